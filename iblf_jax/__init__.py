@@ -1,0 +1,30 @@
+"""iblf_jax: simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots, in JAX."""
+
+from importlib.metadata import version as _version
+
+from iblf_jax import barriers as barriers
+from iblf_jax import bounds as bounds
+from iblf_jax import controllers as controllers
+from iblf_jax import disturbances as disturbances
+from iblf_jax import metrics as metrics
+from iblf_jax import observers as observers
+from iblf_jax import presets as presets
+from iblf_jax import references as references
+from iblf_jax import robots as robots
+from iblf_jax.paths import parameters as parameters
+from iblf_jax.paths import with_parameters as with_parameters
+from iblf_jax.pytree import astype as astype
+from iblf_jax.pytree import component as component
+from iblf_jax.pytree import leaf as leaf
+from iblf_jax.pytree import static as static
+from iblf_jax.results import Metrics as Metrics
+from iblf_jax.results import Rollout as Rollout
+from iblf_jax.rollout import SimulationError as SimulationError
+from iblf_jax.rollout import SimulationWarning as SimulationWarning
+from iblf_jax.rollout import simulate as simulate
+from iblf_jax.scenario import Initial as Initial
+from iblf_jax.scenario import Scenario as Scenario
+from iblf_jax.stability import recommended_dt as recommended_dt
+from iblf_jax.status import Status as Status
+
+__version__ = _version("iblf_jax")

@@ -1,0 +1,40 @@
+"""The asymmetric time-varying integral barrier of Zhang & Yan 2024."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.barriers._base import GUARD, guarded_error, paper_virtual_velocity
+from iblf_jax.bounds import Tube
+from iblf_jax.pytree import component, static
+
+
+@component
+class Integral:
+    """V1 = int_0^xi 2 s / (1 - s^2) ds = -ln(1 - xi^2).                                              (2.6), (3.1)
+
+        s = dV1/de1 = 2 e1 / (k^2 - e1^2),   alpha = q_d' - (k1 + kappa) e1                     (3.15), (3.5)
+
+    It is twice the logarithmic barrier with p = 1, identically.  Theorem 1: xi^2/2 <= V1 <= xi^2/(1 - xi^2).
+    Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.
+    """
+
+    guard: float = static(default=GUARD)
+    uses_o: ClassVar[bool] = True
+
+    def value(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """V1, (n,) [1]."""
+        e, beyond, k, _ = guarded_error(tube, q, self.guard)
+        return -jnp.log1p(-((e / k) ** 2)) + 2.0 * e / (k**2 - e**2) * beyond
+
+    def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """Con = 2 e1 / (k^2 - e1^2), (n,) [1/rad].                                                     (3.15)"""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return 2.0 * e / (k**2 - e**2)
+
+    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+        """alpha, (n,) [rad/s].                                                                          (3.5)"""
+        return paper_virtual_velocity(tube, q, k1, o)

@@ -1,0 +1,50 @@
+"""The asymmetric time-varying logarithmic barrier, the comparison in the paper's figures."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.barriers._base import GUARD, guarded_error, paper_virtual_velocity
+from iblf_jax.bounds import Tube
+from iblf_jax.pytree import component, static
+
+
+@component
+class Log:
+    """V1 = 1/(2p) ln 1/(1 - xi^(2p)), with a whole exponent p >= 1.
+
+        s = e1^(2p-1) / (k^(2p) - e1^(2p)),   alpha = q_d' - (k1 + kappa) e1
+
+    Source: K. P. Tee, B. Ren, S. S. Ge, Automatica 47 (2011) 2511-2516.
+    """
+
+    p: int = static(default=1)
+    guard: float = static(default=GUARD)
+    uses_o: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raises ValueError unless p is a whole number >= 1."""
+        checks.positive_integer("Log.p", self.p)
+
+    def value(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """V1, (n,) [1]."""
+        e, beyond, k, _ = guarded_error(tube, q, self.guard)
+        return -jnp.log1p(-((e / k) ** (2 * self.p))) / (2 * self.p) + self._slope(e, k) * beyond
+
+    def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """s, (n,) [1/rad]."""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return self._slope(e, k)
+
+    def _slope(self, e, k):
+        # In xi, so that a large p does not underflow k^(2p).
+        x = e / k
+        return x ** (2 * self.p - 1) / (k * (1.0 - x ** (2 * self.p)))
+
+    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+        """alpha, (n,) [rad/s]."""
+        return paper_virtual_velocity(tube, q, k1, o)

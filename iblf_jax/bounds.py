@@ -1,0 +1,152 @@
+"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference.
+
+Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the reference.  The law works with
+the errors' bounds
+
+    k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,                    (paper, below Assumption 2)
+
+and with their rates, all taken here, once, by automatic differentiation: `tube_at` returns them as a `Tube`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.pytree import component, leaf
+from iblf_jax.references import Reference
+
+
+class Side(Protocol):
+    """What the package asks of one side of the bounds."""
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for bounds that follow it."""
+        ...
+
+
+@component
+class Constant:
+    """The bound is `value`, for all time."""
+
+    value: jax.Array = leaf("rad")
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound, (n,) [rad]."""
+        return jnp.broadcast_to(self.value, q_d.shape)
+
+
+@component
+class Sinusoid:
+    """The bound is offset + amplitude sin(frequency t + phase).
+
+    Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
+    """
+
+    offset: jax.Array = leaf("rad")
+    amplitude: jax.Array = leaf("rad")
+    frequency: jax.Array = leaf("rad/s", default=1.0)
+    phase: jax.Array = leaf("rad", default=0.0)
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound, (n,) [rad]."""
+        return jnp.broadcast_to(self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q_d.shape)
+
+
+@component
+class Funnel:
+    """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
+
+    `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a lower one.
+    Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
+    """
+
+    initial: jax.Array = leaf("rad")
+    final: jax.Array = leaf("rad")
+    rate: jax.Array = leaf("1/s", sign="nonnegative")
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound, (n,) [rad]."""
+        return q_d + (self.initial - self.final) * jnp.exp(-self.rate * t) + self.final
+
+
+@component
+class Bounds:
+    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`."""
+
+    lower: Side
+    upper: Side
+
+
+class Tube(NamedTuple):
+    """Reference, bounds and their rates at one time; everything that a barrier needs to know of the world."""
+
+    q_d: jax.Array
+    """Reference, (n,) [rad]."""
+    dq_d: jax.Array
+    """Its velocity, (n,) [rad/s]."""
+    lower: jax.Array
+    """k_lc, (n,) [rad]."""
+    upper: jax.Array
+    """k_uc, (n,) [rad]."""
+    dlower: jax.Array
+    """Rate of k_lc, (n,) [rad/s]."""
+    dupper: jax.Array
+    """Rate of k_uc, (n,) [rad/s]."""
+
+    @property
+    def k_l(self) -> jax.Array:
+        """k_l = q_d - k_lc, (n,) [rad]."""
+        return positive_width(self.q_d - self.lower)
+
+    @property
+    def k_u(self) -> jax.Array:
+        """k_u = k_uc - q_d, (n,) [rad]."""
+        return positive_width(self.upper - self.q_d)
+
+    @property
+    def dk_l(self) -> jax.Array:
+        """Rate of k_l, (n,) [rad/s]."""
+        return self.dq_d - self.dlower
+
+    @property
+    def dk_u(self) -> jax.Array:
+        """Rate of k_u, (n,) [rad/s]."""
+        return self.dupper - self.dq_d
+
+    def xi(self, q: jax.Array) -> jax.Array:
+        """xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].                     (2.4), (2.5)"""
+        e1 = q - self.q_d
+        return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
+
+
+NARROWEST = 1e-6
+"""rad.  A reference that comes nearer to its bound than this is called infeasible; widths are held above it so that a run
+with a bad reference gives large numbers and a flag instead of NaN."""
+
+
+def positive_width(k: jax.Array) -> jax.Array:
+    """`k` where it is wider than NARROWEST, else NARROWEST."""
+    return jnp.maximum(k, NARROWEST)
+
+
+def tube_at(reference: Reference, bounds: Bounds, t: jax.Array) -> Tube:
+    """Reference, bounds and their rates at time t, the rates by jvp.
+
+    Args:
+      reference, bounds: the components.
+      t: time, () [s].
+    """
+
+    def values(t):
+        q_d = reference.position(t)
+        return q_d, bounds.lower.at(t, q_d), bounds.upper.at(t, q_d)
+
+    (q_d, lower, upper), (dq_d, dlower, dupper) = jax.jvp(values, (t,), (jnp.ones_like(t),))
+    return Tube(q_d, dq_d, lower, upper, dlower, dupper)
+
+
+MEMBERS = {"constant": Constant, "sinusoid": Sinusoid, "funnel": Funnel}
+"""Every side by the name that a scenario file gives it."""

@@ -1,0 +1,68 @@
+"""The contract of a tracking law.
+
+A law knows the model, the reference and the bounds (its `Setting`), measures q and q', is given the observer's estimate, and
+commands a torque.  Everything else that it returns is there to be looked at: its virtual velocity alpha, its Lyapunov function
+V1, whether a guard or a limit was at work.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+from iblf_jax.bounds import Bounds, Tube, tube_at
+from iblf_jax.references import Reference
+from iblf_jax.robots import Robot
+
+State = Any
+"""A pytree of arrays; `()` for a law without memory."""
+
+
+class Setting(NamedTuple):
+    """What a law knows of the world."""
+
+    model: Robot
+    reference: Reference
+    bounds: Bounds
+
+    def tube(self, t: jax.Array) -> Tube:
+        """Reference, bounds and their rates at time t [s]."""
+        return tube_at(self.reference, self.bounds, t)
+
+
+class Command(NamedTuple):
+    """What a law answers at one instant; all fields are (n,)."""
+
+    tau: jax.Array
+    """Torque [N m]."""
+    alpha: jax.Array
+    """Virtual velocity [rad/s]; e2 = q' - alpha.  A law without one gives q_d'."""
+    V1: jax.Array
+    """Lyapunov function of the position error, joint by joint."""
+    guard_active: jax.Array
+    """bool: the barrier's guard holds the slope."""
+    saturated: jax.Array
+    """bool: the torque was cut to a limit."""
+
+
+class Controller(Protocol):
+    """What the package asks of a law."""
+
+    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
+        """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
+        ...
+
+    def command(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State
+    ) -> tuple[Command, State]:
+        """The command, and the rate of the law's own state (same structure as the state).
+
+        Args:
+          t: time, () [s].
+          q, dq: position [rad] and velocity [rad/s], (n,).
+          f_hat: the observer's estimate of the uncertain term, (n,) [N m].
+          setting: model, reference and bounds.
+          state: the law's own state.
+        """
+        ...

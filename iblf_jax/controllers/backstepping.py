@@ -1,0 +1,75 @@
+"""The backstepping law of the paper, for any barrier.
+
+Step one: were q' = alpha(t, q), the barrier's V1 would decay.  Step two: drive e2 = q' - alpha to zero,
+
+    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - s,                                                           (3.14)
+
+with s = dV1/dq the barrier's slope ("Con" in the paper) and alpha' the total time derivative of alpha, taken by jvp along
+(1, q').  That is the law as `printed`.  Its proof drops 1/2 e2^T M0' e2; the `corrected` reading has C0 alpha in place of
+C0 q', which cancels that term by skew symmetry, and then the claim of Theorem 2 is exact.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.barriers import Barrier, Integral
+from iblf_jax.barriers._base import guard_is_active
+from iblf_jax.controllers._base import Command, Setting
+from iblf_jax.pytree import component, leaf, static
+
+READINGS = ("printed", "corrected")
+
+
+@component
+class Backstepping:
+    """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - s,   v = q' (printed) or alpha (corrected).                (3.14)
+
+    Source: Zhang & Yan 2024, (3.5), (3.14); `corrected` as said at the head of this module.
+    """
+
+    k1: jax.Array = leaf("1/s", sign="positive")
+    """Gain of the virtual velocity."""
+    K2: jax.Array = leaf("N m s/rad", sign="positive")
+    """Diagonal of the velocity error's gain; Theorem 2 asks for more than 1/2."""
+    o: jax.Array | None = leaf("1/s^2", sign="positive", default=None)
+    """Margin under the root of kappa (3.7), for barriers that compensate a moving bound by kappa; else None."""
+    barrier: Barrier = Integral()
+    reading: str = static(default="printed")
+
+    def check(self) -> None:
+        """Raises ValueError for an unknown reading; fits `o` to the barrier (0.1, the paper's, if it needs one)."""
+        checks.one_of("Backstepping.reading", self.reading, READINGS)
+        uses_o = getattr(self.barrier, "uses_o", True)
+        if uses_o and self.o is None:
+            object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
+        if not uses_o and self.o is not None:
+            raise checks.fail("Backstepping.o", self.o, f"None with the barrier {type(self.barrier).__name__}", "That barrier has no kappa; leave `o` out.")
+
+    def advice(self) -> list[str]:
+        """Warnings about gains outside the conditions of Theorem 2."""
+        if bool(jnp.all(self.K2 > 0.5)):
+            return []
+        return [f"controller.K2 = {self.K2}: Theorem 2 needs K2 > 1/2 on every joint (3.17); below it nothing is claimed. Raise K2."]
+
+    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
+        """No state."""
+        return ()
+
+    def command(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]
+    ) -> tuple[Command, tuple[()]]:
+        """The torque (3.14) and what belongs to it."""
+
+        def alpha_at(t, q):
+            return self.barrier.virtual_velocity(setting.tube(t), q, self.k1, self.o)
+
+        alpha, dalpha = jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))
+        tube, model = setting.tube(t), setting.model
+        carried = alpha if self.reading == "corrected" else dq
+        feedforward = model.coriolis(q, dq, carried) + model.gravity(q) + model.mass_matrix(q) @ dalpha
+        tau = feedforward - f_hat - self.K2 * (dq - alpha) - self.barrier.slope(tube, q)
+        guard_active = guard_is_active(tube, q, self.barrier.guard)
+        return Command(tau, alpha, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active)), ()

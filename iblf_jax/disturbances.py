@@ -1,0 +1,186 @@
+"""Disturbances: the generalised torque that acts on the plant and that the law does not know.
+
+    M q" + C q' + G = tau + (disturbance)                                        for the simulated plant
+
+What the observer should estimate is the lumped uncertain term of (2.1),
+
+    f = M0 q" + C0 q' + G0 - tau,
+
+evaluated along the run with the *model*.  It equals the disturbance here when the plant is the model; if the plant has other
+masses, a payload or friction, f holds those as well.  f must be differentiable (Assumption 1), so a disturbance that
+jumps says when: `jump_times`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.pytree import component, leaf
+from iblf_jax.robots import Robot
+
+
+class Disturbance(Protocol):
+    """What the package asks of a disturbance."""
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """Generalised torque on the plant, (n,) [N m], at time t [s] and state q [rad], dq [rad/s]."""
+        ...
+
+    def jump_times(self) -> jax.Array:
+        """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is."""
+        ...
+
+
+def _never() -> jax.Array:
+    return jnp.zeros((0,))
+
+
+@component
+class Nothing:
+    """No disturbance."""
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """Zero, (n,) [N m]."""
+        return jnp.zeros_like(q)
+
+    def jump_times(self) -> jax.Array:
+        """None."""
+        return _never()
+
+
+@component
+class ModelShaped:
+    """The paper's uncertain term, shaped by the model's own matrices.                                      (4.3)
+
+        f = M0(q) a(t) + C0(q, q') b(t)
+        a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase),   b likewise
+
+    `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.  Source: Zhang & Yan 2024, (4.3).
+    """
+
+    acceleration_amplitude: jax.Array = leaf("rad/s^2")
+    acceleration_frequency: jax.Array = leaf("rad/s")
+    acceleration_phase: jax.Array = leaf("rad")
+    velocity_amplitude: jax.Array = leaf("rad/s")
+    velocity_frequency: jax.Array = leaf("rad/s")
+    velocity_phase: jax.Array = leaf("rad")
+    phase: jax.Array = leaf("rad", shape="scalar", default=0.0)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """f(t, q, q'), (n,) [N m]."""
+        a = self.acceleration_amplitude * jnp.sin(self.acceleration_frequency * t + self.acceleration_phase + self.phase)
+        b = self.velocity_amplitude * jnp.sin(self.velocity_frequency * t + self.velocity_phase + self.phase)
+        return model.mass_matrix(q) @ a + model.coriolis(q, dq, b)
+
+    def jump_times(self) -> jax.Array:
+        """None: it is smooth."""
+        return _never()
+
+
+@component
+class Sinusoids:
+    """Joint torques offset + amplitude sin(frequency t + phase)."""
+
+    amplitude: jax.Array = leaf("N m")
+    frequency: jax.Array = leaf("rad/s")
+    phase: jax.Array = leaf("rad", default=0.0)
+    offset: jax.Array = leaf("N m", default=0.0)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """(n,) [N m]."""
+        return jnp.broadcast_to(self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q.shape)
+
+    def jump_times(self) -> jax.Array:
+        """None: it is smooth."""
+        return _never()
+
+
+@component
+class Step:
+    """Joint torques that appear at one time: `size` from `time` on."""
+
+    size: jax.Array = leaf("N m")
+    time: jax.Array = leaf("s", shape="scalar")
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """(n,) [N m]."""
+        return jnp.where(t >= self.time, jnp.broadcast_to(self.size, q.shape), jnp.zeros_like(q))
+
+    def jump_times(self) -> jax.Array:
+        """`time`."""
+        return jnp.atleast_1d(self.time)
+
+
+@component
+class TipForce:
+    """A force that acts on the tip, +J(q)^T F(t) with F = offset + amplitude sin(frequency t + phase).
+
+    (The paper's f_ext in (2.1) is the force that the tip exerts, hence its minus sign: F = -f_ext.)
+    """
+
+    amplitude: jax.Array = leaf("N", shape="any")
+    """One number a coordinate of the tip, (2,) for a planar arm."""
+    frequency: jax.Array = leaf("rad/s", shape="any", default=0.0)
+    phase: jax.Array = leaf("rad", shape="any", default=0.0)
+    offset: jax.Array = leaf("N", shape="any", default=0.0)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """J(q)^T F(t), (n,) [N m]."""
+        J = plant.jacobian(q)
+        force = self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
+        return J.T @ jnp.broadcast_to(force, (J.shape[0],))
+
+    def jump_times(self) -> jax.Array:
+        """None: it is smooth."""
+        return _never()
+
+
+@component
+class Friction:
+    """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' / width))."""
+
+    viscous: jax.Array = leaf("N m s/rad", sign="nonnegative", default=0.0)
+    coulomb: jax.Array = leaf("N m", sign="nonnegative", default=0.0)
+    width: jax.Array = leaf("rad/s", sign="positive", default=0.05)
+    """Velocity over which the Coulomb part changes sign; smaller is sharper and stiffer."""
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """(n,) [N m]."""
+        return -(self.viscous * dq + self.coulomb * jnp.tanh(dq / self.width))
+
+    def jump_times(self) -> jax.Array:
+        """None: the Coulomb part is smoothed."""
+        return _never()
+
+
+@component
+class Sum:
+    """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`."""
+
+    parts: tuple[Disturbance, ...]
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """The sum over the parts, (n,) [N m]."""
+        total = jnp.zeros_like(q)
+        for part in self.parts:
+            total = total + part.torque(t, q, dq, plant, model)
+        return total
+
+    def jump_times(self) -> jax.Array:
+        """The parts' jump times together, (m,) [s]."""
+        return jnp.concatenate([_never(), *(part.jump_times() for part in self.parts)])
+
+
+MEMBERS = {
+    "nothing": Nothing,
+    "model_shaped": ModelShaped,
+    "sinusoids": Sinusoids,
+    "step": Step,
+    "tip_force": TipForce,
+    "friction": Friction,
+    "sum": Sum,
+}
+"""Every disturbance by the name that a scenario file gives it."""

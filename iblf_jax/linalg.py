@@ -1,0 +1,48 @@
+"""Algebra of small symmetric positive definite matrices, unrolled over their static size.
+
+LAPACK calls cost microseconds on a 2x2 matrix and stop XLA from fusing a time step.  A mass matrix is n x n with n the
+number of joints, known when the program is traced, so its Cholesky factor is written out as scalar operations.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
+    """Lower triangular L with L L^T = matrix, as a list of rows of scalars.
+
+    A matrix that is not positive definite gives NaN, as LAPACK does; the run is then flagged, not stopped.
+    """
+    n = matrix.shape[-1]
+    L: list[list[jax.Array]] = []
+    for i in range(n):
+        row: list[jax.Array] = []
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                other = row if i == j else L[j]
+                rest = rest - row[k] * other[k]
+            row.append(jnp.sqrt(rest) if i == j else rest / L[j][j])
+        L.append(row)
+    return L
+
+
+def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """x with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side."""
+    n = matrix.shape[-1]
+    L = cholesky(matrix)
+    y: list[jax.Array] = []
+    for i in range(n):
+        rest = rhs[i]
+        for k in range(i):
+            rest = rest - L[i][k] * y[k]
+        y.append(rest / L[i][i])
+    x: list[jax.Array] = [jnp.zeros(())] * n
+    for i in reversed(range(n)):
+        rest = y[i]
+        for k in range(i + 1, n):
+            rest = rest - L[k][i] * x[k]
+        x[i] = rest / L[i][i]
+    return jnp.stack(x)

@@ -1,0 +1,245 @@
+"""Metrics: what a run is judged by, each a fold over its samples.
+
+A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`; it sees every step whatever is recorded, so the same
+definition serves one recorded run, a million runs that store no trajectory, and a tuning loss.  Integrals are sums over the steps,
+sum_k dt g(t_k) from t = 0 to the last step before the end; peaks and margins see the last sample too.
+
+A fold is a component: thresholds are leaves.  Its `units` name what `finish` returns.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.closed_loop import Sample
+from iblf_jax.pytree import component, leaf
+
+
+class Fold(Protocol):
+    """What the package asks of a metric."""
+
+    units: ClassVar[dict[str, str]]
+    """Name -> SI unit of everything that `finish` returns."""
+
+    def init(self, sample: Sample) -> Any:
+        """The accumulator before the first sample; `sample` is that first sample, for shapes and types."""
+        ...
+
+    def update(self, acc: Any, sample: Sample) -> Any:
+        """The accumulator after one more sample; same structure, shapes and types."""
+        ...
+
+    def finish(self, acc: Any) -> dict[str, jax.Array]:
+        """The named results."""
+        ...
+
+
+class _TrackingSums(NamedTuple):
+    time: jax.Array
+    ise: jax.Array
+    iae: jax.Array
+    itae: jax.Array
+    peak: jax.Array
+
+
+@component
+class Tracking:
+    """Integrals and peak of the position error e1, joint by joint.
+
+    ISE = int e1^2, IAE = int |e1|, ITAE = int t |e1|, rmse = sqrt(ISE / duration), peak_error = max |e1|.
+    """
+
+    units: ClassVar[dict[str, str]] = {"rmse": "rad", "ise": "rad^2 s", "iae": "rad s", "itae": "rad s^2", "peak_error": "rad"}
+
+    def init(self, sample: Sample) -> _TrackingSums:
+        """Zeros."""
+        zero = jnp.zeros_like(sample.e1)
+        return _TrackingSums(jnp.zeros_like(sample.t), zero, zero, zero, zero)
+
+    def update(self, acc: _TrackingSums, sample: Sample) -> _TrackingSums:
+        """Adds one sample."""
+        size = jnp.abs(sample.e1)
+        return _TrackingSums(
+            acc.time + sample.dt,
+            acc.ise + sample.dt * size**2,
+            acc.iae + sample.dt * size,
+            acc.itae + sample.dt * sample.t * size,
+            jnp.maximum(acc.peak, size),
+        )
+
+    def finish(self, acc: _TrackingSums) -> dict[str, jax.Array]:
+        """rmse, ise, iae, itae, peak_error, each (n,)."""
+        # The root is guarded so that its gradient is finite on a run without any error.
+        mean = acc.ise / acc.time
+        rmse = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
+        return {"rmse": rmse, "ise": acc.ise, "iae": acc.iae, "itae": acc.itae, "peak_error": acc.peak}
+
+
+class _SettlingState(NamedTuple):
+    outside: jax.Array
+    last_outside: jax.Array
+    overshoot: jax.Array
+    side: jax.Array
+
+
+@component
+class Settling:
+    """When |e1| falls under a tolerance for good, and how far e1 goes past zero.
+
+    settling_time: the first sample time from which on |e1| < tolerance; infinite if the run ends outside.
+    overshoot: the largest |e1| on the side of zero opposite to the start's.
+    """
+
+    tolerance: jax.Array = leaf("rad", sign="positive", default=0.01)
+    units: ClassVar[dict[str, str]] = {"settling_time": "s", "overshoot": "rad"}
+
+    def init(self, sample: Sample) -> _SettlingState:
+        """Settled since the start, until a sample says otherwise."""
+        zero = jnp.zeros_like(sample.e1)
+        return _SettlingState(jnp.zeros(sample.e1.shape, bool), zero, zero, jnp.sign(sample.e1))
+
+    def update(self, acc: _SettlingState, sample: Sample) -> _SettlingState:
+        """Adds one sample."""
+        outside = ~(jnp.abs(sample.e1) < self.tolerance)
+        # Settled from the sample after the last one outside: the time that this sample reaches to.
+        last = jnp.where(outside, sample.t + sample.dt, acc.last_outside)
+        return _SettlingState(outside, last, jnp.maximum(acc.overshoot, -acc.side * sample.e1), acc.side)
+
+    def finish(self, acc: _SettlingState) -> dict[str, jax.Array]:
+        """settling_time and overshoot, each (n,)."""
+        return {"settling_time": jnp.where(acc.outside, jnp.inf, acc.last_outside), "overshoot": acc.overshoot}
+
+
+class _MarginState(NamedTuple):
+    margin: jax.Array
+    xi: jax.Array
+    time: jax.Array
+    joint: jax.Array
+
+
+@component
+class Margin:
+    """How near the joints came to their bounds, and the first violation.
+
+    margin = min(q - lower, upper - q), continuous through zero; xi_margin = 1 - max |xi|; first_violation_time is infinite and
+    first_violation_joint -1 on a run that keeps its bounds.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "margin": "rad",
+        "xi_margin": "1",
+        "first_violation_time": "s",
+        "first_violation_joint": "1",
+    }
+
+    def init(self, sample: Sample) -> _MarginState:
+        """Infinitely far from the bounds."""
+        far = jnp.full_like(sample.q, jnp.inf)
+        return _MarginState(far, far, jnp.full_like(sample.t, jnp.inf), jnp.int32(-1))
+
+    def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
+        """Adds one sample."""
+        margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+        first = jnp.any(~(margin > 0)) & (acc.joint < 0)
+        return _MarginState(
+            jnp.minimum(acc.margin, margin),
+            jnp.minimum(acc.xi, 1.0 - jnp.abs(sample.xi)),
+            jnp.where(first, sample.t, acc.time),
+            jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.joint),
+        )
+
+    def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
+        """margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
+        return {
+            "margin": acc.margin,
+            "xi_margin": acc.xi,
+            "first_violation_time": acc.time,
+            "first_violation_joint": acc.joint,
+        }
+
+
+class _TorqueSums(NamedTuple):
+    time: jax.Array
+    square: jax.Array
+    peak: jax.Array
+    variation: jax.Array
+    last: jax.Array
+    saturated: jax.Array
+
+
+@component
+class Torque:
+    """What the actuators had to do.
+
+    effort = int |tau|^2 over all joints; torque_rms, peak_torque, torque_variation = sum |tau_k+1 - tau_k| (chatter), and
+    saturated_share, the part of the time in which the torque was cut, joint by joint.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "effort": "N^2 m^2 s",
+        "torque_rms": "N m",
+        "peak_torque": "N m",
+        "torque_variation": "N m",
+        "saturated_share": "1",
+    }
+
+    def init(self, sample: Sample) -> _TorqueSums:
+        """Zeros; the first torque has no predecessor but itself."""
+        zero = jnp.zeros_like(sample.tau)
+        return _TorqueSums(jnp.zeros_like(sample.t), zero, zero, zero, sample.tau, zero)
+
+    def update(self, acc: _TorqueSums, sample: Sample) -> _TorqueSums:
+        """Adds one sample."""
+        return _TorqueSums(
+            acc.time + sample.dt,
+            acc.square + sample.dt * sample.tau**2,
+            jnp.maximum(acc.peak, jnp.abs(sample.tau)),
+            acc.variation + jnp.abs(sample.tau - acc.last),
+            sample.tau,
+            acc.saturated + jnp.where(sample.saturated, sample.dt, jnp.zeros_like(sample.dt)),
+        )
+
+    def finish(self, acc: _TorqueSums) -> dict[str, jax.Array]:
+        """effort, (); the others (n,)."""
+        mean = acc.square / acc.time
+        rms = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
+        return {
+            "effort": jnp.sum(acc.square),
+            "torque_rms": rms,
+            "peak_torque": acc.peak,
+            "torque_variation": acc.variation,
+            "saturated_share": acc.saturated / acc.time,
+        }
+
+
+class _EstimateSums(NamedTuple):
+    time: jax.Array
+    square: jax.Array
+
+
+@component
+class Estimation:
+    """How well the observer knew the uncertain term: estimate_rmse = sqrt(mean f_tilde^2), f_tilde = f - f_hat."""
+
+    units: ClassVar[dict[str, str]] = {"estimate_rmse": "N m"}
+
+    def init(self, sample: Sample) -> _EstimateSums:
+        """Zeros."""
+        return _EstimateSums(jnp.zeros_like(sample.t), jnp.zeros_like(sample.disturbance))
+
+    def update(self, acc: _EstimateSums, sample: Sample) -> _EstimateSums:
+        """Adds one sample."""
+        f_tilde = sample.disturbance - sample.disturbance_estimate
+        return _EstimateSums(acc.time + sample.dt, acc.square + sample.dt * f_tilde**2)
+
+    def finish(self, acc: _EstimateSums) -> dict[str, jax.Array]:
+        """estimate_rmse, (n,)."""
+        mean = acc.square / acc.time
+        return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
+
+
+STANDARD: tuple[Fold, ...] = (Tracking(), Settling(), Margin(), Torque(), Estimation())
+"""The folds that every run carries."""

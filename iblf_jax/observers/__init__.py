@@ -1,0 +1,11 @@
+"""Disturbance observers.  The contract is `Observer` in `_base.py`."""
+
+from iblf_jax.observers._base import Observer as Observer
+from iblf_jax.observers.momentum import Momentum as Momentum
+from iblf_jax.observers.none import NoObserver as NoObserver
+from iblf_jax.observers.printed import Printed as Printed
+
+MEMBERS = {"none": NoObserver, "printed": Printed, "momentum": Momentum}
+"""Every observer by the name that a scenario file gives it."""
+
+__all__ = ["MEMBERS", "Momentum", "NoObserver", "Observer", "Printed"]

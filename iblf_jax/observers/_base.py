@@ -1,0 +1,32 @@
+"""The contract of a disturbance observer.
+
+An observer knows the model, measures q and q', is told the torque that was applied, and gives f_hat, an estimate of the
+lumped uncertain term f of (2.1).  Its state is part of the loop's state and is integrated with the plant.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+
+from iblf_jax.robots import Robot
+
+State = Any
+"""A pytree of arrays; `()` for an observer without memory."""
+
+
+class Observer(Protocol):
+    """What the package asks of an observer."""
+
+    def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
+        """State at the start of a run, given q [rad] and dq [rad/s] there."""
+        ...
+
+    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: State) -> jax.Array:
+        """f_hat, (n,) [N m]."""
+        ...
+
+    def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: State) -> State:
+        """Rate of the state, given the torque `tau` (n,) [N m] that was applied (after any saturation)."""
+        ...

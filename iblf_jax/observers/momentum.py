@@ -1,0 +1,43 @@
+"""The paper's observer in momentum form: exact for every mass matrix."""
+
+from __future__ import annotations
+
+import jax
+
+from iblf_jax import checks
+from iblf_jax.observers.printed import STARTS, initial_eta
+from iblf_jax.pytree import component, leaf, static
+from iblf_jax.robots import Robot, mass_matrix_rate
+
+
+@component
+class Momentum:
+    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').        (3.11), corrected
+
+    Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.
+    Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for the form.
+    """
+
+    kf: jax.Array = leaf("1/s", sign="positive")
+    eta0: jax.Array = leaf("N m", default=0.0)
+    """eta(0), added to what `start` says."""
+    start: str = static(default="zero")
+    """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""
+
+    def check(self) -> None:
+        """Raises ValueError for an unknown `start`."""
+        checks.one_of("Momentum.start", self.start, STARTS)
+
+    def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
+        """eta(0), (n,) [N m]."""
+        return initial_eta(self, q, dq, model)
+
+    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
+        """f_hat, (n,) [N m]."""
+        return state + self.kf * (model.mass_matrix(q) @ dq)
+
+    def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
+        """eta', (n,) [N m/s]."""
+        f_hat = self.estimate(t, q, dq, model, state)
+        drift = model.coriolis(q, dq, dq) + model.gravity(q) - mass_matrix_rate(model, q, dq) @ dq
+        return -self.kf * (f_hat + tau - drift)

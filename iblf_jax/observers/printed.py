@@ -1,0 +1,50 @@
+"""The disturbance observer as the paper prints it: exact for a constant mass matrix only."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.pytree import component, leaf, static
+from iblf_jax.robots import Robot
+
+STARTS = ("zero", "matched")
+
+
+@component
+class Printed:
+    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q').                             (3.11)
+
+    Its error obeys f_tilde' = f' - kf f_tilde - kf M0' q': the last term is what `Momentum` removes.
+    Source: Zhang & Yan 2024, (3.11), signs restored.
+    """
+
+    kf: jax.Array = leaf("1/s", sign="positive")
+    eta0: jax.Array = leaf("N m", default=0.0)
+    """eta(0), added to what `start` says."""
+    start: str = static(default="zero")
+    """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""
+
+    def check(self) -> None:
+        """Raises ValueError for an unknown `start`."""
+        checks.one_of("Printed.start", self.start, STARTS)
+
+    def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
+        """eta(0), (n,) [N m]."""
+        return initial_eta(self, q, dq, model)
+
+    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
+        """f_hat, (n,) [N m]."""
+        return state + self.kf * (model.mass_matrix(q) @ dq)
+
+    def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
+        """eta', (n,) [N m/s]."""
+        f_hat = self.estimate(t, q, dq, model, state)
+        return -self.kf * (f_hat + tau - model.coriolis(q, dq, dq) - model.gravity(q))
+
+
+def initial_eta(observer, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
+    """eta(0) of an observer with `kf`, `eta0` and `start`, (n,) [N m]."""
+    eta0 = jnp.broadcast_to(observer.eta0, q.shape)
+    return eta0 - observer.kf * (model.mass_matrix(q) @ dq) if observer.start == "matched" else eta0

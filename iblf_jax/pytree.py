@@ -1,0 +1,108 @@
+"""Components: frozen dataclasses that JAX can differentiate, batch and compile.
+
+A robot, a law, a bound is a *component*: it has behaviour (methods) and leaves (arrays).  JAX takes a
+component apart into its leaves and puts it together again at every `jit`, `vmap` and `grad`, with tracers,
+placeholders or axis numbers in the place of the numbers.  So two things must be kept apart:
+
+- **construction by a person**, `TwoLink(mass=[2, 0.85], ...)`: lists become arrays, signs and shapes are checked;
+- **reconstruction by JAX**: nothing may be converted or checked, because what comes is not a number.
+
+`component` does that: the checks live in the constructor, and the pytree is registered with an unflatten that never
+calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static` (structure: changes recompile)
+or as a plain annotation (another component).  `eq=False`: comparing arrays with `==` is ambiguous, identity is not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+
+from iblf_jax import checks
+
+T = TypeVar("T")
+
+
+def leaf(unit: str, *, sign: str | None = None, shape: str = "joint", default: Any = dataclasses.MISSING) -> Any:
+    """Declares a field that holds an array of numbers, which can be perturbed, swept, tuned and differentiated.
+
+    Args:
+      unit: SI unit for tables and axes, such as "kg m^2" ("1" for a pure number).
+      sign: None, "positive" or "nonnegative"; checked at construction and at the entry points.
+      shape: "joint" for one number a joint, (n,), where a scalar is repeated; "scalar" for (); "any" for neither.
+      default: the value if none is given.
+    """
+    metadata = {"unit": unit, "sign": sign, "shape": shape, "leaf": True}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def static(*, default: Any = dataclasses.MISSING) -> Any:
+    """Declares a structural field: hashable, not differentiable, part of what is compiled."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(leaf, static))
+def component(cls: type[T]) -> type[T]:
+    """Class decorator that makes a frozen dataclass a component (see the head of this module).
+
+    A class may define `check(self)`, called once after construction, to raise ValueError when fields do not fit together.
+    """
+    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    children = tuple(f.name for f in fields if not f.metadata.get("static"))
+    structure = tuple(f.name for f in fields if f.metadata.get("static"))
+    plain_init = cls.__init__
+
+    @functools.wraps(plain_init)
+    def checked_init(self, *args, **kwargs):
+        plain_init(self, *args, **kwargs)
+        for field in fields:
+            value = getattr(self, field.name)
+            if field.metadata.get("static"):
+                checks.structural(cls.__name__, field.name, value)
+            else:
+                object.__setattr__(self, field.name, checks.as_leaf(cls.__name__, field, value))
+        if hasattr(self, "check"):
+            self.check()
+
+    cls.__init__ = checked_init  # type: ignore[method-assign]
+
+    def flatten_with_keys(obj):
+        keyed = tuple((jax.tree_util.GetAttrKey(name), getattr(obj, name)) for name in children)
+        return keyed, tuple(getattr(obj, name) for name in structure)
+
+    def flatten(obj):
+        return tuple(getattr(obj, name) for name in children), tuple(getattr(obj, name) for name in structure)
+
+    def unflatten(aux, values):
+        obj = object.__new__(cls)
+        for name, value in zip(children, values, strict=True):
+            object.__setattr__(obj, name, value)
+        for name, value in zip(structure, aux, strict=True):
+            object.__setattr__(obj, name, value)
+        return obj
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
+
+
+def is_leaf_field(field: dataclasses.Field) -> bool:
+    """Whether a dataclass field was declared with `leaf`."""
+    return bool(field.metadata.get("leaf"))
+
+
+def float_dtype(tree: Any) -> jax.typing.DTypeLike:
+    """The floating-point type that the numbers of a pytree share (the widest one, if they differ)."""
+    import jax.numpy as jnp
+
+    kinds = [jnp.result_type(x) for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+    return jnp.result_type(*kinds) if kinds else jnp.result_type(float)
+
+
+def astype(tree: T, dtype: jax.typing.DTypeLike) -> T:
+    """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`."""
+    import jax.numpy as jnp
+
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)

@@ -1,0 +1,164 @@
+"""What a run gives back: `Rollout`, and the named `Metrics` in it.
+
+Both are pytrees, so `jax.vmap(ij.simulate...)` gives a Rollout of many runs, time axis after the run axis; an index selects a run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.scenario import Scenario
+from iblf_jax.status import Status, describe
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Metrics(Mapping):
+    """Named results of the folds: `metrics.rmse` or `metrics["rmse"]`; `list(metrics)` names them, `units` has their units."""
+
+    values_by_name: dict[str, jax.Array]
+    unit_pairs: tuple[tuple[str, str], ...] = dataclasses.field(metadata={"static": True})
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Name -> SI unit."""
+        return dict(self.unit_pairs)
+
+    def __getitem__(self, name: str) -> jax.Array:
+        try:
+            return self.values_by_name[name]
+        except KeyError:
+            raise KeyError(f"no metric {name!r}; there are {', '.join(self.values_by_name)}") from None
+
+    def __getattr__(self, name: str) -> jax.Array:
+        if name.startswith("_") or name in ("values_by_name", "unit_pairs"):
+            raise AttributeError(name)
+        try:
+            return self.values_by_name[name]
+        except KeyError:
+            raise AttributeError(f"no metric {name!r}; there are {', '.join(self.values_by_name)}") from None
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.values_by_name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_by_name)
+
+    def __len__(self) -> int:
+        return len(self.values_by_name)
+
+    def __repr__(self) -> str:
+        rows = []
+        for name, value in self.values_by_name.items():
+            shown = np.array2string(np.asarray(value), precision=4, threshold=8) if checks.is_concrete(value) else str(value)
+            rows.append(f"  {name:22s} {shown} {self.units.get(name, '')}".rstrip())
+        return "Metrics(\n" + "\n".join(rows) + "\n)"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rollout:
+    """One run of a scenario, or many: every array below has a leading run axis then.
+
+    Sizes: T recorded samples, n joints.  Recorded samples are every `record_every`-th step from t = 0; metrics and status
+    cover every step.
+    """
+
+    scenario: Scenario
+    """What was run."""
+    t: jax.Array
+    """Time, (T,) [s]."""
+    q: jax.Array
+    """Position, (T, n) [rad]."""
+    dq: jax.Array
+    """Velocity, (T, n) [rad/s]."""
+    tau: jax.Array
+    """Applied torque, (T, n) [N m]."""
+    e1: jax.Array
+    """Position error q - q_d, (T, n) [rad]."""
+    e2: jax.Array
+    """Velocity error q' - alpha, (T, n) [rad/s]."""
+    xi: jax.Array
+    """Position error relative to its bound, (T, n) [1]."""
+    q_d: jax.Array
+    """Reference, (T, n) [rad]."""
+    dq_d: jax.Array
+    """Its velocity, (T, n) [rad/s]."""
+    lower: jax.Array
+    """Lower bound of q, (T, n) [rad]."""
+    upper: jax.Array
+    """Upper bound of q, (T, n) [rad]."""
+    alpha: jax.Array
+    """Virtual velocity, (T, n) [rad/s]."""
+    disturbance: jax.Array
+    """Lumped uncertain term f of (2.1), (T, n) [N m]."""
+    disturbance_estimate: jax.Array
+    """Its estimate f_hat, (T, n) [N m]."""
+    V: jax.Array
+    """Lyapunov function V2 of (3.12), (T,)."""
+    controller_state: Any
+    """State of the law, time axis first; `()` if it has none."""
+    observer_state: Any
+    """State of the observer, time axis first; `()` if it has none."""
+    metrics: Metrics
+    status: jax.Array
+    """Bit flags of `Status`, () int32; 0 is ok."""
+    fastest_mode: jax.Array
+    """Largest measured mode of the closed loop, () [1/s]; dt times this decides whether the step was too large."""
+    dt: jax.Array
+    """Time step, () [s]."""
+    method: str = dataclasses.field(metadata={"static": True})
+    """The integrator."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether no flag is set (for one run)."""
+        return int(self.status) == int(Status.OK)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.q.shape[-1]
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether this holds many runs."""
+        return np.ndim(self.status) > 0
+
+    def __len__(self) -> int:
+        if not self.is_batch:
+            raise TypeError("this Rollout is one run; use run.t.size for its samples")
+        return self.status.shape[0]
+
+    def __getitem__(self, index) -> Rollout:
+        """The run (or runs) with this index."""
+        if not self.is_batch:
+            raise TypeError("this Rollout is one run and cannot be indexed; index its arrays, run.q[0]")
+        return jax.tree.map(lambda x: x[index], self)
+
+    def __repr__(self) -> str:
+        if not checks.is_concrete(self):
+            return "Rollout(being traced)"
+        shape = f"{self.q.shape[-2]} samples, {self.n} joints, dt = {float(np.ravel(self.dt)[0]):g} s, {self.method}"
+        if self.is_batch:
+            bad = int(np.sum(np.asarray(self.status) != 0))
+            return f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"
+        return f"Rollout({shape}; status: {describe(int(self.status))})"
+
+    def to_xarray(self):
+        """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its attributes."""
+        from iblf_jax.io import rollout_to_xarray
+
+        return rollout_to_xarray(self)
+
+    def plot(self, **options):
+        """Overview figure: tube, errors, torque, estimate, phase portrait.  Options as `plotting.overview`."""
+        from iblf_jax import plotting
+
+        return plotting.overview(self, **options)

@@ -1,0 +1,117 @@
+"""The contract of a robot, and what follows from its energies alone.
+
+    M(q) q" + C(q, q') q' + G(q) = tau + f                                                       (2.1)
+
+A robot is known by its mass matrix M(q) and its potential U(q): then G = dU/dq, and C follows from the Christoffel symbols,
+
+    C(q, v) u = 1/2 [ (dM/dq . v) u + (dM/dq . u) v - d/dq (u^T M v) ],
+
+which makes M' - 2 C skew-symmetric, the property that the proofs of all laws here rest on.  `from_energy` adds these
+methods to a class that has the energies; a class with closed forms (`TwoLink`) or a recursion writes its own.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+T = TypeVar("T")
+
+
+class Robot(Protocol):
+    """What the package asks of a robot with n joints.  All methods are for one configuration, in SI units, and pure.
+
+    A member is a component (`iblf_jax.component`) whose inertial parameters are leaves; `payload` [kg], a point mass at
+    the tip, is one of them in every member, so that any robot can carry what its model does not know.
+    """
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        ...
+
+    def mass_matrix(self, q: jax.Array) -> jax.Array:
+        """M(q), symmetric positive definite, (n, n) [kg m^2]."""
+        ...
+
+    def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
+        """C(q, v) u, (n,) [N m], with M' - 2 C skew-symmetric; v and u are (n,) [rad/s]."""
+        ...
+
+    def gravity(self, q: jax.Array) -> jax.Array:
+        """G(q) = dU/dq, (n,) [N m]."""
+        ...
+
+    def potential(self, q: jax.Array) -> jax.Array:
+        """U(q), () [J]."""
+        ...
+
+    def tip(self, q: jax.Array) -> jax.Array:
+        """Position of the tip, (2,) or (3,) [m]."""
+        ...
+
+    def jacobian(self, q: jax.Array) -> jax.Array:
+        """d tip / dq, (2, n) or (3, n) [m/rad]."""
+        ...
+
+    def skeleton(self, q: jax.Array) -> jax.Array:
+        """Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m]; for drawings."""
+        ...
+
+
+def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
+    """C(q, v) u from M(q) by automatic differentiation, with the Christoffel symbols (head of this module).
+
+    Args:
+      mass_matrix: function q -> M(q), (n, n) [kg m^2].
+      q, v, u: (n,) configuration [rad] and two velocities [rad/s].
+
+    Returns:
+      (n,) [N m].
+    """
+    _, M_along_v = jax.jvp(mass_matrix, (q,), (v,))
+    _, M_along_u = jax.jvp(mass_matrix, (q,), (u,))
+    energy_gradient = jax.grad(lambda x: u @ (mass_matrix(x) @ v))(q)
+    return 0.5 * (M_along_v @ u + M_along_u @ v - energy_gradient)
+
+
+def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:
+    """M'(q) = dM/dq . q', (n, n) [kg m^2/s], by jvp."""
+    return jax.jvp(robot.mass_matrix, (q,), (dq,))[1]
+
+
+def from_energy(cls: type[T]) -> type[T]:
+    """Class decorator: adds `coriolis`, `gravity` and `jacobian` to a robot that has `mass_matrix`, `potential`, `tip`.
+
+    Methods that the class already has are kept.  Apply it below `component`:
+
+        @ij.component
+        @ij.robots.from_energy
+        class MyArm: ...
+    """
+
+    def coriolis(self, q, v, u):
+        """C(q, v) u, (n,) [N m], from M(q) by automatic differentiation."""
+        return coriolis_from_mass_matrix(self.mass_matrix, q, v, u)
+
+    def gravity(self, q):
+        """G(q) = dU/dq, (n,) [N m], by automatic differentiation."""
+        return jax.grad(self.potential)(q)
+
+    def jacobian(self, q):
+        """d tip / dq [m/rad], by automatic differentiation."""
+        return jax.jacfwd(self.tip)(q)
+
+    for method in (coriolis, gravity, jacobian):
+        if not hasattr(cls, method.__name__):
+            setattr(cls, method.__name__, method)
+    return cls
+
+
+def planar_skeleton(lengths: jax.Array, q: jax.Array) -> jax.Array:
+    """Base, joints and tip of a planar chain with relative joint angles, (n + 1, 2) [m]."""
+    angles = jnp.cumsum(q)
+    steps = lengths[:, None] * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+    return jnp.concatenate([jnp.zeros((1, 2), steps.dtype), jnp.cumsum(steps, axis=0)])

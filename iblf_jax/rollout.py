@@ -1,0 +1,275 @@
+"""The time loop: `simulate` runs one scenario and returns a `Rollout`.
+
+Time is scanned here and nowhere else.  Per step: the closed loop is evaluated once for record, metrics and the first stage of the
+integrator; a state that runs away is frozen at its last good value and flagged, so that no NaN ever enters a batch or a
+gradient; the instant nearest to a bound is remembered, because the loop is stiffest there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.bounds import NARROWEST
+from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state, rate
+from iblf_jax.integrators import step, tableau
+from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.results import Metrics, Rollout
+from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.stability import comfortable_dt, fastest_mode
+from iblf_jax.status import FAILED, VELOCITY_LIMIT, Status, describe, flag
+
+RECORDED = tuple(f.name for f in dataclasses.fields(Rollout) if f.name in Sample._fields and f.name != "dt")
+
+
+class SimulationError(RuntimeError):
+    """A run that did not do its job, raised by `simulate(..., throw=True)`."""
+
+
+class SimulationWarning(UserWarning):
+    """A run whose result needs a second look."""
+
+
+class Nearest(NamedTuple):
+    """The instant at which a joint was nearest to its bound."""
+
+    xi: jax.Array
+    t: jax.Array
+    state: LoopState
+
+
+class Carry(NamedTuple):
+    """What goes from step to step."""
+
+    state: LoopState
+    accumulators: tuple
+    status: jax.Array
+    nearest: Nearest
+
+
+class Outcome(NamedTuple):
+    """What the time loop returns."""
+
+    records: Any
+    metrics: dict[str, jax.Array]
+    status: jax.Array
+    fastest_mode: jax.Array
+
+
+def sample_status(sample: Sample) -> jax.Array:
+    """The flags that one sample raises, () int32."""
+    narrowest = jnp.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
+    margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+    return (
+        flag(jnp.any(~(margin > 0)), Status.BOUND_VIOLATED)
+        | flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
+        | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
+        | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
+    )
+
+
+def is_sound(state: LoopState) -> jax.Array:
+    """Whether a state is finite and slow enough to be a robot's, () bool."""
+    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)])
+    return jnp.all(finite) & jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT)
+
+
+def _keep_if(condition, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _observe(scenario: Scenario, folds, t, dt, carry: Carry):
+    """Evaluates the loop at t and folds the sample in; returns the rate of the state, the sample and the new carry."""
+    slope, sample = evaluate(scenario, t, carry.state, dt)
+    accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, carry.accumulators, strict=True))
+    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
+    here = Nearest(near, t, jax.lax.stop_gradient(carry.state))
+    nearest = _keep_if(near > carry.nearest.xi, here, carry.nearest)
+    return slope, sample, Carry(carry.state, accumulators, carry.status | sample_status(sample), nearest)
+
+
+def advance(scenario: Scenario, folds, method: str, dt, carry: Carry, index) -> tuple[Carry, Sample]:
+    """One step of the time loop: observe, integrate, freeze what runs away."""
+    t = index.astype(dt.dtype) * dt
+    slope, sample, carry = _observe(scenario, folds, t, dt, carry)
+    stepped = step(method, partial(rate, scenario), t, carry.state, dt, slope)
+    sound = is_sound(stepped) & (carry.status & int(Status.NOT_FINITE) == 0)
+    state = _keep_if(sound, stepped, carry.state)
+    return carry._replace(state=state, status=carry.status | flag(~sound, Status.NOT_FINITE)), sample
+
+
+def start(scenario: Scenario, folds, dt) -> Carry:
+    """The carry before the first step."""
+    state, zero = initial_state(scenario), jnp.zeros_like(dt)
+    _, first = evaluate(scenario, zero, state, dt)
+    nearest = Nearest(-jnp.ones_like(dt), zero, jax.lax.stop_gradient(state))
+    return Carry(state, tuple(fold.init(first) for fold in folds), jnp.int32(0), nearest)
+
+
+def finish(scenario: Scenario, folds, method: str, dt, steps: int, carry: Carry) -> tuple[Carry, Sample, Outcome]:
+    """The last sample, the folds' results and the verdict on the step."""
+    first, end = initial_state(scenario), dt * steps
+    _, sample, carry = _observe(scenario, folds, end, jnp.zeros_like(dt), carry)
+    times = jnp.stack([jnp.zeros_like(end), carry.nearest.t, end])
+    states = jax.tree.map(lambda *xs: jnp.stack(xs), first, carry.nearest.state, carry.state)
+    modes = jax.vmap(partial(fastest_mode, scenario))(*jax.lax.stop_gradient((times, states)))
+    mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
+    status = carry.status | flag(dt * mode > tableau(method).stability, Status.STEP_TOO_LARGE)
+    metrics: dict[str, jax.Array] = {}
+    for fold, acc in zip(folds, carry.accumulators, strict=True):
+        metrics |= fold.finish(acc)
+    return carry, sample, Outcome(None, metrics, status, mode)
+
+
+def _recorded(sample: Sample, state: LoopState):
+    return {name: getattr(sample, name) for name in RECORDED}, state.controller, state.observer
+
+
+def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int, method: str) -> Outcome:
+    """The whole time loop for one run, pure and unchecked; records are stacked every `record_every` steps and at the end."""
+    blocks, rest = divmod(steps, record_every)
+
+    def one(carry, index):
+        return advance(scenario, folds, method, dt, carry, index)
+
+    def block(carry, index):
+        state = carry.state
+        carry, sample = one(carry, index)
+        if record_every > 1:
+            carry, _ = jax.lax.scan(lambda c, i: (one(c, i)[0], None), carry, index + jnp.arange(1, record_every))
+        return carry, _recorded(sample, state)
+
+    carry, records = jax.lax.scan(block, start(scenario, folds, dt), record_every * jnp.arange(blocks))
+    if rest:
+        tail_start = carry.state
+        tail_index = blocks * record_every + jnp.arange(rest)
+        carry, samples = jax.lax.scan(one, carry, tail_index)
+        last = _recorded(jax.tree.map(lambda x: x[0], samples), tail_start)
+        _, _, outcome = finish(scenario, folds, method, dt, steps, carry)
+    else:
+        carry, sample, outcome = finish(scenario, folds, method, dt, steps, carry)
+        last = _recorded(sample, carry.state)
+    records = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), records, last)
+    return outcome._replace(records=records)
+
+
+@partial(jax.jit, static_argnames=("steps", "record_every", "method"))
+def _run_compiled(scenario, folds, dt, *, steps, record_every, method):
+    return run(scenario, folds, dt, steps=steps, record_every=record_every, method=method)
+
+
+def simulate(
+    scenario: Scenario,
+    *,
+    duration: float,
+    dt: float = 1e-3,
+    method: str = "rk4",
+    record_every: int = 1,
+    metrics: Sequence[Fold] = STANDARD,
+    throw: bool = False,
+) -> Rollout:
+    """Runs a scenario with a fixed step and returns everything that can be looked at.
+
+        x' = rate(t, x),   x = (q, q', state of the law, state of the observer)                 (closed_loop)
+
+    Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate `run.metrics` or any array by the leaves of the scenario.
+    New values of leaves do not recompile; a new structure, number of steps or method does.
+
+    Args:
+      scenario: what to run, of n joints.
+      duration: length of the run [s], a whole number of steps.
+      dt: time step [s]; `recommended_dt(scenario)` says which will do.
+      method: "rk4", "heun" or "euler".
+      record_every: record every so-many-th step; metrics and status cover every step whatever is recorded.
+      metrics: the folds to run (`iblf_jax.metrics`).
+      throw: raise instead of warn when the run failed.
+
+    Returns:
+      A `Rollout` with T = steps // record_every + 1 samples.
+
+    Raises:
+      ValueError: bad arguments; the message names the field, the value and the mend.
+      SimulationError: with `throw`, when a bound was violated, the state ran away or the step was too large.
+
+    Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
+    """
+    tableau(method)
+    steps = checks.whole_steps(duration, dt)
+    record_every = checks.positive_integer("record_every", record_every)
+    scenario = canonical(scenario)
+    folds = tuple(metrics)
+    dtype = scenario.initial.q.dtype
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), folds)
+    outcome = _run_compiled(scenario, folds, jnp.asarray(dt, dtype), steps=steps, record_every=record_every, method=method)
+    arrays, controller_state, observer_state = outcome.records
+    units = tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
+    result = Rollout(
+        scenario=scenario,
+        controller_state=controller_state,
+        observer_state=observer_state,
+        metrics=Metrics(outcome.metrics, units),
+        status=outcome.status,
+        fastest_mode=outcome.fastest_mode,
+        dt=jnp.asarray(dt, dtype),
+        method=method,
+        **arrays,
+    )
+    if checks.is_concrete(outcome.status) and outcome.status.ndim == 0:
+        _report(result, throw)
+    return result
+
+
+def _report(result: Rollout, throw: bool) -> None:
+    """Raises or warns, with the physics in the message, if a run failed."""
+    status = Status(int(result.status))
+    if status & Status.INFEASIBLE_REFERENCE:
+        raise _infeasible(result)
+    if not status & FAILED:
+        return
+    text = f"The run failed: {describe(status & FAILED)}. " + " ".join(_explanations(result, status))
+    if throw:
+        raise SimulationError(text)
+    warnings.warn(text, SimulationWarning, stacklevel=3)
+
+
+def _explanations(result: Rollout, status: Status) -> list[str]:
+    texts = []
+    metrics = result.metrics
+    if status & Status.BOUND_VIOLATED and "first_violation_time" in metrics:
+        joint = int(metrics["first_violation_joint"])
+        texts.append(
+            f"Joint {joint} left its bounds first, at t = {float(metrics['first_violation_time']):.4g} s; "
+            f"its smallest margin is {float(metrics['margin'][joint]):.3g} rad."
+        )
+    if status & Status.STEP_TOO_LARGE:
+        mode = float(result.fastest_mode)
+        limit = tableau(result.method).stability / mode
+        texts.append(
+            f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to dt = {limit:.3g} s only; "
+            f"dt = {float(result.dt):g} s was asked for. Take dt={comfortable_dt(mode):g}, or lower controller.K2 or observer.kf."
+        )
+    elif status & Status.NOT_FINITE:
+        texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
+    return texts
+
+
+def _infeasible(result: Rollout) -> ValueError:
+    """The error for a reference that touches a bound (Assumption 2), with joint and time."""
+    tube = [np.asarray(x) for x in (result.q_d - result.lower, result.upper - result.q_d)]
+    gap = np.minimum(*tube)
+    sample, joint = np.unravel_index(np.argmin(gap), gap.shape)
+    where = f"t = {float(result.t[sample]):.4g} s"
+    return checks.fail(
+        f"reference of joint {joint}",
+        float(result.q_d[sample, joint]),
+        f"a value inside the bounds ({float(result.lower[sample, joint]):.6g}, {float(result.upper[sample, joint]):.6g}) at {where}",
+        "The reference must stay strictly inside the bounds for the whole run (Assumption 2): move it, widen the bounds or shorten the run.",
+    )

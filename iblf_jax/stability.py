@@ -1,0 +1,98 @@
+"""How fast the closed loop's fastest mode is, and which time step that allows.
+
+The gain K2 acts through M0^-1, so the fastest mode is about K2 / lambda_min(M0): near 1000 1/s for the paper's gains.  An
+explicit step is stable only while dt times that mode stays inside the method's stability region; beyond it the numbers grow
+without any physics behind them.  So every run measures its fastest mode, at its start, where it was nearest to its bound
+(there the barrier is stiffest) and at its end, and says when the step was too large.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax import checks
+from iblf_jax.closed_loop import LoopState, initial_state, rate
+from iblf_jax.integrators import tableau
+from iblf_jax.scenario import Initial, Scenario, canonical
+
+POWER_ITERATIONS = 48
+AVERAGED = 16
+COMFORT = 1.5
+"""|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
+
+
+def fastest_mode(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
+    """Spectral radius of the closed loop's Jacobian at (t, state), () [1/s], by power iteration on jvp.
+
+    The growth is averaged over the last iterations, so that a pair of complex modes is measured too.
+    """
+    flat, unravel = ravel_pytree(state)
+
+    def push(v):
+        return jax.jvp(lambda x: ravel_pytree(rate(scenario, t, unravel(x)))[0], (flat,), (v,))[1]
+
+    def iterate(v, _):
+        w = push(v)
+        size = jnp.sqrt(jnp.sum(w * w))
+        return w / jnp.maximum(size, jnp.finfo(flat.dtype).tiny), jnp.log(jnp.maximum(size, jnp.finfo(flat.dtype).tiny))
+
+    start = jnp.cos(jnp.arange(1, flat.size + 1, dtype=flat.dtype))
+    _, growth = jax.lax.scan(iterate, start / jnp.sqrt(jnp.sum(start**2)), length=POWER_ITERATIONS)
+    return jnp.exp(jnp.mean(growth[-AVERAGED:]))
+
+
+def stable_dt(mode: float, method: str) -> float:
+    """The largest stable step for a mode [1/s], [s]."""
+    return tableau(method).stability / mode
+
+
+def comfortable_dt(mode: float) -> float:
+    """A round step (1, 2 or 5 times a power of ten) that follows a mode [1/s] comfortably, [s]."""
+    limit = COMFORT / mode
+    decade = 10.0 ** math.floor(math.log10(limit))
+    factor = max(f for f in (1.0, 2.0, 5.0) if f * decade <= limit * (1 + 1e-12))
+    return float(f"{factor * decade:.1g}")
+
+
+def recommended_dt(scenario: Scenario, *, duration: float = 20.0, method: str = "rk4") -> float:
+    """A round time step [s] with which `simulate` is stable and accurate on this scenario.
+
+    dt = 1.5 / max |eigenvalue of the closed loop's Jacobian|, rounded down to 1, 2 or 5 times a power of ten; the maximum is
+    taken at the start and along the reference.
+
+    Args:
+      scenario: what is to run.
+      duration: over which stretch of the reference to look [s].
+      method: the integrator.
+
+    Raises:
+      ValueError: bad scenario, duration or method.
+    """
+    tableau(method)
+    scenario = canonical(scenario)
+    times = np.linspace(0.0, checks.positive_number("duration", duration, "s"), 33)
+    modes = np.abs(np.linalg.eigvals(np.asarray(_jacobians(scenario, jnp.asarray(times, scenario.initial.q.dtype)), float)))
+    if not np.all(np.isfinite(modes)):
+        raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
+    return comfortable_dt(float(np.max(modes)))
+
+
+@jax.jit
+def _jacobians(scenario: Scenario, times: jax.Array) -> jax.Array:
+    def along_reference(t):
+        tube = scenario.setting.tube(t)
+        return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
+
+    def jacobian(t, state):
+        flat, unravel = ravel_pytree(state)
+        return jax.jacfwd(lambda x: ravel_pytree(rate(scenario, t, unravel(x)))[0])(flat)
+
+    first = jacobian(times[0], initial_state(scenario))
+    rest = jax.vmap(lambda t: jacobian(t, along_reference(t)))(times)
+    return jnp.concatenate([first[None], rest])

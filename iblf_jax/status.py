@@ -1,0 +1,57 @@
+"""What can go wrong in a run, as bit flags: inside `jit` nothing raises, each run carries its status to the end.
+
+`Status.OK` is 0.  Flags combine: a run may violate a bound and saturate its torque.  The first group says that the
+run is not to be believed or not to be accepted (`FAILED`), the second tells what happened on the way.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import jax.numpy as jnp
+
+
+class Status(enum.IntFlag):
+    """Bit flags of one run."""
+
+    OK = 0
+    BOUND_VIOLATED = 1
+    """A joint touched or left its bound."""
+    NOT_FINITE = 2
+    """The state ran away (NaN, infinity, or a joint faster than VELOCITY_LIMIT); it was frozen at its last good value."""
+    STEP_TOO_LARGE = 4
+    """dt is beyond the stability limit of the integrator for the fastest mode of the closed loop."""
+    INFEASIBLE_REFERENCE = 8
+    """The reference touches or leaves a bound during the run: Assumption 2 fails and no law can keep both."""
+    TORQUE_SATURATED = 16
+    """The torque that the law asked for was cut to the actuator's limit."""
+    GUARD_ACTIVE = 32
+    """A joint came so near its bound that the barrier's slope was held at its greatest finite value."""
+
+
+FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE
+"""The flags that make a run one that did not do its job."""
+
+VELOCITY_LIMIT = 1e4
+"""rad/s (or m/s).  No robot moves so; beyond it a run has diverged, and stopping there keeps every number finite in
+float32, so that neither a batch nor its gradient meets an infinity."""
+
+_WORDS = {
+    Status.BOUND_VIOLATED: "a bound was violated",
+    Status.NOT_FINITE: "the state ran away and was frozen",
+    Status.STEP_TOO_LARGE: "the time step is too large for the closed loop",
+    Status.INFEASIBLE_REFERENCE: "the reference leaves the bounds",
+    Status.TORQUE_SATURATED: "the torque was saturated",
+    Status.GUARD_ACTIVE: "the guard at the wall was active",
+}
+
+
+def describe(status: int) -> str:
+    """The flags of one run in words, "ok" if there is none."""
+    words = [text for flag, text in _WORDS.items() if int(status) & flag]
+    return "; ".join(words) if words else "ok"
+
+
+def flag(condition, which: Status):
+    """`which` as an int32 where `condition` holds, else 0; for use inside a compiled loop."""
+    return jnp.where(condition, jnp.int32(int(which)), jnp.int32(0))
