@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax import checks
 from iblf_jax.bounds import NARROWEST
@@ -161,9 +162,20 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int, method:
     return outcome._replace(records=records)
 
 
+def as_one_function(f):
+    """`f` compiled as one machine function on CPU, where XLA would otherwise dispatch every operation of a loop by itself.
+
+    Two to five times faster for one run and for small batches, with the same numbers.  The attributes are XLA's own and only
+    hints: where they are unknown, nothing changes.
+    """
+    if jax.default_backend() != "cpu":
+        return f
+    return set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(f))
+
+
 @partial(jax.jit, static_argnames=("steps", "record_every", "method"))
 def _run_compiled(scenario, folds, dt, *, steps, record_every, method):
-    return run(scenario, folds, dt, steps=steps, record_every=record_every, method=method)
+    return as_one_function(partial(run, steps=steps, record_every=record_every, method=method))(scenario, folds, dt)
 
 
 def simulate(
