@@ -134,8 +134,13 @@ def _recorded(sample: Sample, state: LoopState):
     return {name: getattr(sample, name) for name in RECORDED}, state.controller, state.observer
 
 
-def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int, method: str) -> Outcome:
-    """The whole time loop for one run, pure and unchecked; records are stacked every `record_every` steps and at the end."""
+def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str) -> Outcome:
+    """The whole time loop for one run, pure and unchecked.
+
+    Records are stacked every `record_every` steps; with None there are none, and memory does not grow with time.
+    """
+    if record_every is None:
+        return _run_unrecorded(scenario, folds, dt, steps=steps, method=method)
     blocks, rest = divmod(steps, record_every)
 
     def one(carry, index):
@@ -171,6 +176,13 @@ def as_one_function(f):
     if jax.default_backend() != "cpu":
         return f
     return set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(f))
+
+
+def _run_unrecorded(scenario: Scenario, folds, dt, *, steps: int, method: str) -> Outcome:
+    carry, _ = jax.lax.scan(
+        lambda c, i: (advance(scenario, folds, method, dt, c, i)[0], None), start(scenario, folds, dt), jnp.arange(steps)
+    )
+    return finish(scenario, folds, method, dt, steps, carry)[2]
 
 
 @partial(jax.jit, static_argnames=("steps", "record_every", "method"))
