@@ -38,3 +38,11 @@ class Integral:
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s].                                                                          (3.5)"""
         return paper_virtual_velocity(tube, q, k1, o)
+
+    def decay_rate(self, k1: jax.Array) -> jax.Array:
+        """2 k1: V1' <= -2 k1 xi^2/(1 - xi^2) <= -2 k1 V1 at e2 = 0, (n,) [1/s].                        (3.9), (3.19)"""
+        return 2.0 * k1
+
+    def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
+        """|xi| <= sqrt(1 - exp(-V)), (n,) [1].                                                         (3.22)"""
+        return jnp.broadcast_to(jnp.sqrt(-jnp.expm1(-V)), tube.q_d.shape)
