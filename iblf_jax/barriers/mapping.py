@@ -67,7 +67,7 @@ class Mapping:
 
 
 def _mapped(e: jax.Array, tube: Tube) -> tuple[jax.Array, jax.Array]:
-    """z [rad] and z_e [1], in e/k so that wide bounds do not overflow."""
+    """The mapped error z [rad] and z_e [1], in e/k so that wide bounds do not overflow."""
     a, b = e / tube.k_l, e / tube.k_u
     room = (1.0 + a) * (1.0 - b)
     return e / room, (1.0 + a * b) / room**2
