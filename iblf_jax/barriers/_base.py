@@ -17,6 +17,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.bounds import Tube
 
 GUARD = 1e-3
@@ -42,6 +43,14 @@ class Barrier(Protocol):
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
         ...
+
+
+def check_guard(owner: str, guard: float) -> None:
+    """Raises ValueError unless 0 < guard < 1."""
+    if not 0.0 < checks.positive_number(f"{owner}.guard", guard, "1") < 1.0:
+        raise checks.fail(
+            f"{owner}.guard", guard, "a number between 0 and 1", f"It is a distance from the wall in xi; the default is {GUARD:g}."
+        )
 
 
 class GuardedError(NamedTuple):
