@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.bounds import Tube
 
 GUARD = 1e-3
@@ -58,6 +59,14 @@ class Barrier(Protocol):
           tube: the tube at that time; for several barriers the level at which a wall is reached depends on its width.
         """
         ...
+
+
+def check_guard(owner: str, guard: float) -> None:
+    """Raises ValueError unless 0 < guard < 1."""
+    if not 0.0 < checks.positive_number(f"{owner}.guard", guard, "1") < 1.0:
+        raise checks.fail(
+            f"{owner}.guard", guard, "a number between 0 and 1", f"It is a distance from the wall in xi; the default is {GUARD:g}."
+        )
 
 
 class GuardedError(NamedTuple):
