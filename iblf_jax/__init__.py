@@ -13,6 +13,8 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
+from iblf_jax.io import load_rollouts as load_rollouts
+from iblf_jax.io import save_rollouts as save_rollouts
 from iblf_jax.paths import parameters as parameters
 from iblf_jax.paths import with_parameters as with_parameters
 from iblf_jax.pytree import astype as astype
@@ -26,6 +28,8 @@ from iblf_jax.rollout import SimulationWarning as SimulationWarning
 from iblf_jax.rollout import simulate as simulate
 from iblf_jax.scenario import Initial as Initial
 from iblf_jax.scenario import Scenario as Scenario
+from iblf_jax.scenario_file import load_scenario as load_scenario
+from iblf_jax.scenario_file import save_scenario as save_scenario
 from iblf_jax.stability import recommended_dt as recommended_dt
 from iblf_jax.status import Status as Status
 
