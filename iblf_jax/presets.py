@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from iblf_jax import bounds as bounds_
 from iblf_jax import checks, disturbances, references
 from iblf_jax.controllers import LAWS as LAWS
@@ -21,9 +23,8 @@ def customary_two_link() -> TwoLink:
     The paper prints no parameters and refers to others; these are the customary ones and an ASSUMPTION of this package:
     m = (2, 0.85) kg, l = (0.35, 0.31) m, lc = l/2, I = m l^2/4, g = 9.81 m/s^2.
     """
-    mass, length = (2.0, 0.85), (0.35, 0.31)
-    inertia = [m * x**2 / 4 for m, x in zip(mass, length, strict=True)]
-    return TwoLink(mass=mass, length=length, centre=[x / 2 for x in length], inertia=inertia)
+    mass, length = np.array([2.0, 0.85]), np.array([0.35, 0.31])
+    return TwoLink(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
 
 
 def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 1) -> Scenario:
@@ -69,7 +70,7 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
 
 
 def zhang_yan_2024_saturated(
-    *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (10.0, 6.0), kind: str = "hard"
+    *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (8.0, 3.0), kind: str = "hard"
 ) -> Scenario:
     """The paper's simulation with a torque limit below the peak that the law asks for (13.8, 16.3 N m).
 

@@ -27,7 +27,7 @@ from iblf_jax.barriers import Barrier, Log
 from iblf_jax.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.controllers._base import Command, Setting
 from iblf_jax.controllers.backstepping import alpha_and_rate, fit_o
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 
 
 @component
@@ -38,25 +38,25 @@ class AdaptiveRBF:
     Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068; numbers as said at the head of this module.
     """
 
-    k1: jax.Array = leaf("1/s", sign="positive")
+    k1: Leaf = leaf("1/s", sign="positive")
     """Gain of the virtual velocity."""
-    K2: jax.Array = leaf("N m s/rad", sign="positive")
+    K2: Leaf = leaf("N m s/rad", sign="positive")
     """Diagonal of the velocity error's gain."""
-    o: jax.Array | None = leaf("1/s^2", sign="positive", default=None)
+    o: Leaf = leaf("1/s^2", sign="positive", default=None)
     """As `Backstepping.o`."""
-    Gamma: jax.Array = leaf("N m/rad", sign="positive", default=20.0)
+    Gamma: Leaf = leaf("N m/rad", sign="positive", default=20.0)
     """Rate of adaptation of each joint's weights."""
-    sigma: jax.Array = leaf("rad/(N m s)", sign="positive", default=0.005)
+    sigma: Leaf = leaf("rad/(N m s)", sign="positive", default=0.005)
     """Leak that bounds the weights; what it forgets stays as an error."""
-    middle: jax.Array = leaf("rad", default=0.5)
+    middle: Leaf = leaf("rad", default=0.5)
     """Position at the centre of the nodes' box."""
-    span_q: jax.Array = leaf("rad", sign="positive", default=0.5)
+    span_q: Leaf = leaf("rad", sign="positive", default=0.5)
     """Half the box in q."""
-    span_dq: jax.Array = leaf("rad/s", sign="positive", default=1.0)
+    span_dq: Leaf = leaf("rad/s", sign="positive", default=1.0)
     """Half the box in q' and alpha."""
-    span_ddq: jax.Array = leaf("rad/s^2", sign="positive", default=3.0)
+    span_ddq: Leaf = leaf("rad/s^2", sign="positive", default=3.0)
     """Half the box in alpha'."""
-    width: jax.Array = leaf("1", sign="positive", shape="scalar", default=2.0)
+    width: Leaf = leaf("1", sign="positive", shape="scalar", default=2.0)
     """Width of the Gaussians, in half boxes."""
     barrier: Barrier = Log()
     nodes: int = static(default=64)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 
 
 @component
@@ -22,9 +22,9 @@ class ComputedTorque:
     Source: M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, chapter 8.
     """
 
-    Kp: jax.Array = leaf("1/s^2", sign="positive")
+    Kp: Leaf = leaf("1/s^2", sign="positive")
     """Stiffness of the error equation."""
-    Kd: jax.Array = leaf("1/s", sign="positive")
+    Kd: Leaf = leaf("1/s", sign="positive")
     """Damping of the error equation; 2 sqrt(Kp) is critical."""
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 
 
 @component
@@ -20,8 +20,8 @@ class PDGravity:
     Source: M. Takegaki, S. Arimoto, ASME J. Dynamic Systems, Measurement and Control 103 (1981) 119-125.
     """
 
-    Kp: jax.Array = leaf("N m/rad", sign="positive")
-    Kd: jax.Array = leaf("N m s/rad", sign="positive")
+    Kp: Leaf = leaf("N m/rad", sign="positive")
+    Kd: Leaf = leaf("N m s/rad", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from iblf_jax import checks
 from iblf_jax.controllers._base import Command, Controller, Setting, State
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 
 KINDS = ("hard", "smooth")
 SHARPNESS = 8
@@ -29,7 +29,7 @@ class Saturated:
     """
 
     law: Controller
-    limit: jax.Array = leaf("N m", sign="positive")
+    limit: Leaf = leaf("N m", sign="positive")
     """Largest torque of each joint."""
     kind: str = static(default="hard")
     wraps: ClassVar[str] = "law"

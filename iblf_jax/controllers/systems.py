@@ -29,7 +29,7 @@ BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {
 
 YARDSTICKS: dict[str, Callable[[], Controller]] = {
     "computed_torque": lambda: ComputedTorque(Kp=25.0, Kd=10.0),
-    "pd": lambda: PDGravity(Kp=100.0, Kd=20.0),
+    "pd": lambda: PDGravity(Kp=60.0, Kd=20.0),
 }
 """Laws outside the family.  ASSUMPTION: their gains are this package's, chosen to settle about as fast as the paper's law."""
 

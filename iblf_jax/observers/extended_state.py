@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots import Robot, mass_matrix_rate
 
 
@@ -35,9 +35,9 @@ class ExtendedState:
     Source: J. Han, IEEE Trans. Industrial Electronics 56 (2009) 900-906; Z. Gao, ACC 2003, 4989-4996 (one bandwidth).
     """
 
-    bandwidth: jax.Array | None = leaf("1/s", sign="positive", default=None)
-    l1: jax.Array | None = leaf("1/s", sign="positive", default=None)
-    l2: jax.Array | None = leaf("1/s^2", sign="positive", default=None)
+    bandwidth: Leaf = leaf("1/s", sign="positive", default=None)
+    l1: Leaf = leaf("1/s", sign="positive", default=None)
+    l2: Leaf = leaf("1/s^2", sign="positive", default=None)
 
     def check(self) -> None:
         """Raises ValueError unless either `bandwidth` or both `l1` and `l2` are given."""
