@@ -38,8 +38,12 @@ __version__ = _version("iblf_jax")
 if TYPE_CHECKING:
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
+    from iblf_jax._compare import compare as compare
+    from iblf_jax._comparison import Comparison as Comparison
 
 _ON_FIRST_USE = {
+    "Comparison": ("iblf_jax._comparison", "Comparison"),
+    "compare": ("iblf_jax._compare", "compare"),
     "plotting": ("iblf_jax.plotting", None),
     "testing": ("iblf_jax.testing", None),
 }

@@ -51,6 +51,8 @@ class Sample(NamedTuple):
     lower: jax.Array
     upper: jax.Array
     alpha: jax.Array
+    gravity: jax.Array
+    """G0(q), what holding the model still takes [N m]."""
     disturbance: jax.Array
     """The lumped uncertain term f of (2.1) [N m]."""
     disturbance_estimate: jax.Array
@@ -86,8 +88,8 @@ def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array |
     pushed = command.tau + scenario.disturbance.torque(t, q, dq, plant, model)
     ddq = solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
 
-    M0 = model.mass_matrix(q)
-    f = M0 @ ddq + model.coriolis(q, dq, dq) + model.gravity(q) - command.tau
+    M0, G0 = model.mass_matrix(q), model.gravity(q)
+    f = M0 @ ddq + model.coriolis(q, dq, dq) + G0 - command.tau
     e2, f_tilde = dq - command.alpha, f - f_hat
     V = jnp.sum(command.V1) + 0.5 * (e2 @ (M0 @ e2) + f_tilde @ f_tilde)
     sample = Sample(
@@ -104,6 +106,7 @@ def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array |
         lower=tube.lower,
         upper=tube.upper,
         alpha=command.alpha,
+        gravity=G0,
         disturbance=f,
         disturbance_estimate=f_hat,
         V=V,

@@ -217,6 +217,34 @@ class Torque:
         }
 
 
+class _AboveGravitySums(NamedTuple):
+    time: jax.Array
+    square: jax.Array
+
+
+@component
+class AboveGravity:
+    """What the law did beyond holding the arm up: effort_above_gravity = sqrt(mean |tau - G0(q)|^2) over all joints.
+
+    `compare` holds it equal between laws.
+    """
+
+    units: ClassVar[dict[str, str]] = {"effort_above_gravity": "N m"}
+
+    def init(self, sample: Sample) -> _AboveGravitySums:
+        """Zeros."""
+        return _AboveGravitySums(jnp.zeros_like(sample.t), jnp.zeros_like(sample.t))
+
+    def update(self, acc: _AboveGravitySums, sample: Sample) -> _AboveGravitySums:
+        """Adds one sample."""
+        return _AboveGravitySums(acc.time + sample.dt, acc.square + sample.dt * jnp.sum((sample.tau - sample.gravity) ** 2))
+
+    def finish(self, acc: _AboveGravitySums) -> dict[str, jax.Array]:
+        """The effort above gravity, ()."""
+        mean = acc.square / acc.time
+        return {"effort_above_gravity": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
+
+
 class _EstimateSums(NamedTuple):
     time: jax.Array
     square: jax.Array

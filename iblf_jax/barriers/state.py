@@ -49,7 +49,7 @@ class _Parts(NamedTuple):
 def _parts(e: jax.Array, k_l: jax.Array, k_u: jax.Array) -> _Parts:
     kc = 0.5 * (k_l + k_u)
     a, b = e / k_l, e / k_u
-    h_l, h_u = log_remainder(-a), log_remainder(b)
+    h_l, h_u = log_remainder(jnp.stack([-a, b]))
     w = 0.5 * kc * (h_l / k_l + h_u / k_u)
     rho = 0.5 * kc * ((1.0 - a * h_l) / k_l + (1.0 + b * h_u) / k_u)
     return _Parts(kc, (k_l + e) * (k_u - e) / kc**2, w, rho)

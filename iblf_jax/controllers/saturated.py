@@ -47,9 +47,7 @@ class Saturated:
         """The wrapped law's state."""
         return self.law.init(q, dq, setting)
 
-    def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State
-    ) -> tuple[Command, State]:
+    def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
         """The wrapped law's command with its torque limited; `saturated` says where it asked for more than the limit."""
         command, rate = self.law.command(t, q, dq, f_hat, setting, state)
         asked = command.tau
@@ -58,6 +56,6 @@ class Saturated:
 
 
 def _smooth_clip(x: jax.Array) -> jax.Array:
-    """x / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives too."""
+    """X / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives too."""
     m = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), 1.0))
     return (x / m) / ((1.0 / m) ** SHARPNESS + (x / m) ** SHARPNESS) ** (1.0 / SHARPNESS)

@@ -30,8 +30,9 @@ class ExtendedStateValues(NamedTuple):
 class ExtendedState:
     """p_hat' = tau + C0^T q' - G0 + f_hat + l1 (p - p_hat),   f_hat' = l2 (p - p_hat),   p = M0 q'.
 
-    Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then f_tilde" + l1 f_tilde' + l2 f_tilde = f" + l1 f':
-    second order, so a constant f is found exactly and a changing one with the lag l1/l2.  It starts at the measured momentum and f_hat = 0.
+    Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then f_tilde = f - f_hat obeys
+    f_tilde" + l1 f_tilde' + l2 f_tilde = f" + l1 f': a constant f is found exactly, a changing one with the lag l1/l2.
+    It starts at the measured momentum and f_hat = 0.
     Source: J. Han, IEEE Trans. Industrial Electronics 56 (2009) 900-906; Z. Gao, ACC 2003, 4989-4996 (one bandwidth).
     """
 

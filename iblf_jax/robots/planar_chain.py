@@ -43,9 +43,7 @@ class PlanarChain:
         names = ("mass", "length", "centre", "inertia")
         sizes = {name: getattr(self, name).shape for name in names if getattr(self, name).ndim == 1}
         if not sizes:
-            raise checks.fail(
-                "PlanarChain.mass", self.mass, "one number a link, (n,)", "One field must say how many links."
-            )
+            raise checks.fail("PlanarChain.mass", self.mass, "one number a link, (n,)", "One field must say how many links.")
         shape = next(iter(sizes.values()))
         if shape[0] == 0:
             raise checks.fail("PlanarChain.mass", self.mass, "at least one link")

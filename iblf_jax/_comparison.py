@@ -1,0 +1,178 @@
+"""What `compare` gives back: runs by law, at their gains and at equal effort, and the table of both."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.barriers import Integral
+from iblf_jax.pytree import unwrapped
+from iblf_jax.results import Rollout
+from iblf_jax.status import FAILED, describe
+
+HELD = {"gains": "Gains as given", "effort": "Equal effort"}
+
+FACTOR_TWO = (
+    "Equal gains favour the integral form: V_integral = 2 V_log (p = 1) identically, so its barrier term is twice the logarithmic "
+    "one's at the same k1 and K2. Compare at equal effort."
+)
+OWN_GAINS = "Laws whose gains differ are comparable at equal effort only."
+
+
+class Row(NamedTuple):
+    """One law's line.  Of several joints, the worst one's; efforts and chatter are over all joints."""
+
+    law: str
+    factor: float
+    """What the law's gains were multiplied by."""
+    settling_time: float
+    """Until |e1| < 0.01 rad for good [s]."""
+    rmse: float
+    """[rad]."""
+    margin: float
+    """Smallest distance to a bound [rad]."""
+    xi_margin: float
+    """1 - max |xi| [1]."""
+    peak_torque: float
+    """[N m]."""
+    torque_rms: float
+    """sqrt(mean |tau|^2) [N m]."""
+    effort_above_gravity: float
+    """sqrt(mean |tau - G0(q)|^2) [N m]."""
+    chatter: float
+    """sum |tau_k+1 - tau_k| [N m]."""
+    status: str
+
+
+HEADINGS = (
+    "law",
+    "factor",
+    "settling [s]",
+    "rmse [rad]",
+    "margin [rad]",
+    "1-max|xi|",
+    "peak tau [N m]",
+    "rms tau [N m]",
+    "above gravity",
+    "chatter [N m]",
+    "status",
+)
+
+
+def row_of(law: str, factor: float, run: Rollout) -> Row:
+    """The line of one run."""
+    m = run.metrics
+
+    def worst(name: str, reduce: Any = np.max) -> float:
+        return float(reduce(np.asarray(m[name])))
+
+    return Row(
+        law,
+        factor,
+        worst("settling_time"),
+        worst("rmse"),
+        worst("margin", np.min),
+        worst("xi_margin", np.min),
+        worst("peak_torque"),
+        float(np.sqrt(np.sum(np.asarray(m["torque_rms"]) ** 2))),
+        float(m["effort_above_gravity"]),
+        worst("torque_variation", np.sum),
+        ("FAILED: " if int(run.status) & FAILED else "") + describe(int(run.status)),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Comparison:
+    """Several laws on one scenario.  Prints as two tables, with what was held equal in words."""
+
+    rollouts: dict[str, Rollout]
+    """Law -> run at the gains it has."""
+    equal_effort: dict[str, Rollout]
+    """Law -> run at the first law's effort; without the laws for which there is no factor."""
+    factors: dict[str, float]
+    """Law -> what its gains were multiplied by for that; NaN where there is no such factor."""
+    reasons: dict[str, str]
+    """Law -> why there is none."""
+    gains: dict[str, str]
+    """Law -> its gains in words."""
+
+    @property
+    def table(self) -> dict[str, tuple[Row, ...]]:
+        """The lines of both tables: "gains" and "effort"."""
+        as_given = tuple(row_of(name, 1.0, run) for name, run in self.rollouts.items())
+        effort = tuple(row_of(name, self.factors[name], run) for name, run in self.equal_effort.items())
+        return {"gains": as_given, "effort": effort} if self.factors else {"gains": as_given}
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Law -> what went wrong, for the runs at given gains that failed."""
+        return {name: describe(int(run.status) & FAILED) for name, run in self.rollouts.items() if int(run.status) & FAILED}
+
+    @property
+    def notes(self) -> dict[str, list[str]]:
+        """What each table holds equal, and what it does not, in words."""
+        first = next(iter(self.rollouts))
+        groups: dict[str, list[str]] = {}
+        for name, gains in self.gains.items():
+            groups.setdefault(gains, []).append(name)
+        in_words = "; ".join(f"{gains} ({', '.join(names)})" for gains, names in groups.items())
+        barriers = [getattr(unwrapped(run.scenario.controller), "barrier", None) for run in self.rollouts.values()]
+        notes = {"gains": [f"Held equal: the scenario. Gains: {in_words}.", *([OWN_GAINS] if len(groups) > 1 else [])]}
+        notes["gains"] += [FACTOR_TWO] if any(isinstance(barrier, Integral) for barrier in barriers) else []
+        notes["gains"] += [f"{name} FAILED: {why}." for name, why in self.failed.items()]
+        if self.factors:
+            if first in self.failed:
+                held = "Nothing could be held equal."
+            else:
+                effort = float(self.rollouts[first].metrics.effort_above_gravity)
+                held = f"Held equal: the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2) = {effort:.4g} N m, that of {first}."
+            scaled = "Each law's gains (k1 and K2, or its own) are scaled by one factor, the one nearest 1 that does it."
+            notes["effort"] = [f"{held} {scaled}", *(f"{name}: no factor; {why}." for name, why in self.reasons.items())]
+        return notes
+
+    def __repr__(self) -> str:
+        run = next(iter(self.rollouts.values()))
+        parts = [f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt = {float(run.dt):g} s, {run.method}; worst joint"]
+        for held, rows in self.table.items():
+            parts += ["", HELD[held], *_aligned([HEADINGS, *map(_cells, rows)]), *self.notes[held]]
+        return "\n".join(parts)
+
+    def _repr_html_(self) -> str:
+        parts = []
+        for held, rows in self.table.items():
+            head = "".join(f"<th>{html.escape(x)}</th>" for x in HEADINGS)
+            body = "".join("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in _cells(row)) + "</tr>" for row in rows)
+            notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[held])
+            parts.append(f"<h4>{HELD[held]}</h4><table><tr>{head}</tr>{body}</table>{notes}")
+        return "".join(parts)
+
+    def to_pandas(self):
+        """A `pandas.DataFrame` (pandas comes with xarray), one line a law and table, columns as `Row`."""
+        import pandas as pd
+
+        lines = [{"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows]
+        return pd.DataFrame(lines).set_index(["held", "law"])
+
+    def plot(self, **options):
+        """Overlaid figure of all laws, at their gains and at equal effort.  Options as `plotting.comparison`."""
+        from iblf_jax import plotting
+
+        return plotting.comparison(self, **options)
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    return tuple(x if isinstance(x, str) else f"{x:.4g}" if math.isfinite(x) else "never" if x > 0 else "-" for x in row)
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    last = len(widths) - 1
+
+    def cell(text: str, i: int) -> str:
+        return text.ljust(widths[i]) if i in (0, last) else text.rjust(widths[i])
+
+    return ["  ".join(cell(text, i) for i, text in enumerate(row)).rstrip() for row in rows]

@@ -1,0 +1,158 @@
+"""`compare`: what it holds equal, what it says, and what it does with laws that fail."""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import barriers, controllers
+from iblf_jax._compare import factor_nearest_one
+
+RUN = {"duration": 2.0, "dt": 1e-3, "record_every": 10}
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    return ij.compare(ij.presets.zhang_yan_2024(), ["integral", "log", "pd"], **RUN)
+
+
+def effort(run):
+    """RMS torque above gravity from a run with every step recorded."""
+    gravity = np.array([run.scenario.model.gravity(q) for q in run.q[:-1]])
+    return math.sqrt(np.mean(np.sum((np.asarray(run.tau[:-1]) - gravity) ** 2, axis=1)))
+
+
+def test_equal_effort_is_equal_effort(comparison):
+    assert list(comparison.equal_effort) == ["integral", "log", "pd"]
+    efforts = [float(run.metrics.effort_above_gravity) for run in comparison.equal_effort.values()]
+    np.testing.assert_allclose(efforts, efforts[0], rtol=1e-5)
+    assert comparison.factors["integral"] == 1.0
+    for name, gains in (("log", ("k1", "K2")), ("pd", ("Kp", "Kd"))):
+        for gain in gains:
+            before, after = (getattr(runs[name].scenario.controller, gain) for runs in (comparison.rollouts, comparison.equal_effort))
+            np.testing.assert_allclose(after, before * comparison.factors[name], rtol=1e-12)
+
+
+def test_the_fold_measures_the_torque_above_gravity():
+    run = ij.simulate(ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, metrics=(ij.metrics.AboveGravity(),))
+    assert float(run.metrics.effort_above_gravity) == pytest.approx(effort(run), rel=1e-9)
+
+
+def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario():
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024_saturated(), {"controller.k1": [1.5, 2.5], "controller.K2": 15.0})
+    comparison = ij.compare(scenario, ["log", "tan", "adaptive_rbf"], duration=0.02, dt=1e-3, equal_effort=False)
+    for name, run in comparison.rollouts.items():
+        law = run.scenario.controller
+        assert isinstance(law, controllers.Saturated)
+        np.testing.assert_array_equal(law.law.k1, [1.5, 2.5])
+        np.testing.assert_array_equal(law.law.K2, [15.0, 15.0])
+        assert float(jnp.max(jnp.abs(run.tau) - law.limit)) <= 1e-12
+        observer = type(run.scenario.observer).__name__
+        assert observer == ("NoObserver" if name == "adaptive_rbf" else "Momentum")
+    assert comparison.rollouts["log"].scenario.controller.law.reading == "corrected"
+    assert not comparison.equal_effort
+    assert "effort" not in comparison.table
+
+
+def test_the_text_says_what_was_held_equal(comparison):
+    text = repr(comparison)
+    assert "twice the logarithmic" in text
+    assert "Equal gains favour the integral form" in text
+    assert "RMS torque above gravity" in text
+    assert "that of integral" in text
+    assert "k1 = 2, K2 = 20 (integral, log)" in text
+    assert "Kp = 60, Kd = 20 (pd)" in text
+    html = comparison._repr_html_()
+    assert html.count("<table>") == 2
+    assert "twice the logarithmic" in html
+    without = dataclasses.replace(comparison, rollouts={"pd": comparison.rollouts["pd"]})
+    assert "integral form" not in repr(without)
+
+
+def test_the_table_is_the_metrics_of_the_runs(comparison):
+    row, run = comparison.table["gains"][1], comparison.rollouts["log"]
+    assert row.law == "log"
+    assert row.settling_time == float(jnp.max(run.metrics.settling_time))
+    assert row.xi_margin == float(jnp.min(run.metrics.xi_margin))
+    assert row.chatter == float(jnp.sum(run.metrics.torque_variation))
+    frame = comparison.to_pandas()
+    assert frame.loc[("gains", "log"), "rmse"] == row.rmse
+    assert frame.shape == (6, 10)
+
+
+def test_at_equal_gains_the_integral_form_works_harder_than_the_logarithmic_one(comparison):
+    integral, log = comparison.table["gains"][:2]
+    assert integral.settling_time < log.settling_time
+    assert integral.effort_above_gravity > log.effort_above_gravity
+    assert comparison.factors["log"] > 1.0
+
+
+def test_failed_runs_are_named():
+    scenario = ij.presets.zhang_yan_2024()
+    laws = {"good": "integral", "weak": controllers.PDGravity(Kp=0.01, Kd=0.01)}
+    comparison = ij.compare(dataclasses.replace(scenario, initial=ij.Initial(q=0.8, dq=[1.0, 1.0])), laws, **RUN)
+    assert "bound was violated" in comparison.failed["weak"]
+    assert "weak FAILED: a bound was violated" in repr(comparison)
+    reverse = ij.compare(comparison.rollouts["weak"].scenario, {"weak": laws["weak"], "good": "integral"}, **RUN)
+    assert math.isnan(reverse.factors["good"])
+    assert "weak, failed itself" in repr(reverse)
+
+
+def test_a_law_without_a_factor_is_said_so():
+    # A limit far below what the integral form does: no gain makes this one work as hard.
+    capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])
+    comparison = ij.compare(ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, duration=0.2, dt=1e-3)
+    assert math.isnan(comparison.factors["capped"])
+    assert "capped" not in comparison.equal_effort
+    assert "capped: no factor; its effort stays below" in repr(comparison)
+
+
+@ij.component
+class Bang:
+    """A user's law without gains."""
+
+    size: object = ij.leaf("N m", default=0.1)
+
+    def init(self, q, dq, setting):
+        return ()
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        tube = setting.tube(t)
+        never = jnp.zeros(q.shape, bool)
+        tau = setting.model.gravity(q) - self.size * jnp.sign(q - tube.q_d)
+        return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
+
+
+def test_laws_of_a_users_own():
+    laws = [controllers.Backstepping(k1=2.0, K2=20.0, barrier=barriers.Tan()), Bang(), Bang(size=0.2)]
+    comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1, dt=1e-3)
+    assert list(comparison.rollouts) == ["Backstepping(Tan)", "Bang", "Bang 2"]
+    assert "no gains to scale" in comparison.reasons["Bang"]
+    assert "no gains (Bang, Bang 2)" in repr(comparison)
+
+
+@pytest.mark.parametrize("laws", [[], "integral", ["nonsense"], [3.0], {"x": None}, 7, [controllers.PDGravity]])
+def test_wrong_laws_are_value_errors(laws):
+    with pytest.raises(ValueError, match="laws"):
+        ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1)
+
+
+@pytest.mark.parametrize(
+    ("effort", "target", "expected"),
+    [
+        (lambda c: c, 3.0, 3.0),
+        (lambda c: c, 0.2, 0.2),
+        (lambda c: c, 1.0, 1.0),
+        (lambda c: (c - 0.5) * (c - 1.1) + 2.0, 2.0, 1.1),  # two roots: the one nearest 1
+        (lambda c: (c - 0.9) * (c - 1.3) + 2.0, 2.0, 0.9),
+        (lambda c: c if c < 2.0 else math.nan, 1.9, 1.9),  # failing runs beyond
+        (lambda c: c if c < 2.0 else math.nan, 3.0, math.nan),
+        (lambda c: 1.0 + 0.1 * math.tanh(c), 5.0, math.nan),
+        (lambda c: math.nan, 1.0, math.nan),
+    ],
+)
+def test_the_factor_is_the_one_nearest_one(effort, target, expected):
+    np.testing.assert_allclose(factor_nearest_one(effort, target), expected, rtol=1e-6)

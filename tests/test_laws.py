@@ -1,0 +1,331 @@
+"""The laws beside the paper's: what each does, what saturation leaves of the claims, and paths through a wrapper."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import controllers, observers
+from iblf_jax.closed_loop import LoopState, evaluate, initial_state, rate
+from iblf_jax.controllers.adaptive_rbf import sobol_centres
+from iblf_jax.pytree import rewrapped, unwrapped
+
+PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
+Q, DQ = jnp.array([0.7, 0.6]), jnp.array([0.4, -0.3])
+
+
+@pytest.fixture(scope="module")
+def saturated_runs():
+    """The saturated preset at several limits, and without one; one structure, so one compilation."""
+    scenario = ij.presets.zhang_yan_2024_saturated()
+    limits = {"free": 100.0, "preset": scenario.controller.limit, "below_gravity": (6.0, 2.0)}
+    runs = {}
+    for name, limit in limits.items():
+        one = ij.with_parameters(scenario, {"controller.limit": jnp.asarray(limit)})
+        if name == "below_gravity":
+            with pytest.warns(ij.SimulationWarning, match="bound was violated"):
+                runs[name] = ij.simulate(one, **PAPER)
+        else:
+            runs[name] = ij.simulate(one, **PAPER)
+    return runs
+
+
+@pytest.mark.parametrize("law", ij.presets.LAWS)
+def test_every_system_keeps_the_bounds_and_settles(law):
+    run = ij.simulate(ij.presets.zhang_yan_2024(law=law), **PAPER)
+    assert run.ok
+    assert float(jnp.min(run.metrics.xi_margin)) > 0.38  # that of the start
+    assert float(jnp.max(run.metrics.settling_time)) < 3.5
+    assert float(jnp.max(jnp.abs(run.e1[1000:]))) < 3e-3
+
+
+def test_unknown_law_names_the_known_ones():
+    with pytest.raises(ValueError, match="mapping"):
+        ij.presets.zhang_yan_2024(law="nonsense")
+
+
+def test_the_funnel_is_kept_by_its_own_law():
+    run = ij.simulate(ij.presets.zhang_yan_2024_funnel(), duration=5.0, dt=5e-4, record_every=10)
+    assert run.ok
+    assert float(jnp.max(jnp.abs(run.e1[run.t >= 1.0]))) < 0.12
+    # and it lies inside the paper's bounds
+    paper = ij.presets.zhang_yan_2024()
+    tubes = [jax.vmap(scenario.setting.tube)(jnp.linspace(0.0, 20.0, 2001)) for scenario in (run.scenario, paper)]
+    assert bool(jnp.all(tubes[0].lower >= tubes[1].lower))
+    assert bool(jnp.all(tubes[0].upper <= tubes[1].upper))
+
+
+def test_computed_torque_gives_the_error_equation_that_it_promises():
+    scenario = ij.presets.zhang_yan_2024(law="computed_torque")
+    scenario = dataclasses.replace(scenario, disturbance=ij.disturbances.Nothing(), observer=observers.NoObserver())
+    run = ij.simulate(scenario, duration=2.0, dt=1e-3)
+    w, t = 5.0, run.t[:, None]  # Kp = 25, Kd = 10: double pole at -5
+    e0, de0 = run.e1[0], run.dq[0] - run.dq_d[0]
+    np.testing.assert_allclose(run.e1, (e0 + (de0 + w * e0) * t) * jnp.exp(-w * t), atol=1e-9)
+
+
+def test_pd_holds_a_reference_at_rest():
+    scenario = ij.presets.zhang_yan_2024(law="pd")
+    rest = ij.references.Sinusoid(offset=[0.5, 0.6], amplitude=0.0)
+    walls = ij.bounds.Bounds(ij.bounds.Constant(0.1), ij.bounds.Constant(1.0))
+    scenario = dataclasses.replace(scenario, reference=rest, bounds=walls, disturbance=ij.disturbances.Nothing())
+    run = ij.simulate(scenario, duration=8.0, dt=1e-3)
+    assert float(jnp.max(jnp.abs(run.e1[-1]))) < 1e-8
+    np.testing.assert_allclose(run.tau[-1], scenario.model.gravity(run.q[-1]), atol=1e-6)
+
+
+def test_backstepping_without_barrier_is_the_limit_of_the_state_barrier():
+    wide = ij.bounds.Bounds(ij.bounds.Constant(-1e5), ij.bounds.Constant(1e5 + 1.0))
+    runs = [
+        ij.simulate(dataclasses.replace(ij.presets.zhang_yan_2024(law=law), bounds=wide), duration=1.0, dt=1e-3)
+        for law in ("backstepping", "state", "mapping")
+    ]
+    for run in runs[1:]:
+        np.testing.assert_allclose(run.q, runs[0].q, atol=2e-5)
+
+
+# ------------------------------------------------------------------------------------------------------------- adaptive RBF
+
+
+def test_adaptive_weights_stay_below_their_bound():
+    run = ij.simulate(ij.presets.zhang_yan_2024(law="adaptive_rbf"), **PAPER)
+    law, weights = run.scenario.controller, run.controller_state
+    assert weights.shape == (run.t.size, law.nodes, 2)
+    norms = jnp.sqrt(jnp.sum(weights**2, axis=1))
+    bound = jnp.sqrt(law.nodes) * jnp.max(jnp.abs(run.e2), axis=0) / law.sigma
+    assert bool(jnp.all(norms <= bound))
+    # the leak keeps them from drifting in the second half of the run
+    assert bool(jnp.all(jnp.max(norms[1000:], axis=0) < 1.5 * jnp.max(norms[:1000], axis=0)))
+
+
+def test_adaptive_weights_are_bounded_under_a_large_disturbance():
+    scenario = ij.presets.zhang_yan_2024(law="adaptive_rbf")
+    push = ij.disturbances.Sinusoids(amplitude=[8.0, 3.0], frequency=5.0)
+    strong = dataclasses.replace(scenario, disturbance=push, controller=controllers.AdaptiveRBF(k1=2.0, K2=20.0, sigma=0.5))
+    run = ij.simulate(strong, **PAPER)
+    norms = jnp.sqrt(jnp.sum(run.controller_state**2, axis=1))
+    assert bool(jnp.all(norms <= 8.0 * jnp.max(jnp.abs(run.e2), axis=0) / 0.5))
+
+
+def test_adaptive_law_uses_neither_model_nor_estimate():
+    scenario = ij.presets.zhang_yan_2024(law="adaptive_rbf")
+    law, t = scenario.controller, jnp.asarray(0.3)
+    weights = jax.random.normal(jax.random.PRNGKey(0), (law.nodes, 2))
+    heavy = ij.robots.TwoLink(mass=9.0, length=1.0, centre=0.5, inertia=1.0)
+    one = law.command(t, Q, DQ, jnp.zeros(2), scenario.setting, weights)
+    other = law.command(t, Q, DQ, jnp.ones(2), scenario.setting._replace(model=heavy), weights)
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_adaptation_descends_the_lyapunov_function():
+    # d/dt of tr(W~^T W~) / (2 Gamma) cancels e2^T W~^T S up to the leak, for any W*
+    scenario = ij.presets.zhang_yan_2024(law="adaptive_rbf")
+    law, t = scenario.controller, jnp.asarray(0.3)
+    weights, ideal = jax.random.normal(jax.random.PRNGKey(1), (2, law.nodes, 2))
+    command, dweights = law.command(t, Q, DQ, jnp.zeros(2), scenario.setting, weights)
+    e2 = DQ - command.alpha
+    S = jnp.linalg.lstsq(weights.T, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q))[0]
+    np.testing.assert_allclose(weights.T @ S, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q), atol=1e-9)
+    S = -(dweights / law.Gamma + law.sigma * weights)[:, 0] / e2[0]
+    np.testing.assert_allclose(weights.T @ S, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q), atol=1e-9)
+    error = weights - ideal
+    storage_rate = jnp.sum(error * dweights / law.Gamma)
+    np.testing.assert_allclose(storage_rate, -e2 @ (error.T @ S) - jnp.sum(law.sigma * weights * error), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("nodes", "dimensions"), [(1, 4), (7, 8), (64, 8), (64, 28)])
+def test_centres_fill_the_box(nodes, dimensions):
+    points = sobol_centres(nodes, dimensions)
+    assert points.shape == (nodes, dimensions)
+    assert np.all(np.abs(points) < 1)
+    assert len(np.unique(points, axis=0)) == nodes
+    if nodes == 64:
+        np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------------------- saturation
+
+
+def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold(saturated_runs):
+    run, free = saturated_runs["preset"], saturated_runs["free"]
+    limit = run.scenario.controller.limit
+    assert bool(jnp.all(jnp.max(jnp.abs(free.tau), axis=0) > limit))
+    assert run.status == ij.Status.TORQUE_SATURATED
+    assert free.ok
+    np.testing.assert_allclose(run.metrics.peak_torque, limit, rtol=1e-12)
+    assert bool(jnp.all(run.metrics.saturated_share > 0))
+    assert 0.35 < float(jnp.min(run.metrics.xi_margin)) < 0.38  # less than the start's: it came nearer
+    assert float(jnp.max(run.metrics.settling_time)) < 1.05
+    np.testing.assert_allclose(run.e1[1000:], free.e1[1000:], atol=1e-6)
+    # The observer is told the torque that was applied, so it does not take the cut for a disturbance.
+    error = [jnp.max(jnp.abs(x.disturbance - x.disturbance_estimate)) for x in (run, free)]
+    np.testing.assert_allclose(error[0], error[1], rtol=0.1)
+
+
+def inequality_excess(run):
+    """V2' + rho V2 - |f'|^2 / 2 at the recorded samples, with Theorem 2's rho at that mass matrix (case 2)."""
+    scenario = run.scenario
+
+    def at(t, state):
+        def of_interest(t, state):
+            sample = evaluate(scenario, t, state)[1]
+            return sample.V, sample.disturbance
+
+        (V, _), (dV, df) = jax.jvp(of_interest, (t, state), (jnp.ones(()), rate(scenario, t, state)))
+        rho = jnp.minimum(4.0, 2 * 19.5 / jnp.linalg.eigvalsh(scenario.model.mass_matrix(state.q))[-1])
+        return dV + rho * V - 0.5 * jnp.sum(df**2)
+
+    states = LoopState(run.q, run.dq, run.controller_state, run.observer_state)
+    return jax.jit(jax.vmap(at))(run.t, states)
+
+
+def test_the_inequality_of_theorem_2_fails_only_while_the_torque_is_cut(saturated_runs):
+    run = saturated_runs["preset"]
+    assert float(jnp.max(inequality_excess(saturated_runs["free"]))) < 1e-9
+    excess, cut = inequality_excess(run), jnp.any(jnp.abs(run.tau) >= run.scenario.controller.limit, axis=1)
+    assert float(jnp.max(excess[cut])) > 1.0
+    assert float(jnp.max(excess[~cut])) < 1e-9
+
+
+def test_a_limit_below_gravity_keeps_nothing(saturated_runs):
+    run = saturated_runs["below_gravity"]
+    assert int(run.status) & ij.Status.BOUND_VIOLATED
+    assert int(run.status) & ij.Status.TORQUE_SATURATED
+    assert float(jnp.min(run.metrics.margin)) < -0.1
+    assert bool(jnp.all(jnp.isfinite(run.q)))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_smooth_limit(dtype):
+    scenario = ij.astype(ij.presets.zhang_yan_2024_saturated(kind="smooth"), dtype)
+    law = scenario.controller
+    tau = jnp.asarray([0.0, 1e-30, 0.5, 0.999, 1.0, 1.001, 2.0, 1e8, 1e30], dtype)
+
+    def limited(x):
+        fixed = _Fixed(tau=jnp.stack([x, -x]))
+        wrapped = controllers.Saturated(law=fixed, limit=jnp.ones(2, dtype), kind="smooth")
+        return wrapped.command(jnp.zeros((), dtype), Q.astype(dtype), DQ.astype(dtype), jnp.zeros(2, dtype), scenario.setting, ())[0].tau
+
+    value, slope = jax.vmap(limited)(tau), jax.vmap(jax.jacfwd(limited))(tau)
+    assert value.dtype == dtype
+    np.testing.assert_allclose(value[:, 0], -value[:, 1])
+    exact = np.asarray(tau, np.longdouble) / (1 + np.asarray(tau, np.longdouble) ** 8) ** 0.125
+    np.testing.assert_allclose(value[:, 0], exact.astype(float), rtol=1e-6)
+    np.testing.assert_allclose(slope[:, 0], ((1 + np.asarray(tau, np.longdouble) ** 8) ** -1.125).astype(float), rtol=1e-5, atol=1e-30)
+    assert bool(jnp.all(jnp.isfinite(jax.vmap(jax.jacrev(limited))(tau))))
+    assert bool(jnp.all(jnp.abs(value) <= 1.0))
+    assert law.kind == "smooth"
+
+
+@ij.component
+class _Fixed:
+    """A law that asks for a given torque."""
+
+    tau: jax.Array = ij.leaf("N m", shape="any")
+
+    def init(self, q, dq, setting):
+        return ()
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        never = jnp.zeros(q.shape, bool)
+        return controllers.Command(self.tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), ()
+
+
+# ------------------------------------------------------------------------------------------------------- paths and wrappers
+
+
+def test_paths_reach_through_a_wrapper():
+    scenario = ij.presets.zhang_yan_2024_saturated()
+    paths = [p.path for p in ij.parameters(scenario)]
+    assert "controller.K2" in paths
+    assert "controller.limit" in paths
+    assert not any(".law." in path for path in paths)
+    for path in ("controller.K2[1]", "controller.law.K2[1]"):
+        other = ij.with_parameters(scenario, {path: 33.0})
+        np.testing.assert_array_equal(other.controller.law.K2, [20.0, 33.0])
+    for p in ij.parameters(scenario):
+        ij.with_parameters(scenario, {p.path: p.value})
+    with pytest.raises(ValueError, match=r"controller\.K2"):
+        ij.with_parameters(scenario, {"controller.K3": 1.0})
+    with pytest.raises(ValueError, match="> 0"):
+        ij.with_parameters(scenario, {"controller.K2": -1.0})
+
+
+def test_a_wrapper_in_a_wrapper_keeps_both_fields_apart():
+    scenario = ij.presets.zhang_yan_2024_saturated()
+    twice = dataclasses.replace(scenario, controller=controllers.Saturated(law=scenario.controller, limit=50.0, kind="smooth"))
+    values = {p.path: p.value for p in ij.parameters(twice)}
+    np.testing.assert_array_equal(values["controller.limit"], [50.0, 50.0])
+    np.testing.assert_array_equal(values["controller.law.limit"], [7.2, 1.5])
+    np.testing.assert_array_equal(values["controller.k1"], [2.0, 2.0])
+    other = ij.with_parameters(twice, {"controller.law.limit": 7.0, "controller.k1": 3.0})
+    np.testing.assert_array_equal(other.controller.law.limit, [7.0, 7.0])
+    np.testing.assert_array_equal(unwrapped(other.controller).k1, [3.0, 3.0])
+    again = rewrapped(twice.controller, controllers.PDGravity(Kp=1.0, Kd=1.0))
+    assert isinstance(again.law.law, controllers.PDGravity)
+
+
+def test_new_limits_and_gains_do_not_recompile():
+    scenario, traces = ij.presets.zhang_yan_2024_saturated(), []
+
+    @jax.jit
+    def start(scenario):
+        traces.append(1)
+        return evaluate(scenario, jnp.zeros(()), initial_state(scenario))[1].tau
+
+    for limit, K2 in ((8.0, 20.0), (3.0, 10.0)):
+        start(ij.with_parameters(scenario, {"controller.limit": limit, "controller.K2": K2}))
+    assert len(traces) == 1
+
+
+def test_saturation_says_what_is_wrong():
+    law = controllers.PDGravity(Kp=1.0, Kd=1.0)
+    with pytest.raises(ValueError, match="hard"):
+        controllers.Saturated(law=law, limit=1.0, kind="soft")
+    with pytest.raises(ValueError, match="> 0"):
+        controllers.Saturated(law=law, limit=0.0)
+    with pytest.raises(ValueError, match=r"Saturated\.law"):
+        controllers.Saturated(law=3.0, limit=1.0)
+
+
+# ------------------------------------------------------------------------------------------------- extended-state observer
+
+
+def test_extended_state_observer_obeys_its_error_equation():
+    scenario = dataclasses.replace(
+        ij.presets.zhang_yan_2024(reading="corrected"), observer=observers.ExtendedState(bandwidth=30.0), initial=ij.Initial(Q, DQ)
+    )
+
+    def f_tilde(t, state):
+        sample = evaluate(scenario, t, state)[1]
+        return sample.disturbance - sample.disturbance_estimate
+
+    def f(t, state):
+        return evaluate(scenario, t, state)[1].disturbance
+
+    def along(g):
+        return lambda t, state: jax.jvp(g, (t, state), (jnp.ones(()), rate(scenario, t, state)))[1]
+
+    t, state = jnp.asarray(0.4), initial_state(scenario)
+    state = state._replace(observer=state.observer._replace(f_hat=jnp.array([0.3, -0.2]), p_hat=state.observer.p_hat + 0.01))
+    left = along(along(f_tilde))(t, state) + 60.0 * along(f_tilde)(t, state) + 900.0 * f_tilde(t, state)
+    np.testing.assert_allclose(left, along(along(f))(t, state) + 60.0 * along(f)(t, state), rtol=1e-8)
+
+
+def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_forms():
+    scenario = ij.presets.zhang_yan_2024(reading="corrected")
+    push = ij.disturbances.Sinusoids(amplitude=0.0, frequency=1.0, offset=[1.0, -0.5])
+    runs = [
+        ij.simulate(dataclasses.replace(scenario, disturbance=push, observer=observer), duration=2.0, dt=1e-3)
+        for observer in (observers.ExtendedState(bandwidth=40.0), observers.ExtendedState(l1=80.0, l2=1600.0))
+    ]
+    np.testing.assert_allclose(runs[0].disturbance_estimate[-1], [1.0, -0.5], atol=1e-8)
+    np.testing.assert_allclose(runs[0].q, runs[1].q, rtol=1e-12)
+    assert "observer.bandwidth" in [p.path for p in ij.parameters(runs[0].scenario)]
+    assert "observer.l2" in [p.path for p in ij.parameters(runs[1].scenario)]
+    for wrong in ({}, {"l1": 1.0}, {"bandwidth": 1.0, "l1": 1.0, "l2": 1.0}):
+        with pytest.raises(ValueError, match="bandwidth"):
+            observers.ExtendedState(**wrong)
