@@ -238,8 +238,9 @@ def _why_not(runs: Mapping[float, Rollout], reference: Rollout) -> str:
     if not sound:
         return "every run failed: " + describe(int(runs[1.0].status) & FAILED)
     efforts = [float(run.metrics.effort_above_gravity) for run in sound.values()]
-    side = "below" if max(efforts) < target else "above" if min(efforts) > target else "on both sides of"
-    text = f"its effort stays {side} {target:.4g} N m ({min(efforts):.4g} to {max(efforts):.4g}) for factors {min(sound):.3g} to {max(sound):.3g}"
+    side = "stays below" if max(efforts) < target else "stays above" if min(efforts) > target else "misses"
+    where = f"{side} {target:.4g} N m ({min(efforts):.4g} to {max(efforts):.4g})"
+    text = f"its effort {where} for factors {min(sound):.3g} to {max(sound):.3g}"
     failed = sorted((factor for factor in runs if factor not in sound), key=lambda factor: abs(math.log(factor)))
     if failed:
         status = Status(int(runs[failed[0]].status) & FAILED)

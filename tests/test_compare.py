@@ -1,6 +1,7 @@
 """`compare`: what it holds equal, what it says, and what it does with laws that fail."""
 
 import dataclasses
+import json
 import math
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import barriers, controllers
+from iblf_jax import barriers, cli, controllers
 from iblf_jax._compare import factor_nearest_one
 
 RUN = {"duration": 2.0, "dt": 1e-3, "record_every": 10}
@@ -156,3 +157,45 @@ def test_wrong_laws_are_value_errors(laws):
 )
 def test_the_factor_is_the_one_nearest_one(effort, target, expected):
     np.testing.assert_allclose(factor_nearest_one(effort, target), expected, rtol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------- figure and command line
+
+
+def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison):
+    figure = comparison.plot(joint=1)
+    assert len(figure.axes) == 6
+    left, right = ({line.get_label(): line.get_color() for line in axes.lines} for axes in figure.axes[:2])
+    assert list(left)[:3] == ["integral", "log", "pd"]
+    assert left == right
+    fewer = dataclasses.replace(comparison, equal_effort={"integral": comparison.rollouts["integral"], "pd": comparison.rollouts["pd"]})
+    axes = fewer.plot().axes
+    assert {line.get_label(): line.get_color() for line in axes[1].lines}["pd"] == left["pd"]
+    assert [text.get_text() for text in axes[5].texts] == ["no factor"] + ["never"] * sum(
+        not np.isfinite(np.max(run.metrics.settling_time)) for run in fewer.equal_effort.values()
+    )
+    assert len(dataclasses.replace(comparison, factors={}, equal_effort={}).plot().axes) == 3
+    with pytest.raises(ValueError, match="joint"):
+        comparison.plot(joint=2)
+    with pytest.raises(ValueError, match=r"ij\.compare"):
+        ij.plotting.comparison(comparison.rollouts["log"])
+
+
+def test_command_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    words = ["--laws", "integral", "log", "--duration", "2", "--record-every", "10", "--out", str(tmp_path / "out")]
+    assert cli.main(["compare", *words]) == 0
+    out = capsys.readouterr().out
+    assert "Equal effort" in out
+    assert "twice the logarithmic" in out
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names >= {"comparison.txt", "comparison.csv", "comparison.json", "comparison_joint_0.png", "comparison_joint_1.pdf", "rollouts.nc"}
+    report = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert report["factors"]["integral"] == 1.0
+    assert report["factors"]["log"] == pytest.approx(1.1, abs=0.1)
+    assert set(ij.load_rollouts(tmp_path / "out" / "rollouts.nc")) == {"integral", "log"}
+
+
+def test_command_line_refuses_an_unknown_law(capsys):
+    assert cli.main(["compare", "zhang_yan_2024", "--laws", "nonsense", "--duration", "0.1"]) == 2
+    assert "one of 'integral'" in capsys.readouterr().err

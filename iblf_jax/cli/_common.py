@@ -21,9 +21,11 @@ RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "
 """How a scenario is run if neither the command line nor its file says."""
 
 
-def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
-    """SCENARIO, --arg and --set."""
-    parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help="a scenario file, or the name of a preset")
+def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """SCENARIO (which may be left out if there is a default), --arg and --set."""
+    words = "a scenario file, or the name of a preset" + (f" (default: {default})" if default else "")
+    optional: dict[str, Any] = {"nargs": "?", "default": default} if default else {}
+    parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=words, **optional)
     parser.add_argument(
         "--arg", action="append", default=[], metavar="NAME=VALUE", help="an argument of the preset, such as law=log; may be repeated"
     )

@@ -18,3 +18,4 @@ from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
 from iblf_jax.plotting._figures import velocity_errors as velocity_errors
 from iblf_jax.plotting._overview import overview as overview
 from iblf_jax.plotting.animation import animate as animate
+from iblf_jax.plotting.comparison import comparison as comparison

@@ -34,7 +34,7 @@ class Row(NamedTuple):
     label: str
 
 
-def _windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) -> tuple[Window, Window]:
+def windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) -> tuple[Window, Window]:
     """The whole time and the zoom's, by default two and a half transients in a round number; ValueError if the zoom is no time."""
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves) or 1e-3
     if zoom is None:
@@ -48,7 +48,7 @@ def _windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) -
 @_style.styled()
 def _rows_with_zoom(title: str, curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None, height: float) -> Figure:
     """A figure of rows against time, with the start magnified in a second column."""
-    whole, start = _windows(curves, rows, zoom)
+    whole, start = windows(curves, rows, zoom)
     figure = _style.new_figure(_style.WIDTH, 1.0 + height * len(rows))
     table = figure.subplots(len(rows), 2, sharex="col", squeeze=False, width_ratios=(2.1, 1))
     for (main, inset), row in zip(table, rows, strict=True):

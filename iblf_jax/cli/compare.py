@@ -1,0 +1,79 @@
+"""`compare`: several laws on one scenario, at the gains they have and at equal effort."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from iblf_jax.cli._common import (
+    add_run_arguments,
+    add_scenario_arguments,
+    output_folder,
+    run_options,
+    scenario_of,
+    verdict,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from iblf_jax._comparison import Comparison
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = subparsers.add_parser(
+        "compare",
+        help="run several laws side by side",
+        description="Run several laws on one scenario, at the gains they have and at equal effort (RMS torque above gravity), and print "
+        "two tables that say what was held equal.",
+        epilog="Exit code 1 if a run at the given gains failed: a bound was violated, the state ran away, or the step was too large.",
+    )
+    add_scenario_arguments(parser, default="zhang_yan_2024")
+    add_run_arguments(parser)
+    parser.add_argument("--laws", nargs="+", metavar="LAW", help="the laws, the first of which sets the effort (default: all)")
+    parser.add_argument("--gains-only", action="store_true", help="do not look for equal effort")
+    parser.add_argument("--out", metavar="DIR", help="write comparison.txt, comparison.csv, comparison.json, figures and rollouts.nc here")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command."""
+    from iblf_jax._compare import compare
+    from iblf_jax.controllers import LAWS
+
+    file = scenario_of(args)
+    options = run_options(args, file)
+    folder = output_folder(args.out) if args.out else None
+    laws = [name for word in args.laws or LAWS for name in word.split(",") if name]
+    result = compare(file.scenario, laws, equal_effort=not args.gains_only, **options)
+    print(f"{args.scenario}\n{result!r}")
+    if folder is not None:
+        _write(folder, args.scenario, result, options)
+    return 1 if result.failed else 0
+
+
+def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any]) -> None:
+    import iblf_jax
+    from iblf_jax import plotting
+    from iblf_jax.io import save_rollouts
+
+    (folder / "comparison.txt").write_text(f"{result!r}\n", encoding="utf-8")
+    result.to_pandas().to_csv(folder / "comparison.csv")
+    report = {
+        "source": source,
+        "run": options,
+        "iblf_jax_version": iblf_jax.__version__,
+        "notes": result.notes,
+        "factors": result.factors,
+        "gains": {name: verdict(one) for name, one in result.rollouts.items()},
+        "effort": {name: verdict(one) for name, one in result.equal_effort.items()},
+    }
+    write_json(folder / "comparison.json", report)
+    joints = range(next(iter(result.rollouts.values())).n)
+    figures = {f"comparison_joint_{joint}": plotting.comparison(result, joint) for joint in joints}
+    plotting.save(figures, folder, formats=("png", "pdf"))
+    save_rollouts(folder / "rollouts.nc", result.rollouts)
+    named = ", ".join(figures)
+    print(f"\nwritten to {folder}: comparison.txt, comparison.csv, comparison.json, {named} (.png, .pdf), rollouts.nc")
