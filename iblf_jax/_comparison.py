@@ -157,11 +157,11 @@ class Comparison:
         lines = [{"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows]
         return pd.DataFrame(lines).set_index(["held", "law"])
 
-    def plot(self, **options):
+    def plot(self, joint: int = 0, **options):
         """Overlaid figure of all laws, at their gains and at equal effort.  Options as `plotting.comparison`."""
         from iblf_jax import plotting
 
-        return plotting.comparison(self, **options)
+        return plotting.comparison(self, joint, **options)
 
 
 def _cells(row: Row) -> tuple[str, ...]:

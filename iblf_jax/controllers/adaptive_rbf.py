@@ -87,7 +87,7 @@ class AdaptiveRBF:
         alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
         tube, e2 = setting.tube(t), dq - alpha
         S = self.basis(q, dq, alpha, dalpha)
-        tau = S @ state - self.K2 * e2 - self.barrier.slope(tube, q)
+        tau = jnp.sum(S[:, None] * state, axis=0) - self.K2 * e2 - self.barrier.slope(tube, q)
         guard_active = guard_is_active(tube, q, self.barrier.guard)
         command = Command(tau, alpha, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active))
         return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.controllers._base import Command, Setting
+from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf
 
 
@@ -39,6 +40,7 @@ class ComputedTorque:
         tube, model = setting.tube(t), setting.model
         ddq_d = jax.jvp(lambda t: setting.tube(t).dq_d, (t,), (jnp.ones_like(t),))[1]
         e1, de1 = q - tube.q_d, dq - tube.dq_d
-        tau = model.mass_matrix(q) @ (ddq_d - self.Kd * de1 - self.Kp * e1) + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
+        accelerate = matvec(model.mass_matrix(q), ddq_d - self.Kd * de1 - self.Kp * e1)
+        tau = accelerate + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * self.Kp * e1**2, never, never), ()

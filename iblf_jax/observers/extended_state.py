@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
+from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots import Robot, mass_matrix_rate
 
@@ -50,7 +51,7 @@ class ExtendedState:
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> ExtendedStateValues:
         """The measured momentum, and no estimate yet."""
-        return ExtendedStateValues(model.mass_matrix(q) @ dq, jnp.zeros_like(q))
+        return ExtendedStateValues(matvec(model.mass_matrix(q), dq), jnp.zeros_like(q))
 
     def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: ExtendedStateValues) -> jax.Array:
         """f_hat, (n,) [N m]."""
@@ -61,6 +62,6 @@ class ExtendedState:
     ) -> ExtendedStateValues:
         """p_hat' and f_hat'."""
         l1, l2 = (self.l1, self.l2) if self.bandwidth is None else (2.0 * self.bandwidth, self.bandwidth**2)
-        innovation = model.mass_matrix(q) @ dq - state.p_hat
-        drift = mass_matrix_rate(model, q, dq) @ dq - model.coriolis(q, dq, dq) - model.gravity(q)
+        innovation = matvec(model.mass_matrix(q), dq) - state.p_hat
+        drift = matvec(mass_matrix_rate(model, q, dq), dq) - model.coriolis(q, dq, dq) - model.gravity(q)
         return ExtendedStateValues(tau + drift + state.f_hat + l1 * innovation, l2 * innovation)
