@@ -23,7 +23,7 @@ from iblf_jax import checks
 from iblf_jax._comparison import Comparison
 from iblf_jax.controllers import LAWS, Controller, law_by_name
 from iblf_jax.controllers.systems import observer_of
-from iblf_jax.metrics import STANDARD, AboveGravity
+from iblf_jax.metrics import AboveGravity, standard
 from iblf_jax.observers import NoObserver
 from iblf_jax.paths import with_parameters
 from iblf_jax.pytree import rewrapped, unwrapped
@@ -137,7 +137,7 @@ def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; a failure is named in the table, not warned of."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return simulate(scenario, metrics=(*STANDARD, AboveGravity()), **options)
+        return simulate(scenario, metrics=(*standard(), AboveGravity()), **options)
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:

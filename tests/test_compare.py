@@ -189,7 +189,14 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     assert "Equal effort" in out
     assert "twice the logarithmic" in out
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names >= {"comparison.txt", "comparison.csv", "comparison.json", "comparison_joint_0.png", "comparison_joint_1.pdf", "rollouts.nc"}
+    assert names >= {
+        "comparison.txt",
+        "comparison.csv",
+        "comparison.json",
+        "comparison_joint_0.png",
+        "comparison_joint_1.pdf",
+        "rollouts.nc",
+    }
     report = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert report["factors"]["integral"] == 1.0
     assert report["factors"]["log"] == pytest.approx(1.1, abs=0.1)
