@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.pytree import component, leaf
 from iblf_jax.references import Reference
 
@@ -78,6 +79,11 @@ class Bounds:
 
     lower: Side
     upper: Side
+
+    def check(self) -> None:
+        """Raises ValueError for a side that is not one."""
+        for name in ("lower", "upper"):
+            checks.conforms(f"Bounds.{name}", getattr(self, name), Side, "A constant bound is iblf_jax.bounds.Constant(value).")
 
 
 class Tube(NamedTuple):

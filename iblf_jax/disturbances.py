@@ -18,6 +18,7 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.pytree import component, leaf
 from iblf_jax.robots import Robot
 
@@ -161,6 +162,14 @@ class Sum:
     """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`."""
 
     parts: tuple[Disturbance, ...]
+
+    def check(self) -> None:
+        """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""
+        if not isinstance(self.parts, tuple | list):
+            raise checks.fail("Sum.parts", self.parts, "a tuple of disturbances", "Put one part into brackets, Sum((part,)).")
+        object.__setattr__(self, "parts", tuple(self.parts))
+        for i, part in enumerate(self.parts):
+            checks.conforms(f"Sum.parts[{i}]", part, Disturbance)
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """The sum over the parts, (n,) [N m]."""

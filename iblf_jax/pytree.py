@@ -102,7 +102,17 @@ def float_dtype(tree: Any) -> jax.typing.DTypeLike:
 
 
 def astype(tree: T, dtype: jax.typing.DTypeLike) -> T:
-    """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`."""
+    """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`.
+
+    Raises:
+      ValueError: a type that is not a floating-point one.
+    """
     import jax.numpy as jnp
 
+    try:
+        floating = jnp.issubdtype(dtype, jnp.floating)
+    except TypeError:
+        floating = False
+    if not floating:
+        raise checks.fail("dtype", dtype, 'a floating-point type, such as "float32"')
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)

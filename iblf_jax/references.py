@@ -7,6 +7,7 @@ and its derivative alpha' is continuous only if q_d" is.
 
 from __future__ import annotations
 
+import functools
 from typing import Protocol
 
 import jax
@@ -78,7 +79,10 @@ class WaypointSpline:
 
     def check(self) -> None:
         """Raises ValueError for times that do not increase or do not match the waypoints."""
-        times = np.asarray(self.times, float)
+        try:
+            times = np.asarray(self.times, float)
+        except (TypeError, ValueError):
+            times = np.zeros(0)
         if times.ndim != 1 or times.size < 2 or not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
             raise checks.fail("WaypointSpline.times", self.times, "at least two strictly increasing times [s]")
         if self.waypoints.ndim != 2 or self.waypoints.shape[0] != times.size:
@@ -97,6 +101,7 @@ class WaypointSpline:
         return basis @ self.waypoints
 
 
+@functools.lru_cache(maxsize=32)
 def _cardinal_splines(times: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are 1 at one waypoint."""
     from scipy.interpolate import PPoly, make_interp_spline

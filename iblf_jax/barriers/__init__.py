@@ -3,8 +3,21 @@
 from iblf_jax.barriers._base import Barrier as Barrier
 from iblf_jax.barriers.integral import Integral as Integral
 from iblf_jax.barriers.log import Log as Log
+from iblf_jax.barriers.mapping import Mapping as Mapping
+from iblf_jax.barriers.prescribed_performance import PrescribedPerformance as PrescribedPerformance
+from iblf_jax.barriers.quadratic import Quadratic as Quadratic
+from iblf_jax.barriers.state import State as State
+from iblf_jax.barriers.tan import Tan as Tan
 
-MEMBERS = {"integral": Integral, "log": Log}
+MEMBERS = {
+    "integral": Integral,
+    "log": Log,
+    "tan": Tan,
+    "state": State,
+    "prescribed_performance": PrescribedPerformance,
+    "mapping": Mapping,
+    "quadratic": Quadratic,
+}
 """Every barrier by the name that a scenario file gives it."""
 
-__all__ = ["MEMBERS", "Barrier", "Integral", "Log"]
+__all__ = ["MEMBERS", "Barrier", "Integral", "Log", "Mapping", "PrescribedPerformance", "Quadratic", "State", "Tan"]

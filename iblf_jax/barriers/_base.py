@@ -7,7 +7,10 @@ backstepping law (`controllers.Backstepping`) needs nothing else.
 **At the wall.**  s has a pole at the bound and the wrong sign beyond it: a step too far and the law pushes outward, NaN spreads
 through the batch and its gradient.  So barriers evaluate at a guarded error (`guarded_error`), which is e1 itself for
 |xi| <= 1 - guard and stays at the edge of that range beyond.  There the slope is constant, large, finite and directed inward,
-V1 goes on along its tangent, and both have finite derivatives everywhere.
+V1 goes on along its tangent, and both have finite derivatives everywhere.  A virtual velocity that is a nonlinear function of the
+error is evaluated there too and goes on with gain k1, so that it still leads back inside.
+
+**Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them and nothing else.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.bounds import Tube
 
 GUARD = 1e-3
@@ -27,7 +31,7 @@ class Barrier(Protocol):
     """What the package asks of a barrier.  All arrays are (n,), one number a joint, and joints do not mix."""
 
     guard: float
-    """Static: the law is exact for |xi| <= 1 - guard."""
+    """Static: the law is exact for |xi| <= 1 - guard; -infinity for a barrier that needs no guard."""
     uses_o: bool
     """Class attribute: whether `virtual_velocity` uses `o`."""
 
@@ -42,6 +46,27 @@ class Barrier(Protocol):
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
         ...
+
+    def decay_rate(self, k1: jax.Array) -> jax.Array | None:
+        """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard is active, or None for no claim."""
+        ...
+
+    def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array | None:
+        """The claim on the bounds: b_i with |xi_i| <= b_i wherever V1_i <= V, or None for no claim.
+
+        Args:
+          V: level of the Lyapunov function, () or (n,), >= 0.
+          tube: the tube at that time; for several barriers the level at which a wall is reached depends on its width.
+        """
+        ...
+
+
+def check_guard(owner: str, guard: float) -> None:
+    """Raises ValueError unless 0 < guard < 1."""
+    if not 0.0 < checks.positive_number(f"{owner}.guard", guard, "1") < 1.0:
+        raise checks.fail(
+            f"{owner}.guard", guard, "a number between 0 and 1", f"It is a distance from the wall in xi; the default is {GUARD:g}."
+        )
 
 
 class GuardedError(NamedTuple):

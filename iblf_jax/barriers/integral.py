@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.barriers._base import GUARD, guarded_error, paper_virtual_velocity
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error, paper_virtual_velocity
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
 
@@ -25,6 +25,10 @@ class Integral:
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = True
 
+    def check(self) -> None:
+        """Raises ValueError for a guard outside (0, 1)."""
+        check_guard("Integral", self.guard)
+
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [1]."""
         e, beyond, k, _ = guarded_error(tube, q, self.guard)
@@ -38,3 +42,11 @@ class Integral:
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s].                                                                          (3.5)"""
         return paper_virtual_velocity(tube, q, k1, o)
+
+    def decay_rate(self, k1: jax.Array) -> jax.Array:
+        """2 k1: V1' <= -2 k1 xi^2/(1 - xi^2) <= -2 k1 V1 at e2 = 0, (n,) [1/s].                        (3.9), (3.19)"""
+        return 2.0 * k1
+
+    def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
+        """|xi| <= sqrt(1 - exp(-V)), (n,) [1].                                                         (3.22)"""
+        return jnp.broadcast_to(jnp.sqrt(-jnp.expm1(-V)), tube.q_d.shape)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
-from iblf_jax.barriers._base import GUARD, guarded_error, paper_virtual_velocity
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error, paper_virtual_velocity
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
 
@@ -27,7 +27,8 @@ class Log:
     uses_o: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raises ValueError unless p is a whole number >= 1."""
+        """Raises ValueError unless p is a whole number >= 1 and the guard in (0, 1)."""
+        check_guard("Log", self.guard)
         checks.positive_integer("Log.p", self.p)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
@@ -48,3 +49,11 @@ class Log:
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         return paper_virtual_velocity(tube, q, k1, o)
+
+    def decay_rate(self, k1: jax.Array) -> jax.Array:
+        """2 p k1: V1' <= -k1 xi^(2p)/(1 - xi^(2p)) <= -2 p k1 V1 at e2 = 0, (n,) [1/s]."""
+        return 2.0 * self.p * k1
+
+    def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
+        """|xi| <= (1 - exp(-2 p V))^(1/(2p)), (n,) [1]."""
+        return jnp.broadcast_to((-jnp.expm1(-2.0 * self.p * V)) ** (1.0 / (2 * self.p)), tube.q_d.shape)

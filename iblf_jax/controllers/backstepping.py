@@ -42,15 +42,21 @@ class Backstepping:
     def check(self) -> None:
         """Raises ValueError for an unknown reading; fits `o` to the barrier (0.1, the paper's, if it needs one)."""
         checks.one_of("Backstepping.reading", self.reading, READINGS)
+        checks.conforms("Backstepping.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().")
         uses_o = getattr(self.barrier, "uses_o", True)
         if uses_o and self.o is None:
             object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
         if not uses_o and self.o is not None:
-            raise checks.fail("Backstepping.o", self.o, f"None with the barrier {type(self.barrier).__name__}", "That barrier has no kappa; leave `o` out.")
+            raise checks.fail(
+                "Backstepping.o",
+                self.o,
+                f"None with the barrier {type(self.barrier).__name__}",
+                "That barrier has no kappa; leave `o` out.",
+            )
 
     def advice(self) -> list[str]:
         """Warnings about gains outside the conditions of Theorem 2."""
-        if bool(jnp.all(self.K2 > 0.5)):
+        if not checks.is_concrete(self.K2) or bool(jnp.all(self.K2 > 0.5)):
             return []
         return [f"controller.K2 = {self.K2}: Theorem 2 needs K2 > 1/2 on every joint (3.17); below it nothing is claimed. Raise K2."]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 
 from iblf_jax import checks
-from iblf_jax.observers.printed import STARTS, initial_eta
+from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
 from iblf_jax.pytree import component, leaf, static
 from iblf_jax.robots import Robot, mass_matrix_rate
 
@@ -27,6 +27,10 @@ class Momentum:
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""
         checks.one_of("Momentum.start", self.start, STARTS)
+
+    def advice(self) -> list[str]:
+        """Warnings about gains outside the conditions of Theorem 2."""
+        return kf_advice(self.kf)
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
         """eta(0), (n,) [N m]."""

@@ -30,6 +30,10 @@ class Printed:
         """Raises ValueError for an unknown `start`."""
         checks.one_of("Printed.start", self.start, STARTS)
 
+    def advice(self) -> list[str]:
+        """Warnings about gains outside the conditions of Theorem 2."""
+        return kf_advice(self.kf)
+
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
         """eta(0), (n,) [N m]."""
         return initial_eta(self, q, dq, model)
@@ -42,6 +46,14 @@ class Printed:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
         return -self.kf * (f_hat + tau - model.coriolis(q, dq, dq) - model.gravity(q))
+
+
+def kf_advice(kf: jax.Array) -> list[str]:
+    """What to tell a user whose kf is below the condition of Theorem 2; nothing for traced values."""
+    if not checks.is_concrete(kf) or bool(jnp.all(kf > 0.5)):
+        return []
+    need = "Theorem 2 needs kf > 1/2 on every joint (3.17), and kf > 1 where f changes (3.25)"
+    return [f"observer.kf = {kf}: {need}; below it nothing is claimed. Raise kf."]
 
 
 def initial_eta(observer, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:

@@ -1,0 +1,233 @@
+"""Every barrier against its definition: quadrature, AD of V1, V1' along alpha, limits, symmetry, claims, and the singular points."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import iblf_jax as ij
+from iblf_jax import barriers
+from iblf_jax.barriers._series import log_remainder, sinc
+from iblf_jax.bounds import Tube, tube_at
+
+K1 = jnp.array([1.3, 2.1])
+O = jnp.array([0.1, 0.1])
+BARRIERS = {name: cls() for name, cls in barriers.MEMBERS.items()} | {"log_p2": barriers.Log(p=2)}
+KAPPA = {"integral", "log", "log_p2"}
+"""Barriers whose alpha compensates a moving bound by kappa >= |k'/k|: V1' is bounded, not given."""
+
+REFERENCE = ij.references.Sinusoid(0.5, 0.14, 1.0, [0.0, 1.5])
+BOUNDS = {
+    "paper": ij.bounds.Bounds(ij.bounds.Sinusoid(0.2, 0.14, 1.0, [1.57, 0.0]), ij.bounds.Sinusoid(0.9, 0.14, 1.0, [1.57, 0.0])),
+    "breathing": ij.bounds.Bounds(ij.bounds.Sinusoid(0.1, 0.1, 1.3, [0.2, 2.0]), ij.bounds.Sinusoid(1.0, 0.2, 0.7, [0.0, 1.0])),
+    "funnel": ij.bounds.Bounds(ij.bounds.Funnel(-0.5, -0.05, 0.8), ij.bounds.Funnel(0.4, 0.1, 0.6)),
+}
+POINTS = [(t, xi) for t in (0.0, 0.4, 2.2) for xi in (-0.97, -0.5, -1e-3, -1e-9, 0.0, 1e-9, 1e-3, 0.4, 0.95)]
+
+
+def tube_of(bounds, t):
+    return tube_at(REFERENCE, bounds, jnp.asarray(t))
+
+
+def position(tube, xi):
+    return tube.q_d + xi * jnp.where(jnp.asarray(xi) > 0, tube.k_u, tube.k_l)
+
+
+def simple_tube(k_l, k_u, dtype=None, dk_l=0.1, dk_u=-0.2, q_d=0.0):
+    one = jnp.ones(2, dtype)
+    return Tube(q_d * one, 0.3 * one, (q_d - k_l) * one, (q_d + k_u) * one, (0.3 - dk_l) * one, (0.3 + dk_u) * one)
+
+
+def rates(barrier, bounds, t, xi):
+    """V1 and its total derivative along q' = alpha, joint by joint."""
+    q = position(tube_of(bounds, t), xi)
+    alpha = barrier.virtual_velocity(tube_of(bounds, t), q, K1, O)
+    return jax.jvp(lambda t, q: barrier.value(tube_of(bounds, t), q), (jnp.asarray(t), q), (jnp.ones(()), alpha))
+
+
+def test_integral_is_twice_the_logarithmic_barrier():
+    tube = simple_tube(0.3, 0.5)
+    q = jnp.linspace(-0.35, 0.6, 50)[:, None] * jnp.ones(2)
+    for method in ("value", "slope"):
+        one = jax.vmap(lambda q, m=method: getattr(barriers.Integral(), m)(tube, q))(q)
+        other = jax.vmap(lambda q, m=method: getattr(barriers.Log(p=1), m)(tube, q))(q)
+        np.testing.assert_allclose(one, 2 * other, rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_slope_is_the_derivative_of_the_value(name, bounds):
+    barrier = BARRIERS[name]
+    for t, xi in POINTS:
+        tube = tube_of(BOUNDS[bounds], t)
+        q = position(tube, xi)
+        slope = jax.jvp(lambda q, tube=tube: barrier.value(tube, q), (q,), (jnp.ones(2),))[1]
+        np.testing.assert_allclose(barrier.slope(tube, q), slope, rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("p", [1, 2, 4])
+@pytest.mark.parametrize("e", [-0.25, -0.01, 0.02, 0.4])
+def test_values_that_are_integrals_match_quadrature(e, p):
+    k_l, k_u, q_d = 0.3, 0.5, 0.6
+    tube, q = simple_tube(k_l, k_u, q_d=q_d), jnp.full(2, q_d + e)
+    xi = abs(e) / (k_u if e > 0 else k_l)
+    integral = quad(lambda s: 2 * s / (1 - s**2), 0, xi)[0]
+    log = quad(lambda s: s ** (2 * p - 1) / (1 - s ** (2 * p)), 0, xi)[0]
+    kc, y = (k_l + k_u) / 2, (k_l - k_u) / 2
+    state = quad(lambda s: s * kc**2 / (kc**2 - (s + y) ** 2), 0, e)[0]
+    np.testing.assert_allclose(barriers.Integral().value(tube, q), integral, rtol=1e-10)
+    np.testing.assert_allclose(barriers.Log(p=p).value(tube, q), log, rtol=1e-10)
+    np.testing.assert_allclose(barriers.State().value(tube, q), state, rtol=1e-10)
+
+
+@pytest.mark.parametrize("bounds", BOUNDS)
+@pytest.mark.parametrize("name", sorted(set(BARRIERS) - KAPPA))
+def test_rate_of_V1_along_alpha_is_what_the_law_promises(name, bounds):
+    barrier = BARRIERS[name]
+    for t, xi in POINTS:
+        tube = tube_of(BOUNDS[bounds], t)
+        q = position(tube, xi)
+        V, dV = rates(barrier, BOUNDS[bounds], t, xi)
+        if name == "state":
+            kc = (tube.k_l + tube.k_u) / 2
+            x = q - (tube.lower + tube.upper) / 2
+            expected = -K1 * kc**2 * (q - tube.q_d) ** 2 / (kc**2 - x**2)
+        else:
+            expected = -barrier.decay_rate(K1) * V
+        np.testing.assert_allclose(dV, expected, rtol=1e-8, atol=1e-15)
+
+
+@pytest.mark.parametrize("bounds", BOUNDS)
+@pytest.mark.parametrize("name", BARRIERS)
+def test_decay_rate_holds(name, bounds):
+    barrier, generator = BARRIERS[name], np.random.default_rng(0)
+    t, xi = jnp.asarray(generator.uniform(0, 6, 400)), jnp.asarray(generator.uniform(-0.998, 0.998, 400))
+    V, dV = jax.vmap(lambda t, xi: rates(barrier, BOUNDS[bounds], t, xi))(t, xi)
+    excess = dV + barrier.decay_rate(K1) * V
+    assert float(jnp.max(excess / (1e-12 + V))) < 1e-8
+
+
+def test_state_rate_is_the_best_constant():
+    # Reference near the wall, position nearer: V1' / V1 comes as near to -k1 as one likes.
+    tube = simple_tube(1.0, 1e-5, dk_l=0.0, dk_u=0.0)
+    barrier, e = barriers.State(), jnp.full(2, -1e-2)
+    ratio = barrier.slope(tube, e) * e / barrier.value(tube, e)
+    assert float(jnp.max(ratio)) < 1.02
+    assert float(jnp.min(ratio)) >= 1.0
+
+
+@pytest.mark.parametrize("bounds", BOUNDS)
+@pytest.mark.parametrize("name", sorted(set(BARRIERS) - {"quadratic"}))
+def test_xi_bound_holds_and_is_reached_on_the_worse_side(name, bounds):
+    barrier = BARRIERS[name]
+    for t in (0.0, 1.1):
+        tube = tube_of(BOUNDS[bounds], t)
+        for size in (1e-3, 0.3, 0.9, 0.99):
+            values = [barrier.value(tube, position(tube, side * size)) for side in (1, -1)]
+            claims = jnp.stack([barrier.xi_bound(V, tube) for V in values])
+            assert bool(jnp.all(claims >= size * (1 - 1e-6)))
+            np.testing.assert_allclose(jnp.min(claims, axis=0), size, rtol=1e-6)
+
+
+def test_no_claim_without_a_barrier():
+    assert barriers.Quadratic().xi_bound(jnp.ones(()), simple_tube(1.0, 1.0)) is None
+
+
+LIMITS = {"integral": (0.0, None), "log": (0.0, None), "log_p2": (0.0, None), "prescribed_performance": (0.0, 1.0), "tan": (1.0, 0.5)}
+LIMITS |= {name: (1.0, 1.0) for name in ("state", "mapping", "quadratic")}
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+def test_limit_of_wide_bounds(name):
+    barrier, wide = BARRIERS[name], simple_tube(1e6, 2e6)
+    e = jnp.array([0.3, -0.2])
+    slope, gain = LIMITS[name]
+    gain = K1 * gain if gain is not None else K1 + jnp.sqrt(O)
+    np.testing.assert_allclose(barrier.slope(wide, e), slope * e, atol=1e-5)
+    np.testing.assert_allclose(barrier.virtual_velocity(wide, e, K1, O), 0.3 - gain * e, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+def test_symmetric_bounds_give_an_odd_law(name):
+    barrier, tube = BARRIERS[name], simple_tube(0.4, 0.4, dk_l=0.1, dk_u=0.1)
+    for e in (1e-8, 1e-3, 0.2, 0.39, 0.45):
+        up, down = jnp.full(2, e), jnp.full(2, -e)
+        np.testing.assert_allclose(barrier.value(tube, up), barrier.value(tube, down), rtol=1e-12)
+        np.testing.assert_allclose(barrier.slope(tube, up), -barrier.slope(tube, down), rtol=1e-12)
+        velocity = [barrier.virtual_velocity(tube, q, K1, O) - tube.dq_d for q in (up, down)]
+        np.testing.assert_allclose(velocity[0], -velocity[1], rtol=1e-12, atol=1e-16)
+
+
+def test_symmetric_forms_are_those_of_the_literature():
+    k, e = 0.4, jnp.array([0.1, -0.3])
+    tube = simple_tube(k, k, dk_l=0.0, dk_u=0.0)
+    np.testing.assert_allclose(barriers.PrescribedPerformance().value(tube, e), 0.5 * jnp.arctanh(e / k) ** 2, rtol=1e-12)
+    np.testing.assert_allclose(barriers.Mapping().slope(tube, e), e * k**4 * (k**2 + e**2) / (k**2 - e**2) ** 3, rtol=1e-12)
+    # y = 0: the state's barrier is the error's, and alpha = q_d' (kc^2 - e^2)/kc^2 rho - k1 e
+    rho = k / (2 * e) * jnp.log((k + e) / (k - e))
+    np.testing.assert_allclose(barriers.State().value(tube, e), -0.5 * k**2 * jnp.log(1 - (e / k) ** 2), rtol=1e-12)
+    fixed = tube._replace(dlower=jnp.zeros(2), dupper=jnp.zeros(2))
+    expected = fixed.dq_d * (k**2 - e**2) / k**2 * rho - K1 * e
+    np.testing.assert_allclose(barriers.State().virtual_velocity(fixed, e, K1, None), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("name", BARRIERS)
+def test_singular_points_are_finite(name, dtype):
+    barrier, tube = BARRIERS[name], simple_tube(0.3, 0.5, dtype)
+    k1, o = K1.astype(dtype), O.astype(dtype)
+
+    def everything(tube, q, k1):
+        return barrier.value(tube, q), barrier.slope(tube, q), barrier.virtual_velocity(tube, q, k1, o)
+
+    def total(tube, q, k1):
+        return sum(jnp.sum(x) for x in everything(tube, q, k1))
+
+    tiny = float(jnp.finfo(dtype).tiny)
+    for e in (0.0, -0.0, tiny, -tiny, 1e-20, 1e-7, -0.3, 0.5, 0.4995, -0.2997, 0.49999, -0.29999, 0.51, -0.4, 3.0, -1e3):
+        q = jnp.full(2, e, dtype)
+        out = everything(tube, q, k1)
+        assert all(x.dtype == dtype for x in out)
+        tangents = jax.tree.map(jnp.ones_like, (tube, q, k1))
+        forward = jax.jvp(everything, (tube, q, k1), tangents)[1]
+        second = jax.jvp(lambda *x: jax.jvp(everything, x, tangents)[1], (tube, q, k1), tangents)[1]
+        reverse = jax.grad(total, argnums=(0, 1, 2))(tube, q, k1)
+        for part in jax.tree.leaves((out, forward, second, reverse)):
+            assert bool(jnp.all(jnp.isfinite(part))), (e, part)
+        backward = sum(jnp.sum(x * t) for x, t in zip(jax.tree.leaves(reverse), jax.tree.leaves(tangents), strict=True))
+        np.testing.assert_allclose(backward, sum(jnp.sum(x) for x in forward), rtol=2e-3 if dtype == jnp.float32 else 1e-9, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", sorted(set(BARRIERS) - {"quadratic"}))
+def test_beyond_the_wall_everything_leads_back(name):
+    barrier, tube = BARRIERS[name], simple_tube(0.3, 0.5)
+    edge = barrier.slope(tube, jnp.full(2, 0.5 * (1 - barrier.guard)))
+    for e in (0.5, 0.6, 5.0):
+        np.testing.assert_allclose(barrier.slope(tube, jnp.full(2, e)), edge, rtol=1e-9)
+        assert bool(jnp.all(barrier.slope(tube, jnp.full(2, -e)) < 0))
+    far = [barrier.virtual_velocity(tube, jnp.full(2, e), K1, O) for e in (0.6, 0.7)]
+    assert bool(jnp.all(far[1] < far[0]))
+    values = [barrier.value(tube, jnp.full(2, e)) for e in (0.49, 0.5, 0.6)]
+    assert bool(jnp.all(values[0] < values[1])) and bool(jnp.all(values[1] < values[2]))
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+def test_switch_at_zero_error_is_continuous(name):
+    barrier, tube = BARRIERS[name], simple_tube(0.3, 0.5)
+    for method in (barrier.value, barrier.slope, lambda tube, q: barrier.virtual_velocity(tube, q, K1, O)):
+        below, above = method(tube, jnp.full(2, -1e-12)), method(tube, jnp.full(2, 1e-12))
+        np.testing.assert_allclose(below, above, atol=1e-10)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_removable_singularities_are_accurate(dtype):
+    u = np.concatenate([np.linspace(-3, 0.99, 500), [0.0, 1e-9, -1e-9, 0.2499, 0.2501, -0.2499, -0.2501, 0.0299, 0.0301]])
+    u = np.asarray(u, dtype).astype(np.longdouble)
+    exact = [np.where(u == 0, 1, np.sin(u) / np.where(u == 0, 1, u))]
+    small = np.abs(u) < 0.05
+    series = sum(u**n / (n + 2) for n in range(40))
+    exact.append(np.where(small, series, (-np.log1p(-u) - u) / np.where(small, 1, u) ** 2))
+    for function, wanted in zip((sinc, log_remainder), exact, strict=True):
+        tolerance = 60 * float(jnp.finfo(dtype).eps)
+        np.testing.assert_allclose(function(jnp.asarray(u.astype(float), dtype)), wanted.astype(float), rtol=tolerance)
