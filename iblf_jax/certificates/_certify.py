@@ -142,7 +142,7 @@ def _traces(facts: Facts) -> Traces:
     run, evidence, case = facts.run, facts.evidence, applicable_case(facts)
     nothing = np.full(run.t.shape, np.nan)
     envelope, left = (nothing, nothing) if case is None else (facts.envelope[case].bound, left_side(facts, case))
-    bounds = {"xi, by V1": nothing, "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
+    bounds = {"xi, by V1": np.full(run.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
     return Traces(
         t=run.t,
         V=evidence.V,

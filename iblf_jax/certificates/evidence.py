@@ -162,13 +162,18 @@ def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, me
     """
     vector_field = partial(rate, scenario)
 
-    def advance(t, state, dt):
-        return step(method, vector_field, t, state, dt, vector_field(t, state))
+    def two_steps(share: jax.Array) -> jax.Array:
+        """V2 after a step of share * dt and one of the rest."""
 
-    whole = advance(t, state, dt)
-    halves = advance(t + 0.5 * dt, advance(t, state, 0.5 * dt), 0.5 * dt)
-    end = t + dt
-    return 2.0 * jnp.abs(evaluate(scenario, end, whole)[1].V - evaluate(scenario, end, halves)[1].V)
+        def advance(place, part):
+            t, state = place
+            return (t + part * dt, step(method, vector_field, t, state, part * dt, vector_field(t, state))), None
+
+        (end, last), _ = jax.lax.scan(advance, (t, state), jnp.stack([share, 1.0 - share]))
+        return evaluate(scenario, end, last)[1].V
+
+    whole, halves = jax.vmap(two_steps)(jnp.asarray([1.0, 0.5], dt.dtype))
+    return 2.0 * jnp.abs(whole - halves)
 
 
 @partial(jax.jit, static_argnames="method")

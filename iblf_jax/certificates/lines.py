@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.facts import Facts
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
+from iblf_jax.scenario import Scenario
 
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 RHO = {1: "(3.19)", 2: "(3.27)"}
@@ -178,13 +180,19 @@ def envelope(facts: Facts, case: int) -> Line:
     return judged(facts, upper.bound - facts.evidence.V, upper.tolerance, {**description, "note": _excluded(facts)})
 
 
+@jax.jit
+def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
+    """The barrier's own bound on |xi| where V1 <= V, (T, n), or None if it states none."""
+    stated = getattr(claims.law_of(scenario).barrier, "xi_bound", None)
+    return None if stated is None else jax.vmap(lambda t, V: stated(V, scenario.setting.tube(t)))(t, V)
+
+
 def bounds_along(facts: Facts, V: np.ndarray) -> dict[str, np.ndarray]:
-    """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V, (T,) each."""
-    xi_bound = getattr(claims.law_of(facts.run.scenario).barrier, "xi_bound", None)
-    by_barrier = None if xi_bound is None else xi_bound(jnp.asarray(V))
+    """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
+    by_barrier = _xi_bound(facts.run.scenario, facts.run.t, jnp.asarray(V, facts.run.t.dtype))
     return {
-        "xi, by V1": np.full(V.shape, np.nan) if by_barrier is None else np.asarray(by_barrier),
-        "xi": np.sqrt(2 * V),
+        "xi, by V1": np.full(facts.run.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier),
+        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], facts.run.q.shape),
         "e2": np.sqrt(2 * V / facts.evidence.lambda_min.min()),
         "f_tilde": np.sqrt(2 * V),
     }
@@ -209,16 +217,13 @@ def bounds(facts: Facts) -> list[Line]:
     sizes |= {"e2": np.linalg.norm(evidence.e2, axis=1), "f_tilde": np.linalg.norm(evidence.f_tilde, axis=1)}
     lines = []
     for description in descriptions:
-        name, per_joint = description["name"], sizes[description["name"]].ndim == 2
+        name = description["name"]
         reason = _no_xi_bound(tight) if name.startswith("xi") else ""
         if reason and (name == "xi" or np.all(np.isnan(tight["xi, by V1"]))):
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        bound, slack = tight[name], wide[name] - tight[name]
-        if per_joint:
-            bound, slack = bound[:, None], slack[:, None]
         note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(facts)) if x)
-        lines.append(judged(facts, bound - sizes[name], slack, {**description, "note": note}))
+        lines.append(judged(facts, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
     return lines
 
 

@@ -117,7 +117,7 @@ class Certificate:
         rows = [("", "equation", "verdict", "margin", "value", "where the margin is smallest"), *self._rows()]
         widths = [max(len(row[i]) for row in rows) for i in range(6)]
         text = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-        notes = [f"  {line.name}: {line.note}" for line in self.lines if line.note]
+        notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
         return "\n".join([f"Certificate: {self.verdict}  ({self._subject()})", *text, *(["notes", *notes] if notes else [])])
 
     def _repr_html_(self) -> str:
@@ -129,6 +129,14 @@ class Certificate:
             body.append(f"<tr{weight}>" + "".join(f'<td style="text-align:left">{html.escape(c)}</td>' for c in cells) + "</tr>")
         title = f"<b>Certificate: {html.escape(self.verdict)}</b> ({html.escape(self._subject())})"
         return f"{title}<table><tr>{head}</tr>{''.join(body)}</table>"
+
+    def _notes(self) -> dict[str, list[str]]:
+        """Each note and the lines that it belongs to."""
+        notes: dict[str, list[str]] = {}
+        for line in self.lines:
+            if line.note:
+                notes.setdefault(line.note, []).append(line.name)
+        return notes
 
     def _subject(self) -> str:
         return self.heading + (f"; {len(self.runs)} runs, worst {self.worst_run}" if self.runs else "")
