@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from iblf_jax import checks
 from iblf_jax.closed_loop import Sample
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 
 
 class Fold(Protocol):
@@ -95,7 +95,7 @@ class Settling:
     overshoot: the largest |e1| on the side of zero opposite to the start's.
     """
 
-    tolerance: jax.Array = leaf("rad", sign="positive", default=0.01)
+    tolerance: Leaf = leaf("rad", sign="positive", default=0.01)
     units: ClassVar[dict[str, str]] = {"settling_time": "s", "overshoot": "rad"}
 
     def init(self, sample: Sample) -> _SettlingState:
@@ -154,7 +154,7 @@ class Margin:
         )
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
-        """margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
+        """Margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
         return {
             "margin": acc.margin,
             "xi_margin": acc.xi,

@@ -16,13 +16,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
 from iblf_jax import checks
 
 T = TypeVar("T")
+
+Leaf: TypeAlias = Any
+"""Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a `jax.Array` from then on."""
 
 
 def leaf(unit: str, *, sign: str | None = None, shape: str = "joint", default: Any = dataclasses.MISSING) -> Any:

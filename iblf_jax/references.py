@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 
 
 class Reference(Protocol):
@@ -33,10 +33,10 @@ class Sinusoid:
     Source: Zhang & Yan 2024, equation (4.2).
     """
 
-    offset: jax.Array = leaf("rad")
-    amplitude: jax.Array = leaf("rad")
-    frequency: jax.Array = leaf("rad/s", default=1.0)
-    phase: jax.Array = leaf("rad", default=0.0)
+    offset: Leaf = leaf("rad")
+    amplitude: Leaf = leaf("rad")
+    frequency: Leaf = leaf("rad/s", default=1.0)
+    phase: Leaf = leaf("rad", default=0.0)
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
@@ -52,9 +52,9 @@ class Quintic:
     Velocity and acceleration vanish at both ends.  Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
     """
 
-    start: jax.Array = leaf("rad")
-    end: jax.Array = leaf("rad")
-    duration: jax.Array = leaf("s", sign="positive", shape="scalar")
+    start: Leaf = leaf("rad")
+    end: Leaf = leaf("rad")
+    duration: Leaf = leaf("s", sign="positive", shape="scalar")
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
@@ -74,7 +74,7 @@ class WaypointSpline:
 
     times: tuple[float, ...] = static()
     """Strictly increasing times of the waypoints [s]."""
-    waypoints: jax.Array = leaf("rad", shape="any")
+    waypoints: Leaf = leaf("rad", shape="any")
     """One row a time, (m, n)."""
 
     def check(self) -> None:

@@ -296,5 +296,5 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
         f"reference of joint {joint}",
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g}, {float(upper[sample, joint]):.6g}) at {where}",
-        "The reference must stay strictly inside the bounds for the whole run (Assumption 2): move it, widen the bounds or shorten the run.",
+        "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the bounds or shorten the run.",
     )

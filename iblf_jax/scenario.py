@@ -20,7 +20,7 @@ from iblf_jax.bounds import Bounds, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
-from iblf_jax.pytree import component, is_leaf_field, leaf
+from iblf_jax.pytree import Leaf, component, is_leaf_field, leaf
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
 from iblf_jax.status import VELOCITY_LIMIT
@@ -30,8 +30,8 @@ from iblf_jax.status import VELOCITY_LIMIT
 class Initial:
     """Where a run starts."""
 
-    q: jax.Array = leaf("rad")
-    dq: jax.Array = leaf("rad/s", default=0.0)
+    q: Leaf = leaf("rad")
+    dq: Leaf = leaf("rad/s", default=0.0)
 
 
 PARTS = (
@@ -62,7 +62,7 @@ class Scenario:
     initial: Initial
     observer: Observer = NoObserver()
     disturbance: Disturbance = Nothing()
-    model: Robot | None = None
+    model: Robot = None  # type: ignore[assignment]
     """What law and observer know; the plant itself if not given."""
 
     def check(self) -> None:

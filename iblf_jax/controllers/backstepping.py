@@ -18,7 +18,7 @@ from iblf_jax import checks
 from iblf_jax.barriers import Barrier, Integral
 from iblf_jax.barriers._base import guard_is_active
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 
 READINGS = ("printed", "corrected")
 
@@ -30,11 +30,11 @@ class Backstepping:
     Source: Zhang & Yan 2024, (3.5), (3.14); `corrected` as said at the head of this module.
     """
 
-    k1: jax.Array = leaf("1/s", sign="positive")
+    k1: Leaf = leaf("1/s", sign="positive")
     """Gain of the virtual velocity."""
-    K2: jax.Array = leaf("N m s/rad", sign="positive")
+    K2: Leaf = leaf("N m s/rad", sign="positive")
     """Diagonal of the velocity error's gain; Theorem 2 asks for more than 1/2."""
-    o: jax.Array | None = leaf("1/s^2", sign="positive", default=None)
+    o: Leaf = leaf("1/s^2", sign="positive", default=None)
     """Margin under the root of kappa (3.7), for barriers that compensate a moving bound by kappa; else None."""
     barrier: Barrier = Integral()
     reading: str = static(default="printed")

@@ -6,7 +6,7 @@ import jax
 
 from iblf_jax import checks
 from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot, mass_matrix_rate
 
 
@@ -18,8 +18,8 @@ class Momentum:
     Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for the form.
     """
 
-    kf: jax.Array = leaf("1/s", sign="positive")
-    eta0: jax.Array = leaf("N m", default=0.0)
+    kf: Leaf = leaf("1/s", sign="positive")
+    eta0: Leaf = leaf("N m", default=0.0)
     """eta(0), added to what `start` says."""
     start: str = static(default="zero")
     """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot
 
 STARTS = ("zero", "matched")
@@ -20,8 +20,8 @@ class Printed:
     Source: Zhang & Yan 2024, (3.11), signs restored.
     """
 
-    kf: jax.Array = leaf("1/s", sign="positive")
-    eta0: jax.Array = leaf("N m", default=0.0)
+    kf: Leaf = leaf("1/s", sign="positive")
+    eta0: Leaf = leaf("N m", default=0.0)
     """eta(0), added to what `start` says."""
     start: str = static(default="zero")
     """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""
