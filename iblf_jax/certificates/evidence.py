@@ -135,7 +135,9 @@ def _sizes(scenario: Scenario, t: jax.Array, state: LoopState, M0, now, ahead, f
     """Sizes of the terms of V2' and f', and the error of sqrt(2 V2) for one unit of relative error."""
     law, observer = law_of(scenario), scenario.observer
     K2, kf = getattr(law, "K2", jnp.zeros_like(state.q)), getattr(observer, "kf", jnp.zeros_like(state.q))
-    gap = jnp.maximum(1.0 - jnp.abs(now["xi"]), jnp.finfo(f_tilde.dtype).eps)
+    guard = getattr(getattr(law, "barrier", None), "guard", -1.0)
+    # How much nearer the wall than the tube is wide: relative errors grow by 1/gap there, if the barrier has a wall.
+    gap = jnp.clip(1.0 - jnp.abs(now["xi"]), guard, 1.0) if guard > 0 else jnp.ones_like(f_tilde)
     slow = jnp.abs(state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
     fast = jnp.abs(now["ddq"]) + jnp.abs(ahead["alpha"])
     torque = jnp.abs(M0) @ fast + jnp.abs(now["tau"]) + jnp.abs(now["disturbance_estimate"]) + K2 * slow + jnp.abs(now["s"]) / gap

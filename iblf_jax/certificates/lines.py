@@ -27,6 +27,8 @@ BOUNDS = {1: "(3.23)", 2: "(3.31)"}
 LEFT = {1: "V2' + rho V2 <= 0", 2: "V2' + rho V2 - |f'|^2/2 <= 0"}
 ENVELOPED = {1: "V2(t) <= V2(0) exp(-rho t)", 2: "V2(t) <= V2(0) exp(-rho t) + rho2/rho"}
 
+NO_BOUND = "the barrier states no bound on xi from V1"
+
 
 def all_lines(facts: Facts) -> list[Line]:
     """Every line of the certificate of one run, in the theorem's order."""
@@ -230,7 +232,7 @@ def bounds(facts: Facts) -> list[Line]:
 def _no_xi_bound(tight: dict[str, np.ndarray]) -> str:
     """Why |xi| <= sqrt(2 V) does not follow for this barrier; "" if it does (xi^2/2 <= V1, Theorem 1)."""
     if np.all(np.isnan(tight["xi, by V1"])):
-        return "the barrier states no bound on xi from V1"
+        return NO_BOUND
     stronger = tight["xi, by V1"] <= tight["xi"] * (1 + 1e-9)
     return "" if np.all(stronger | np.isnan(tight["xi"])) else "xi^2/2 <= V1 (Theorem 1) is not so for this barrier"
 
@@ -239,8 +241,8 @@ def dropped(facts: Facts) -> list[Line]:
     """The size of the terms that the printed proof drops, against the margin that the proof has without them."""
     law, evidence, case = claims.law_of(facts.run.scenario), facts.evidence, applicable_case(facts)
     described = (
-        ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 <= the margin that the proof leaves", evidence.dropped_e2),
-        ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' <= the margin that the proof leaves", evidence.dropped_f),
+        ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", evidence.dropped_e2),
+        ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", evidence.dropped_f),
     )
     exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(facts))
     lines = []
@@ -271,7 +273,9 @@ def conclusion(facts: Facts) -> Line:
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
     case = applicable_case(facts)
     line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(facts.run.t[at]))
-    if case is None:
-        note = f"no claim, only seen ({why_not(facts, facts.case)})"
+    unclaimed = case is not None and _xi_bound(facts.run.scenario, facts.run.t[:1], facts.evidence.V[:1]) is None
+    if case is None or unclaimed:
+        reason = NO_BOUND if unclaimed else why_not(facts, facts.case)
+        note = f"no claim, only seen ({reason})"
         return Line(**{**vars(line), "verdict": NOT_APPLICABLE, "note": note})
     return line
