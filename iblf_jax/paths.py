@@ -2,7 +2,8 @@
 
 Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow the fields of the components;
 `[i]` selects a part of a `Sum` or one entry of an array.  `robot.` stands for `plant.` and `model.` together: use it to change the
-robot that is simulated and the one that the law knows alike.
+robot that is simulated and the one that the law knows alike.  A component that wraps another (class attribute `wraps`, such as
+`controllers.Saturated`) is looked through: "controller.K2" is the wrapped law's K2, and "controller.law.K2" works too.
 """
 
 from __future__ import annotations
@@ -77,10 +78,17 @@ def _walk(part: Any, path: str) -> Iterator[Parameter]:
         for i, x in enumerate(part):
             yield from _walk(x, f"{path}[{i}]")
     elif dataclasses.is_dataclass(part) and not isinstance(part, type):
+        own = {field.name for field in dataclasses.fields(part)}
         for field in dataclasses.fields(part):
             if field.metadata.get("static"):
                 continue
             value, name = getattr(part, field.name), f"{path}.{field.name}" if path else field.name
+            if field.name == getattr(type(part), "wraps", None):
+                # As a user would type them, unless the wrapper has a field of that name.
+                for inner in _walk(value, path):
+                    rest = inner.path[len(path) :].lstrip(".")
+                    yield inner if parse(rest)[0] not in own else inner._replace(path=f"{name}.{rest}")
+                continue
             if isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
                 yield Parameter(name, jnp.shape(value), field.metadata.get("unit", ""), value)
             else:
@@ -119,18 +127,31 @@ def _unknown(scenario: Scenario, path: str) -> ValueError:
 
 def get(scenario: Scenario, path: str) -> Any:
     """The value at a path (the plant's, for `robot.`)."""
+    return _resolved(scenario, path, expand(path)[0])[1]
+
+
+def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int], Any]:
+    """The tokens of a full path, with the names of wrapped components filled in, and the value there."""
     value: Any = scenario
-    full = expand(path)[0]
+    tokens: list[str | int] = []
     for token in parse(full):
         try:
+            while isinstance(token, str) and getattr(type(value), "wraps", None) and not _has_field(value, token):
+                tokens.append(type(value).wraps)
+                value = _field(value, type(value).wraps)
             value = _entry(value, token) if isinstance(token, int) else _field(value, token)
         except (AttributeError, IndexError, TypeError, KeyError):
             raise _unknown(scenario, path) from None
         if isinstance(token, int) and not isinstance(value, jax.Array | np.ndarray | float) and not dataclasses.is_dataclass(value):
             raise _unknown(scenario, path)
+        tokens.append(token)
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
         raise _unknown(scenario, path)
-    return value
+    return tokens, value
+
+
+def _has_field(part: Any, name: str) -> bool:
+    return any(field.name == name for field in dataclasses.fields(part))
 
 
 def _entry(part: Any, index: int) -> Any:
@@ -197,6 +218,5 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         raise checks.fail("values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}')
     for path, value in values.items():
         for full in expand(path):
-            get(scenario, full)
-            scenario = _replaced(scenario, parse(full), value, full, None)
+            scenario = _replaced(scenario, _resolved(scenario, path, full)[0], value, full, None)
     return scenario

@@ -9,8 +9,9 @@ import numpy as np
 
 from iblf_jax import bounds as bounds_
 from iblf_jax import checks, disturbances, references
-from iblf_jax.barriers import Integral, Log
-from iblf_jax.controllers import Backstepping
+from iblf_jax.controllers import LAWS as LAWS
+from iblf_jax.controllers import Saturated, law_by_name
+from iblf_jax.controllers.systems import observer_of
 from iblf_jax.observers import Momentum, Printed
 from iblf_jax.robots import TwoLink
 from iblf_jax.scenario import Initial, Scenario
@@ -30,7 +31,9 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
     """The paper's simulation, section 4.                                                                 (4.1)-(4.3)
 
     Args:
-      law: "integral" (the paper's) or "log" (its comparison).
+      law: "integral" (the paper's), "log" (its comparison), or any other of `LAWS`: the systems that the paper names, at the same gains
+        k1, K2 and o, and the yardsticks "computed_torque" and "pd" at their own.  "backstepping" is the unconstrained one;
+        "adaptive_rbf" and "pd" run without an observer.
       reading: "printed", or "corrected" (law with C0 alpha, observer in momentum form), for which Theorem 2 is exact.
       p: exponent of the logarithmic barrier.
 
@@ -42,9 +45,8 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
 
     Source: Zhang & Yan 2024, section 4; the arm's parameters are an assumption, see `customary_two_link`.
     """
-    checks.one_of("law", law, ("integral", "log"))
     checks.one_of("reading", reading, ("printed", "corrected"))
-    barrier = Integral() if law == "integral" else Log(p=p)
+    controller = law_by_name(law, k1=2.0, K2=20.0, o=0.1, reading=reading, p=p)
     cosine = math.pi / 2
     return Scenario(
         plant=customary_two_link(),
@@ -61,8 +63,8 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
             velocity_frequency=0.5,
             velocity_phase=[cosine, 0.0],
         ),
-        controller=Backstepping(k1=2.0, K2=20.0, o=0.1, barrier=barrier, reading=reading),
-        observer=(Printed if reading == "printed" else Momentum)(kf=20.0),
+        controller=controller,
+        observer=observer_of(law, (Printed if reading == "printed" else Momentum)(kf=20.0)),
         initial=Initial(q=0.8, dq=0.0),
     )
 
@@ -94,5 +96,53 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
     )
 
 
-PRESETS = {"zhang_yan_2024": zhang_yan_2024, "printed_gap": printed_gap}
+def zhang_yan_2024_saturated(
+    *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (8.0, 3.0), kind: str = "hard"
+) -> Scenario:
+    """The paper's simulation with a torque limit below the peak that the law asks for (13.8, 16.3 N m).
+
+    The limit is above what gravity and the motion need, so the error still converges; the claims of Theorem 2 do not hold
+    while the torque is cut.
+
+    Args:
+      law, reading: as `zhang_yan_2024`.
+      limit: largest torque, one number or one a joint [N m].
+      kind: "hard", or "smooth" for gradients.
+
+    Raises:
+      ValueError: an unknown law, reading or kind; a limit that is not positive.
+
+    Source: this package; the paper leaves saturation to future work.
+    """
+    scenario = zhang_yan_2024(law=law, reading=reading)
+    return dataclasses.replace(scenario, controller=Saturated(law=scenario.controller, limit=limit, kind=kind))
+
+
+def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str = "corrected") -> Scenario:
+    """The paper's arm, reference and disturbance with prescribed performance: funnels inside the paper's bounds.
+
+        q_d - r_l(t) < q < q_d + r_u(t),   r(t) = (r0 - 0.05) exp(-2 t) + 0.05
+
+    with r0 = (0.5, 0.25) rad above and (0.15, 0.4) rad below: from 1 s on the error must be within 0.12 rad, in the end within 0.05 rad.
+
+    Args:
+      law, reading: as `zhang_yan_2024`.
+
+    Raises:
+      ValueError: an unknown law or reading.
+
+    Source: Zhang & Yan 2024, section 4, with a funnel as in its references [10, 11]; the funnel's numbers are this package's.
+    """
+    scenario = zhang_yan_2024(law=law, reading=reading)
+    lower = bounds_.Funnel(initial=[-0.15, -0.4], final=-0.05, rate=2.0)
+    upper = bounds_.Funnel(initial=[0.5, 0.25], final=0.05, rate=2.0)
+    return dataclasses.replace(scenario, bounds=bounds_.Bounds(lower=lower, upper=upper))
+
+
+PRESETS = {
+    "zhang_yan_2024": zhang_yan_2024,
+    "printed_gap": printed_gap,
+    "zhang_yan_2024_saturated": zhang_yan_2024_saturated,
+    "zhang_yan_2024_funnel": zhang_yan_2024_funnel,
+}
 """Every preset by name."""

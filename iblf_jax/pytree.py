@@ -91,6 +91,19 @@ def component(cls: type[T]) -> type[T]:
     return cls
 
 
+def unwrapped(part: Any) -> Any:
+    """The innermost component of one that wraps another (class attribute `wraps`: the name of the field that holds it)."""
+    while getattr(type(part), "wraps", None):
+        part = getattr(part, type(part).wraps)
+    return part
+
+
+def rewrapped(part: Any, inner: Any) -> Any:
+    """`part` with its innermost component replaced by `inner`; `inner` itself if `part` wraps nothing."""
+    name = getattr(type(part), "wraps", None)
+    return inner if not name else dataclasses.replace(part, **{name: rewrapped(getattr(part, name), inner)})
+
+
 def is_leaf_field(field: dataclasses.Field) -> bool:
     """Whether a dataclass field was declared with `leaf`."""
     return bool(field.metadata.get("leaf"))

@@ -10,7 +10,8 @@ through the batch and its gradient.  So barriers evaluate at a guarded error (`g
 V1 goes on along its tangent, and both have finite derivatives everywhere.  A virtual velocity that is a nonlinear function of the
 error is evaluated there too and goes on with gain k1, so that it still leads back inside.
 
-**Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them and nothing else.
+**Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them and nothing else.  A barrier may
+lack them and then claims nothing.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from iblf_jax.pytree import Leaf
 
 GUARD = 1e-3
 """Default distance from the wall, in xi, at which the guard takes over."""
+
+CLAIMS = ("decay_rate", "xi_bound")
+"""Methods that a barrier may lack; then it claims nothing."""
 
 
 class Barrier(Protocol):

@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.barriers._base import GUARD, guarded_error
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
 
@@ -25,6 +25,10 @@ class Mapping:
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Raises ValueError for a guard outside (0, 1)."""
+        check_guard("Mapping", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""
@@ -67,7 +71,7 @@ class Mapping:
 
 
 def _mapped(e: jax.Array, tube: Tube) -> tuple[jax.Array, jax.Array]:
-    """z [rad] and z_e [1], in e/k so that wide bounds do not overflow."""
+    """The mapped error z [rad] and z_e [1], in e/k so that wide bounds do not overflow."""
     a, b = e / tube.k_l, e / tube.k_u
     room = (1.0 + a) * (1.0 - b)
     return e / room, (1.0 + a * b) / room**2

@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.barriers._base import GUARD, guarded_error
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
 
@@ -18,13 +18,18 @@ class PrescribedPerformance:
 
         s = eps eps_e,   alpha = q_d' - (k1 eps + eps_t) / eps_e
 
-    eps_e = 1/2 (1/(k_l + e1) + 1/(k_u - e1)), and eps_t is the rate of eps at fixed e1.  At e2 = 0, V1' = -k1 eps^2.  Its bounds are usually
-    a `bounds.Funnel`, r(t) = (r0 - rinf) exp(-l t) + rinf; any bounds do.  For k -> infinity s -> 0 and the gain of alpha is k1.
+    eps_e = 1/2 (1/(k_l + e1) + 1/(k_u - e1)), and eps_t is the rate of eps at fixed e1.  At e2 = 0, V1' = -k1 eps^2.
+    Its bounds are usually a `bounds.Funnel`, r(t) = (r0 - rinf) exp(-l t) + rinf; any bounds do.  For k -> infinity s -> 0 and the
+    gain of alpha is k1.
     Source: C. P. Bechlioulis, G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099.
     """
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Raises ValueError for a guard outside (0, 1)."""
+        check_guard("PrescribedPerformance", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [1]."""

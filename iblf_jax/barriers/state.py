@@ -28,7 +28,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.barriers._base import GUARD, guarded_error
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error
 from iblf_jax.barriers._series import log_remainder
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
@@ -69,6 +69,10 @@ class State:
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Raises ValueError for a guard outside (0, 1)."""
+        check_guard("State", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

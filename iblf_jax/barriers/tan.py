@@ -8,7 +8,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.barriers._base import GUARD, guarded_error
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error
 from iblf_jax.barriers._series import sinc
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
@@ -27,6 +27,10 @@ class Tan:
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Raises ValueError for a guard outside (0, 1)."""
+        check_guard("Tan", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

@@ -37,10 +37,10 @@ class Claim(NamedTuple):
 
 
 def law_of(scenario: Scenario) -> Any:
-    """The law itself, without a wrapper around it that limits the torque."""
+    """The law itself, without what wraps it (a torque limit)."""
     law = scenario.controller
-    while not isinstance(law, Backstepping) and hasattr(law, "law"):
-        law = law.law
+    while getattr(law, "wraps", None) is not None:
+        law = getattr(law, law.wraps)
     return law
 
 

@@ -26,6 +26,8 @@ from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status, describe
 
 DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
+NOISE = 32.0
+"""Units of the last place by which sqrt(2 V2) may be off, relative to the sizes of its terms."""
 
 
 class Envelope(NamedTuple):
@@ -106,7 +108,7 @@ def _envelope(run: Rollout, evidence: Evidence, defect: np.ndarray, jumps: np.nd
     bound, tolerance = np.full(size, np.nan), np.full(size, np.nan)
     if not rate > 0:
         return Envelope(bound, tolerance)
-    noise = rounding(V.dtype) * evidence.V_terms
+    noise = NOISE * float(np.finfo(V.dtype).eps) * evidence.V_terms
     steps = np.rint(np.diff(t) / float(run.dt))
     starts = starts_of(t, evidence.held, jumps)
     first, carried = 0, 0.0

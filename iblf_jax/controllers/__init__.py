@@ -1,11 +1,35 @@
-"""Tracking laws.  The contract is `Controller` in `_base.py`."""
+"""Tracking laws.  The contract is `Controller` in `_base.py`; `systems.py` has the paper's systems by name."""
 
 from iblf_jax.controllers._base import Command as Command
 from iblf_jax.controllers._base import Controller as Controller
 from iblf_jax.controllers._base import Setting as Setting
+from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping as Backstepping
+from iblf_jax.controllers.computed_torque import ComputedTorque as ComputedTorque
+from iblf_jax.controllers.pd_gravity import PDGravity as PDGravity
+from iblf_jax.controllers.saturated import Saturated as Saturated
+from iblf_jax.controllers.systems import LAWS as LAWS
+from iblf_jax.controllers.systems import law_by_name as law_by_name
 
-MEMBERS = {"backstepping": Backstepping}
+MEMBERS = {
+    "backstepping": Backstepping,
+    "adaptive_rbf": AdaptiveRBF,
+    "computed_torque": ComputedTorque,
+    "pd_gravity": PDGravity,
+    "saturated": Saturated,
+}
 """Every law by the name that a scenario file gives it."""
 
-__all__ = ["MEMBERS", "Backstepping", "Command", "Controller", "Setting"]
+__all__ = [
+    "LAWS",
+    "MEMBERS",
+    "AdaptiveRBF",
+    "Backstepping",
+    "Command",
+    "ComputedTorque",
+    "Controller",
+    "PDGravity",
+    "Saturated",
+    "Setting",
+    "law_by_name",
+]

@@ -47,7 +47,12 @@ class Command(NamedTuple):
 
 
 class Controller(Protocol):
-    """What the package asks of a law."""
+    """What the package asks of a law.
+
+    A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it works ("k1", "K2" if it says nothing),
+    which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `wraps`, the name of the field that holds
+    another law whose paths are then its own ("controller.K2" reaches through).  And a method `advice()`, a list of warnings.
+    """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""

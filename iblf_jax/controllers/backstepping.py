@@ -11,12 +11,14 @@ C0 q', which cancels that term by skew symmetry, and then the claim of Theorem 2
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
 from iblf_jax.barriers import Barrier, Integral
-from iblf_jax.barriers._base import guard_is_active
+from iblf_jax.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.controllers._base import Command, Setting
 from iblf_jax.pytree import Leaf, component, leaf, static
 
@@ -38,21 +40,13 @@ class Backstepping:
     """Margin under the root of kappa (3.7), for barriers that compensate a moving bound by kappa; else None."""
     barrier: Barrier = Integral()
     reading: str = static(default="printed")
+    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
 
     def check(self) -> None:
         """Raises ValueError for an unknown reading; fits `o` to the barrier (0.1, the paper's, if it needs one)."""
         checks.one_of("Backstepping.reading", self.reading, READINGS)
-        checks.conforms("Backstepping.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().")
-        uses_o = getattr(self.barrier, "uses_o", True)
-        if uses_o and self.o is None:
-            object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
-        if not uses_o and self.o is not None:
-            raise checks.fail(
-                "Backstepping.o",
-                self.o,
-                f"None with the barrier {type(self.barrier).__name__}",
-                "That barrier has no kappa; leave `o` out.",
-            )
+        checks.conforms("Backstepping.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().", CLAIMS)
+        fit_o(self)
 
     def advice(self) -> list[str]:
         """Warnings about gains outside the conditions of Theorem 2."""
@@ -68,14 +62,33 @@ class Backstepping:
         self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]
     ) -> tuple[Command, tuple[()]]:
         """The torque (3.14) and what belongs to it."""
-
-        def alpha_at(t, q):
-            return self.barrier.virtual_velocity(setting.tube(t), q, self.k1, self.o)
-
-        alpha, dalpha = jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))
+        alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
         tube, model = setting.tube(t), setting.model
         carried = alpha if self.reading == "corrected" else dq
         feedforward = model.coriolis(q, dq, carried) + model.gravity(q) + model.mass_matrix(q) @ dalpha
         tau = feedforward - f_hat - self.K2 * (dq - alpha) - self.barrier.slope(tube, q)
         guard_active = guard_is_active(tube, q, self.barrier.guard)
         return Command(tau, alpha, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active)), ()
+
+
+def fit_o(law) -> None:
+    """Fits `o` of a law under construction to its barrier: 0.1, the paper's, if the barrier needs one and none was given.
+
+    Raises:
+      ValueError: an `o` for a barrier that has no kappa.
+    """
+    uses_o = getattr(law.barrier, "uses_o", True)
+    if uses_o and law.o is None:
+        object.__setattr__(law, "o", jnp.full_like(law.k1, 0.1))
+    if not uses_o and law.o is not None:
+        barrier = type(law.barrier).__name__
+        raise checks.fail(f"{type(law).__name__}.o", law.o, f"None with the barrier {barrier}", "That barrier has no kappa; leave `o` out.")
+
+
+def alpha_and_rate(law, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[jax.Array, jax.Array]:
+    """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,), for a law with `barrier`, `k1`, `o`."""
+
+    def alpha_at(t, q):
+        return law.barrier.virtual_velocity(setting.tube(t), q, law.k1, law.o)
+
+    return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))

@@ -1,0 +1,103 @@
+"""Adaptive radial-basis network with a barrier: no model, no observer, weights that are part of the loop's state.
+
+What the backstepping law takes from the model, M0 alpha' + C0 alpha + G0 - f, a network of Gaussians learns while it runs:
+
+    W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),   z = Z over its spans
+    W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
+
+The sigma-modification bounds the weights whatever happens: as |S| <= sqrt(nodes), the column of joint i obeys
+|W_hat_i| <= sqrt(nodes) sup|e2_i| / sigma.  The literature puts the centres on a lattice, which in the 4n dimensions of Z has
+nodes^(4n) points; here they are a fixed number of points of a Sobol sequence in the box [-1, 1]^(4n).
+
+ASSUMPTION: the source's own node count, centres and gains could not be found; all numbers here are this package's.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.barriers import Barrier, Log
+from iblf_jax.barriers._base import CLAIMS, guard_is_active
+from iblf_jax.controllers._base import Command, Setting
+from iblf_jax.controllers.backstepping import alpha_and_rate, fit_o
+from iblf_jax.pytree import Leaf, component, leaf, static
+
+
+@component
+class AdaptiveRBF:
+    """tau = -s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
+
+    s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes, n) [N m].
+    Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068; numbers as said at the head of this module.
+    """
+
+    k1: Leaf = leaf("1/s", sign="positive")
+    """Gain of the virtual velocity."""
+    K2: Leaf = leaf("N m s/rad", sign="positive")
+    """Diagonal of the velocity error's gain."""
+    o: Leaf = leaf("1/s^2", sign="positive", default=None)
+    """As `Backstepping.o`."""
+    Gamma: Leaf = leaf("N m/rad", sign="positive", default=20.0)
+    """Rate of adaptation of each joint's weights."""
+    sigma: Leaf = leaf("rad/(N m s)", sign="positive", default=0.005)
+    """Leak that bounds the weights; what it forgets stays as an error."""
+    middle: Leaf = leaf("rad", default=0.5)
+    """Position at the centre of the nodes' box."""
+    span_q: Leaf = leaf("rad", sign="positive", default=0.5)
+    """Half the box in q."""
+    span_dq: Leaf = leaf("rad/s", sign="positive", default=1.0)
+    """Half the box in q' and alpha."""
+    span_ddq: Leaf = leaf("rad/s^2", sign="positive", default=3.0)
+    """Half the box in alpha'."""
+    width: Leaf = leaf("1", sign="positive", shape="scalar", default=2.0)
+    """Width of the Gaussians, in half boxes."""
+    barrier: Barrier = Log()
+    nodes: int = static(default=64)
+    """Number of Gaussians."""
+    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
+    uses_observer: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Raises ValueError for a bad barrier or number of nodes; fits `o` to the barrier."""
+        checks.positive_integer("AdaptiveRBF.nodes", self.nodes)
+        checks.conforms("AdaptiveRBF.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Log().", CLAIMS)
+        fit_o(self)
+
+    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> jax.Array:
+        """W_hat(0) = 0, (nodes, n) [N m]."""
+        return jnp.zeros((self.nodes, q.size), q.dtype)
+
+    def basis(self, q: jax.Array, dq: jax.Array, alpha: jax.Array, dalpha: jax.Array) -> jax.Array:
+        """S(Z), (nodes,) [1]."""
+        z = jnp.concatenate([(q - self.middle) / self.span_q, dq / self.span_dq, alpha / self.span_dq, dalpha / self.span_ddq])
+        offset = z - jnp.asarray(sobol_centres(self.nodes, z.size), z.dtype)
+        return jnp.exp(-jnp.sum(offset**2, axis=1) / self.width**2)
+
+    def command(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: jax.Array
+    ) -> tuple[Command, jax.Array]:
+        """The torque, what belongs to it, and W_hat'."""
+        alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
+        tube, e2 = setting.tube(t), dq - alpha
+        S = self.basis(q, dq, alpha, dalpha)
+        tau = S @ state - self.K2 * e2 - self.barrier.slope(tube, q)
+        guard_active = guard_is_active(tube, q, self.barrier.guard)
+        command = Command(tau, alpha, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active))
+        return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)
+
+
+@functools.lru_cache(maxsize=16)
+def sobol_centres(nodes: int, dimensions: int) -> np.ndarray:
+    """The first `nodes` points of the unscrambled Sobol sequence, centred in their cells, in [-1, 1]^dimensions."""
+    from scipy.stats import qmc
+
+    order = math.ceil(math.log2(nodes))
+    points = qmc.Sobol(dimensions, scramble=False).random_base2(order)[:nodes]
+    return 2.0 * (points + 0.5 / 2**order) - 1.0

@@ -1,0 +1,63 @@
+"""Actuator limits around any law; the paper leaves them to future work.
+
+The loop gives observer and plant the torque that was applied, so an observer that is told the truth estimates f and not the cut.
+While the torque is cut, no law's claims hold; outside, they do again.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.controllers._base import Command, Controller, Setting, State
+from iblf_jax.pytree import Leaf, component, leaf, static
+
+KINDS = ("hard", "smooth")
+SHARPNESS = 8
+"""Even exponent of the smooth limit: at half the limit it takes off 0.05 %, at the limit 8 %."""
+
+
+@component
+class Saturated:
+    """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8) (smooth, for gradients).
+
+    Paths reach through: "controller.K2" is the wrapped law's K2.
+    Source: none; the construction is common.
+    """
+
+    law: Controller
+    limit: Leaf = leaf("N m", sign="positive")
+    """Largest torque of each joint."""
+    kind: str = static(default="hard")
+    wraps: ClassVar[str] = "law"
+
+    def check(self) -> None:
+        """Raises ValueError for something that is not a law, or an unknown kind."""
+        checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
+        checks.one_of("Saturated.kind", self.kind, KINDS)
+
+    def advice(self) -> list[str]:
+        """The wrapped law's."""
+        return getattr(self.law, "advice", list)()
+
+    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
+        """The wrapped law's state."""
+        return self.law.init(q, dq, setting)
+
+    def command(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State
+    ) -> tuple[Command, State]:
+        """The wrapped law's command with its torque limited; `saturated` says where it asked for more than the limit."""
+        command, rate = self.law.command(t, q, dq, f_hat, setting, state)
+        asked = command.tau
+        tau = jnp.clip(asked, -self.limit, self.limit) if self.kind == "hard" else self.limit * _smooth_clip(asked / self.limit)
+        return command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)), rate
+
+
+def _smooth_clip(x: jax.Array) -> jax.Array:
+    """x / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives too."""
+    m = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), 1.0))
+    return (x / m) / ((1.0 / m) ** SHARPNESS + (x / m) ** SHARPNESS) ** (1.0 / SHARPNESS)

@@ -1,0 +1,67 @@
+"""The systems that the paper names, each by its name: which law with which barrier, and the gains of the yardsticks.
+
+All barrier laws take the same k1, K2 and o, so that they are compared at equal gains; computed torque and PD have their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from iblf_jax import barriers, checks
+from iblf_jax.controllers._base import Controller
+from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF
+from iblf_jax.controllers.backstepping import Backstepping
+from iblf_jax.controllers.computed_torque import ComputedTorque
+from iblf_jax.controllers.pd_gravity import PDGravity
+from iblf_jax.observers import NoObserver, Observer
+
+BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {
+    "integral": barriers.Integral,
+    "log": barriers.Log,
+    "tan": barriers.Tan,
+    "state": barriers.State,
+    "prescribed_performance": barriers.PrescribedPerformance,
+    "mapping": barriers.Mapping,
+    "backstepping": barriers.Quadratic,
+}
+"""System -> barrier of the backstepping law."""
+
+YARDSTICKS: dict[str, Callable[[], Controller]] = {
+    "computed_torque": lambda: ComputedTorque(Kp=25.0, Kd=10.0),
+    "pd": lambda: PDGravity(Kp=60.0, Kd=20.0),
+}
+"""Laws outside the family.  ASSUMPTION: their gains are this package's, chosen to settle about as fast as the paper's law."""
+
+LAWS = (*BARRIERS, "adaptive_rbf", *YARDSTICKS)
+"""Every system by the name that `law_by_name`, the presets and `compare` take."""
+
+_WITHOUT_OBSERVER = ("adaptive_rbf", "pd")
+
+
+def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, reading: str = "printed", p: int = 1) -> Controller:
+    """The law of a system.
+
+    Args:
+      name: one of `LAWS`; "backstepping" is the unconstrained one.
+      k1: gain of the virtual velocity, () or (n,) [1/s].
+      K2: gain of the velocity error, () or (n,) [N m s/rad].
+      o: margin under the root of kappa (3.7), () or (n,) [1/s^2], for the barriers that use it.
+      reading: "printed" or "corrected", for the backstepping laws.
+      p: exponent of the logarithmic barrier.
+
+    Raises:
+      ValueError: an unknown name or reading.
+    """
+    checks.one_of("law", name, LAWS)
+    if name in YARDSTICKS:
+        return YARDSTICKS[name]()
+    if name == "adaptive_rbf":
+        return AdaptiveRBF(k1=k1, K2=K2, o=o, barrier=barriers.Log(p=p))
+    barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
+    return Backstepping(k1=k1, K2=K2, o=o if getattr(barrier, "uses_o", True) else None, barrier=barrier, reading=reading)
+
+
+def observer_of(name: str, usual: Observer) -> Observer:
+    """The observer that belongs to a system: `usual`, or none for the laws that are classical without one."""
+    return NoObserver() if name in _WITHOUT_OBSERVER else usual

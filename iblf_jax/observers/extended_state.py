@@ -1,0 +1,65 @@
+"""A linear extended-state observer on the momentum p = M0 q'.
+
+    p' = tau + C0^T q' - G0 + f,   since (M0 q')' = M0 q" + M0' q' and M0' = C0 + C0^T
+
+so a copy of p, corrected by what is measured, estimates f as an additional constant state.  C0^T q' = M0' q' - C0 q'.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.robots import Robot, mass_matrix_rate
+
+
+class ExtendedStateValues(NamedTuple):
+    """State of `ExtendedState`."""
+
+    p_hat: jax.Array
+    """Estimate of the momentum M0 q', (n,) [N m s]."""
+    f_hat: jax.Array
+    """Estimate of f, (n,) [N m]."""
+
+
+@component
+class ExtendedState:
+    """p_hat' = tau + C0^T q' - G0 + f_hat + l1 (p - p_hat),   f_hat' = l2 (p - p_hat),   p = M0 q'.
+
+    Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then f_tilde" + l1 f_tilde' + l2 f_tilde = f" + l1 f':
+    second order, so a constant f is found exactly and a changing one with the lag l1/l2.  It starts at the measured momentum and f_hat = 0.
+    Source: J. Han, IEEE Trans. Industrial Electronics 56 (2009) 900-906; Z. Gao, ACC 2003, 4989-4996 (one bandwidth).
+    """
+
+    bandwidth: Leaf = leaf("1/s", sign="positive", default=None)
+    l1: Leaf = leaf("1/s", sign="positive", default=None)
+    l2: Leaf = leaf("1/s^2", sign="positive", default=None)
+
+    def check(self) -> None:
+        """Raises ValueError unless either `bandwidth` or both `l1` and `l2` are given."""
+        given = tuple(x is not None for x in (self.bandwidth, self.l1, self.l2))
+        if given not in ((True, False, False), (False, True, True)):
+            named = dict(zip(("bandwidth", "l1", "l2"), given, strict=True))
+            got = [name for name, there in named.items() if there]
+            raise checks.fail("ExtendedState", got, "either `bandwidth`, or both `l1` and `l2`", "Such as ExtendedState(bandwidth=40.0).")
+
+    def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> ExtendedStateValues:
+        """The measured momentum, and no estimate yet."""
+        return ExtendedStateValues(model.mass_matrix(q) @ dq, jnp.zeros_like(q))
+
+    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: ExtendedStateValues) -> jax.Array:
+        """f_hat, (n,) [N m]."""
+        return state.f_hat
+
+    def derivative(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: ExtendedStateValues
+    ) -> ExtendedStateValues:
+        """p_hat' and f_hat'."""
+        l1, l2 = (self.l1, self.l2) if self.bandwidth is None else (2.0 * self.bandwidth, self.bandwidth**2)
+        innovation = model.mass_matrix(q) @ dq - state.p_hat
+        drift = mass_matrix_rate(model, q, dq) @ dq - model.coriolis(q, dq, dq) - model.gravity(q)
+        return ExtendedStateValues(tau + drift + state.f_hat + l1 * innovation, l2 * innovation)
