@@ -90,7 +90,7 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
     return dataclasses.replace(
         paper,
         disturbance=disturbances.Nothing(),
-        controller=Backstepping(k1=2.0, K2=0.6, o=0.1, reading=reading),
+        controller=law_by_name("integral", k1=2.0, K2=0.6, o=0.1, reading=reading),
         observer=observer(kf=[40.0, 1.1], eta0=[-0.5, 1.4], start="matched"),
         initial=Initial(q=[0.68, 0.75], dq=[-4.0, -4.0]),
     )

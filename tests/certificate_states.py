@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import iblf_jax as ij
 from iblf_jax.certificates.evidence import Evidence, evidence_at
@@ -26,32 +26,24 @@ def loop(reading: str = "corrected", observer: str = "momentum", barrier=None, w
 
 def random_loops(scenario: ij.Scenario, seed: int = 0, *, states: int = STATES, speed: float = 10.0, nearest: float = 0.99):
     """Scenarios with other gains, masses and disturbances, and a time and state of each: (scenario, t, state), batched."""
-    dtype = scenario.initial.q.dtype
-    keys = iter(jax.random.split(jax.random.key(seed), 64))
+    dtype, rng, n = scenario.initial.q.dtype, np.random.default_rng(seed), scenario.n
 
     def uniform(low, high, *shape):
-        return jax.random.uniform(next(keys), (states, *shape), dtype, low, high)
+        return rng.uniform(low, high, (states, *shape)).astype(dtype)
 
-    n = scenario.n
-    batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (states, *jnp.shape(x))), scenario)
-    law = dataclasses.asdict(batch.controller) | {"barrier": batch.controller.barrier}
-    law |= {"k1": 10 ** uniform(-1, 1, n), "K2": 0.5 + 10 ** uniform(-2, 1.7, n)}
-    law |= {} if batch.controller.o is None else {"o": 10 ** uniform(-3, 0, n)}
-    unbuilt = partial(_rebuilt, batch)
-    plant = _rebuilt(batch.plant, mass=batch.plant.mass * uniform(0.5, 1.5, n), payload=uniform(0.0, 0.5))
-    model = _rebuilt(batch.model, mass=batch.model.mass * uniform(0.5, 1.5, n))
-    batch = unbuilt(
-        controller=_rebuilt(batch.controller, **law),
-        observer=_rebuilt(batch.observer, kf=1.0 + 10 ** uniform(-2, 1.7, n)),
-        disturbance=_rebuilt(batch.disturbance, phase=uniform(0.0, 6.28)),
-        plant=plant,
-        model=model,
+    every = jax.tree.map(lambda x: np.broadcast_to(x, (states, *np.shape(x))), scenario)
+    o = {} if scenario.controller.o is None else {"o": 10 ** uniform(-3, 0, n)}
+    batch = _rebuilt(
+        every,
+        controller=_rebuilt(every.controller, k1=10 ** uniform(-1, 1, n), K2=0.5 + 10 ** uniform(-2, 1.7, n), **o),
+        observer=_rebuilt(every.observer, kf=1.0 + 10 ** uniform(-2, 1.7, n)),
+        disturbance=_rebuilt(every.disturbance, phase=uniform(0.0, 6.28)),
+        plant=_rebuilt(every.plant, mass=every.plant.mass * uniform(0.5, 1.5, n), payload=uniform(0.0, 0.5)),
+        model=_rebuilt(every.model, mass=every.model.mass * uniform(0.5, 1.5, n)),
     )
     t, dq = uniform(0.0, 20.0), uniform(-speed, speed, n)
-    q = jax.vmap(_position)(batch, t, uniform(-nearest, nearest, n))
-    f_hat = uniform(-5.0, 5.0, n)
-    eta = f_hat - batch.observer.kf * jax.vmap(lambda model, q, dq: model.mass_matrix(q) @ dq)(batch.model, q, dq)
-    return batch, t, LoopState(q, dq, (), eta)
+    q, momentum = _position(batch, t, uniform(-nearest, nearest, n), dq)
+    return batch, t, LoopState(q, dq, (), uniform(-5.0, 5.0, n) - batch.observer.kf * momentum)
 
 
 def _rebuilt(part, **changes):
@@ -62,10 +54,13 @@ def _rebuilt(part, **changes):
     return copy
 
 
-def _position(scenario: ij.Scenario, t, xi):
-    """The position with this relative error."""
+@jax.jit
+@jax.vmap
+def _position(scenario: ij.Scenario, t, xi, dq):
+    """The position with this relative error, and M0 q' there."""
     tube = scenario.setting.tube(t)
-    return tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+    q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+    return q, scenario.model.mass_matrix(q) @ dq
 
 
 @jax.jit

@@ -11,7 +11,7 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.facts import Facts, facts_of
+from iblf_jax.certificates.facts import Facts, facts_of, same_structure, same_tree
 from iblf_jax.certificates.lines import all_lines, applicable_case, bounds_along, left_side
 from iblf_jax.certificates.result import FAILS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.results import Rollout
@@ -70,14 +70,13 @@ def certify(
 
 
 def _check_same_kind(scenario: Scenario, run: Rollout) -> None:
-    if jax.tree.structure(run.scenario) != jax.tree.structure(scenario):
+    if not same_structure(scenario, run.scenario):
         raise checks.fail("run", "a run of another kind of scenario", "a run of `scenario`", "Pass run.scenario as the scenario.")
 
 
 def _check_same(scenario: Scenario, run: Rollout) -> None:
     _check_same_kind(scenario, run)
-    pairs = zip(jax.tree.leaves(scenario), jax.tree.leaves(run.scenario), strict=True)
-    if not all(np.array_equal(a, b) for a, b in pairs):
+    if not same_tree(scenario, run.scenario):
         raise checks.fail("run", "a run of a scenario with other numbers", "a run of `scenario`", "Pass run.scenario as the scenario.")
 
 
@@ -142,7 +141,9 @@ def _traces(facts: Facts) -> Traces:
     run, evidence, case = facts.run, facts.evidence, applicable_case(facts)
     nothing = np.full(run.t.shape, np.nan)
     envelope, left = (nothing, nothing) if case is None else (facts.envelope[case].bound, left_side(facts, case))
-    bounds = {"xi, by V1": np.full(run.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
+    bounds = (
+        {"xi, by V1": np.full(run.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
+    )
     return Traces(
         t=run.t,
         V=evidence.V,

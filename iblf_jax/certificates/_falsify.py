@@ -40,7 +40,7 @@ class Counterexample(NamedTuple):
 
 
 def relative_growth(scenario: Scenario) -> jax.Array:
-    """g = (V2' - 1/2 |f'|^2) / Q at the start of a scenario, ().                                                       (3.24)"""
+    """The growth g = (V2' - 1/2 |f'|^2) / Q at the start of a scenario, ().                                                       (3.24)"""
     seen = evidence_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
     constants = claims.claim(scenario)
     M0 = scenario.model.mass_matrix(scenario.initial.q)

@@ -38,7 +38,7 @@ class Claim(NamedTuple):
 
 def law_of(scenario: Scenario) -> Any:
     """The law itself, without what wraps it (a torque limit)."""
-    law = scenario.controller
+    law: Any = scenario.controller
     while getattr(law, "wraps", None) is not None:
         law = getattr(law, law.wraps)
     return law
@@ -64,11 +64,14 @@ def decay_rate(law: Backstepping) -> jax.Array | None:
 
 def claim(scenario: Scenario) -> Claim:
     """The constants of the claim; only for a scenario for which `why_no_claim` is empty."""
-    law = law_of(scenario)
-    return Claim(decay_rate(law), law.K2, scenario.observer.kf)
+    law, observer = law_of(scenario), scenario.observer
+    decay = decay_rate(law)
+    if decay is None or not isinstance(observer, Printed | Momentum):
+        raise TypeError(why_no_claim(scenario))
+    return Claim(decay, law.K2, observer.kf)
 
 
-def rho_terms(constants: Claim, lambda_max: jax.Array, case: int) -> jax.Array:
+def rho_terms(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
     """The three terms of which rho is the least, (3,) [1/s].                                               (3.19), (3.27)
 
     Args:
@@ -83,6 +86,6 @@ def rho_terms(constants: Claim, lambda_max: jax.Array, case: int) -> jax.Array:
     ])  # fmt: skip
 
 
-def rho(constants: Claim, lambda_max: jax.Array, case: int) -> jax.Array:
+def rho(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
     """The rate of the claim, () [1/s].                                                                      (3.19), (3.27)"""
     return jnp.min(rho_terms(constants, lambda_max, case))

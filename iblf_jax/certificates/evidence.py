@@ -189,11 +189,13 @@ def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, me
     return 2.0 * jnp.abs(whole - halves)
 
 
+@jax.jit
+def along_run(scenario: Scenario, times: jax.Array, states: LoopState) -> Evidence:
+    """The evidence at every recorded sample; time axis first."""
+    return jax.vmap(partial(evidence_at, scenario))(times, states)
+
+
 @partial(jax.jit, static_argnames="method")
-def along_run(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str) -> tuple[Evidence, jax.Array]:
-    """Evidence and integrator's defect at every recorded sample; time axis first."""
-
-    def one(t, state):
-        return evidence_at(scenario, t, state), defect(scenario, t, state, dt, method)
-
-    return jax.vmap(one)(times, states)
+def defects(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str) -> jax.Array:
+    """The integrator's error in V2 over one step from every recorded sample, (T,)."""
+    return jax.vmap(lambda t, state: defect(scenario, t, state, dt, method))(times, states)

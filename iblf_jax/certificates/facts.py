@@ -12,16 +12,15 @@ rate of the claim, and by rounding, so that V2 may be followed down to where it 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.box import Extremes, eigenvalues_over
-from iblf_jax.certificates.evidence import Evidence, along_run, rounding
+from iblf_jax.certificates.evidence import along_run, defects, rounding
 from iblf_jax.closed_loop import LoopState
-from iblf_jax.results import Rollout
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status, describe
 
@@ -42,8 +41,10 @@ class Envelope(NamedTuple):
 class Facts(NamedTuple):
     """One run, on the host, with everything that the lines are made of."""
 
-    run: Rollout
-    evidence: Evidence
+    run: Any
+    """The Rollout, its arrays on the host."""
+    evidence: Any
+    """Its Evidence, time axis first, on the host."""
     eps: float
     """Relative error put down to rounding."""
     no_claim: str
@@ -62,33 +63,43 @@ class Facts(NamedTuple):
     envelope: dict[int, Envelope]
 
 
-def facts_of(run: Rollout) -> Facts:
+def facts_of(run: Any) -> Facts:
     """Everything that the lines are made of, for one run with its arrays on the host."""
     scenario = run.scenario
     states = LoopState(run.q, run.dq, run.controller_state, run.observer_state)
-    evidence, defect = jax.tree.map(np.asarray, along_run(scenario, run.t, states, run.dt, method=run.method))
+    evidence = jax.tree.map(np.asarray, along_run(scenario, run.t, states))
     no_claim = claims.why_no_claim(scenario)
     constants = None if no_claim else claims.claim(scenario)
     box = eigenvalues_over(scenario.model, np.min(run.lower, axis=0), np.max(run.upper, axis=0))
-    case = 1 if bool(np.all(evidence.steady)) and _same(scenario) else 2
+    # With plant and model alike, f is the torque of the disturbance component: f' = 0 can be seen exactly.
+    case = 1 if bool(np.all(evidence.steady)) and same_tree(scenario.plant, scenario.model) else 2
     F_d = 0.0 if case == 1 else float(np.max(np.linalg.norm(evidence.df, axis=1)))
     rates, envelopes = {}, {}
     jumps = _jumps(scenario, run.t)
-    for each in claims.CASES if constants is not None else ():
-        for where, largest in (("run", evidence.lambda_max.max()), ("box", box.lambda_max)):
-            rates[each, where] = float(claims.rho(constants, largest, each))
-        offset = 0.0 if each == 1 else F_d**2 / 2
-        envelopes[each] = _envelope(run, evidence, defect, jumps, rates[each, "run"], offset)
+    if constants is not None:
+        defect = np.asarray(defects(scenario, run.t, states, run.dt, method=run.method))
+        for each in claims.CASES:
+            for where, largest in (("run", evidence.lambda_max.max()), ("box", box.lambda_max)):
+                rates[each, where] = float(claims.rho(constants, largest, each))
+            offset = 0.0 if each == 1 else F_d**2 / 2
+            envelopes[each] = _envelope(run, evidence, defect, jumps, rates[each, "run"], offset)
     believed = not int(run.status) & int(DISBELIEVED)
     no_run = "" if believed else f"the run is not to be believed: {describe(int(run.status) & int(DISBELIEVED))}"
     eps = rounding(np.asarray(run.q).dtype)
     return Facts(run, evidence, eps, no_claim, no_run, jumps, case, rates, F_d, box, constants, envelopes)
 
 
-def _same(scenario: Scenario) -> bool:
-    """Whether plant and model are the same robot with the same numbers: then f is the disturbance component's torque."""
-    plant, model = jax.tree.flatten(scenario.plant), jax.tree.flatten(scenario.model)
-    return plant[1] == model[1] and all(np.array_equal(a, b) for a, b in zip(plant[0], model[0], strict=True))
+def same_structure(one: Any, other: Any) -> bool:
+    """Whether two pytrees have one structure."""
+    structure: Any = jax.tree.structure(one)
+    return bool(structure == jax.tree.structure(other))
+
+
+def same_tree(one: Any, other: Any) -> bool:
+    """Whether two pytrees have one structure and the same numbers."""
+    return same_structure(one, other) and all(
+        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    )
 
 
 def _jumps(scenario: Scenario, t: np.ndarray) -> np.ndarray:
@@ -102,7 +113,7 @@ def starts_of(t: np.ndarray, held: np.ndarray, jumps: np.ndarray) -> np.ndarray:
     return np.concatenate([[True], fresh | held[:-1]])
 
 
-def _envelope(run: Rollout, evidence: Evidence, defect: np.ndarray, jumps: np.ndarray, rate: float, rho2: float) -> Envelope:
+def _envelope(run: Any, evidence: Any, defect: np.ndarray, jumps: np.ndarray, rate: float, rho2: float) -> Envelope:
     """The envelope of V2 and its tolerance along a run; NaN at held samples, and everywhere if the rate is not positive."""
     t, V, size = run.t, evidence.V, run.t.shape[0]
     bound, tolerance = np.full(size, np.nan), np.full(size, np.nan)
@@ -122,5 +133,3 @@ def _envelope(run: Rollout, evidence: Evidence, defect: np.ndarray, jumps: np.nd
             widened = np.sqrt(2 * (bound[k] + carried)) + noise[first] + noise[k]
             tolerance[k] = 0.5 * widened**2 - bound[k]
     return Envelope(bound, tolerance)
-
-

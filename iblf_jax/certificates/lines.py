@@ -27,6 +27,8 @@ BOUNDS = {1: "(3.23)", 2: "(3.31)"}
 LEFT = {1: "V2' + rho V2 <= 0", 2: "V2' + rho V2 - |f'|^2/2 <= 0"}
 ENVELOPED = {1: "V2(t) <= V2(0) exp(-rho t)", 2: "V2(t) <= V2(0) exp(-rho t) + rho2/rho"}
 
+Description = dict[str, Any]
+"""The fields of a line that do not depend on the run."""
 NO_BOUND = "the barrier states no bound on xi from V1"
 
 
@@ -65,7 +67,7 @@ def left_side(facts: Facts, case: int) -> np.ndarray:
     return left if case == 1 else left - 0.5 * np.sum(evidence.df**2, axis=1)
 
 
-def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, description: dict[str, Any]) -> Line:
+def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, description: Description) -> Line:
     """A line from margins at every sample, (T,) or (T, n), with NaN where nothing is claimed."""
     margins = np.asarray(margins, float)
     tolerances = np.broadcast_to(np.asarray(tolerances, float), margins.shape)
@@ -105,19 +107,17 @@ def assumptions(facts: Facts) -> list[Line]:
         at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
         jumps = "" if name == "f bounded" or not facts.jumps.size else f"Assumption 1 is broken by a jump of f: {_excluded(facts)}"
         verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
-        lines.append(
-            Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(run.t[at]), note=jumps)
-        )
+        lines.append(Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(run.t[at]), note=jumps))
     room = np.minimum(run.q_d - run.lower, run.upper - run.q_d)
-    at, joint = np.unravel_index(np.argmin(room), room.shape)
-    feasible = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
-    lines.append(_plain(feasible, float(room[at, joint]), joint=int(joint), time=float(run.t[at])))
+    sample, joint = np.unravel_index(np.argmin(room), room.shape)
+    feasible: Description = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
+    lines.append(_plain(feasible, float(room[sample, joint]), joint=int(joint), time=float(run.t[sample])))
     start = np.minimum(run.q[0] - run.lower[0], run.upper[0] - run.q[0])
-    inside = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
+    inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
     return [*lines, _plain(inside, float(start.min()), joint=int(start.argmin()), time=float(run.t[0]))]
 
 
-def _plain(description: dict[str, Any], margin: float, **more: Any) -> Line:
+def _plain(description: Description, margin: float, **more: Any) -> Line:
     """A line whose margin must be positive."""
     return Line(verdict=HOLDS if margin > 0 else FAILS, margin=margin, **description, **more)
 
@@ -131,7 +131,7 @@ def gains(facts: Facts) -> list[Line]:
     )
     lines = []
     for name, equation, statement, field, lowest, unit in described:
-        description: dict[str, Any] = {"name": name, "equation": equation, "statement": statement, "unit": unit}
+        description: Description = {"name": name, "equation": equation, "statement": statement, "unit": unit}
         if facts.claim is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=facts.no_claim, **description))
             continue
@@ -143,11 +143,11 @@ def gains(facts: Facts) -> list[Line]:
 
 
 def rates(facts: Facts, case: int) -> list[Line]:
-    """rho of one case, with lambda_max(M0) along the run and over the admissible box."""
+    """The rate rho of one case, with lambda_max(M0) along the run and over the admissible box."""
     lines = []
     for where in ("run", "box"):
         name = f"rho, case {case}" + ("" if where == "run" else ", over the box")
-        description: dict[str, Any] = {"name": name, "equation": RHO[case], "unit": "1/s"}
+        description: Description = {"name": name, "equation": RHO[case], "unit": "1/s"}
         description["statement"] = f"rho = min(decay of V1, 2 (K2 - 1/2)/lambda_max(M0), 2 (kf - {claims.LOWEST_KF[case]:g})) > 0"
         reason = facts.no_claim or ("" if case == 2 or facts.case == 1 else why_not(facts, 1))
         if reason or facts.claim is None:
@@ -164,7 +164,7 @@ def rates(facts: Facts, case: int) -> list[Line]:
 
 def inequality(facts: Facts, case: int) -> Line:
     """The differential inequality, at every sample."""
-    description = {"name": f"inequality, case {case}", "equation": INEQUALITY[case], "statement": LEFT[case], "unit": "1/s"}
+    description: Description = {"name": f"inequality, case {case}", "equation": INEQUALITY[case], "statement": LEFT[case], "unit": "1/s"}
     reason = why_not(facts, case)
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
@@ -174,7 +174,7 @@ def inequality(facts: Facts, case: int) -> Line:
 
 def envelope(facts: Facts, case: int) -> Line:
     """The envelope of V2, at every sample."""
-    description = {"name": f"envelope, case {case}", "equation": ENVELOPE[case], "statement": ENVELOPED[case]}
+    description: Description = {"name": f"envelope, case {case}", "equation": ENVELOPE[case], "statement": ENVELOPED[case]}
     reason = why_not(facts, case)
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
@@ -204,8 +204,12 @@ def bounds(facts: Facts) -> list[Line]:
     """The bounds on xi, e2 and f_tilde that follow from the envelope of the case at hand."""
     case = applicable_case(facts)
     shown = case or facts.case
-    descriptions = [
-        {"name": "xi, by V1", "equation": XI_BOUND[shown], "statement": "V1 <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar)), or as the barrier says"},
+    descriptions: list[Description] = [
+        {
+            "name": "xi, by V1",
+            "equation": XI_BOUND[shown],
+            "statement": "V1 <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar)), or as the barrier says",
+        },
         {"name": "xi", "equation": BOUNDS[shown], "statement": "|xi_i| <= sqrt(2 Vbar)"},
         {"name": "e2", "equation": BOUNDS[shown], "statement": "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "unit": "rad/s"},
         {"name": "f_tilde", "equation": BOUNDS[shown], "statement": "|f_tilde| <= sqrt(2 Vbar)", "unit": "N m"},
@@ -247,7 +251,7 @@ def dropped(facts: Facts) -> list[Line]:
     exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(facts))
     lines = []
     for (name, equation, statement, term), none_dropped in zip(described, exact, strict=True):
-        description: dict[str, Any] = {"name": name, "equation": equation, "statement": statement, "unit": "1/s", "counts": False}
+        description: Description = {"name": name, "equation": equation, "statement": statement, "unit": "1/s", "counts": False}
         reason = facts.no_claim or facts.no_run or none_dropped or ("" if case else why_not(facts, facts.case))
         if reason or case is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
@@ -268,7 +272,7 @@ def _exact_observer(facts: Facts) -> str:
 
 def conclusion(facts: Facts) -> Line:
     """Properties (I) and (II): every joint inside its bounds, at every sample."""
-    description: dict[str, Any] = {"name": "joints inside", "equation": "(I), (II)", "statement": "|xi_i| < 1: -k_l < e1 < k_u"}
+    description: Description = {"name": "joints inside", "equation": "(I), (II)", "statement": "|xi_i| < 1: -k_l < e1 < k_u"}
     room = 1.0 - np.abs(facts.run.xi)
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
     case = applicable_case(facts)

@@ -48,6 +48,8 @@ class Line:
 
     def where(self) -> str:
         """Run, joint and time of the smallest margin, in words."""
+        if self.margin is None and self.value is None:
+            return ""
         parts = [] if self.run is None else [f"run {self.run}"]
         parts += [] if self.joint is None else [f"joint {self.joint}"]
         parts += [] if self.time is None else [f"t = {self.time:.4g} s"]
@@ -95,7 +97,7 @@ class Certificate:
 
     @property
     def verdict(self) -> str:
-        """"fails" if a line does; "holds" if none does and the differential inequality was checked; else "not applicable"."""
+        """All in one word: "fails" if a line does, "holds" if none does and the inequality was checked, else "not applicable"."""
         counted = [line for line in self.lines if line.counts]
         if any(line.verdict == FAILS for line in counted):
             return FAILS

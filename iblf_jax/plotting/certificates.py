@@ -25,8 +25,8 @@ LIMIT: dict[str, Any] = {"color": _style.BOUND, "linewidth": 1.6, "linestyle": "
 def certificate(shown: Certificate, *, title: str = "Theorem 2 along the run", until: float | None = None) -> Figure:
     """What `Certificate.plot` shows, the verdict in the title.
 
-    V2 with its envelope (3.20) or (3.28); the left side of the differential inequality (3.18) or (3.26), which must stay below zero, and the
-    dropped terms of the printed proof; xi, |e2| and |f_tilde| with their bounds.  Samples at which nothing is claimed are left out.
+    V2 with its envelope (3.20) or (3.28); the left side of the differential inequality (3.18) or (3.26), which must stay below zero,
+    and the dropped terms of the printed proof; xi, |e2| and |f_tilde| with their bounds.  Samples without a claim are left out.
 
     Args:
       shown: the certificate; over many runs, its worst run is drawn.
@@ -106,7 +106,7 @@ def _inequality(axes: Axes, traces: Traces) -> None:
 
 
 def _relative_error(axes: Axes, traces: Traces) -> None:
-    """xi of every joint between its bounds and the walls."""
+    """The relative error xi of every joint between its bounds and the walls."""
     n = traces.xi.shape[1]
     for joint in range(n):
         look = _style.series(joint)
