@@ -9,8 +9,9 @@ from collections.abc import Mapping
 
 import jax
 
+from iblf_jax.one_function import as_one_function
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import Outcome, as_one_function, run
+from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
 
 
