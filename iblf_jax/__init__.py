@@ -36,14 +36,18 @@ from iblf_jax.status import Status as Status
 __version__ = _version("iblf_jax")
 
 if TYPE_CHECKING:
+    from iblf_jax import certificates as certificates
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
     from iblf_jax._compare import compare as compare
     from iblf_jax._comparison import Comparison as Comparison
+    from iblf_jax.certificates import certify as certify
 
 _ON_FIRST_USE = {
-    "Comparison": ("iblf_jax._comparison", "Comparison"),
+    "certificates": ("iblf_jax.certificates", None),
+    "certify": ("iblf_jax.certificates", "certify"),
     "compare": ("iblf_jax._compare", "compare"),
+    "Comparison": ("iblf_jax._comparison", "Comparison"),
     "plotting": ("iblf_jax.plotting", None),
     "testing": ("iblf_jax.testing", None),
 }

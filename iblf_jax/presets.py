@@ -69,6 +69,33 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
     )
 
 
+def printed_gap(*, reading: str = "printed") -> Scenario:
+    """A start at which the law as printed breaks its own inequality, and the corrected one keeps it.                (3.18), (3.20)
+
+    The paper's arm, reference and bounds without disturbance, so that V2 should fall at once.  The gains are inside (3.17) and (3.25),
+    near their lower limits; the joints move fast, 4 rad/s.  There the terms that the printed proof drops outweigh what it leaves, and
+    V2 grows.  Found by `certificates.falsify` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded.
+
+    Args:
+      reading: "printed" or "corrected"; the same gains and the same start, f_hat(0) included.
+
+    Returns:
+      A Scenario of 2 joints; the first 0.1 s tell the difference.
+
+    Raises:
+      ValueError: an unknown reading.
+    """
+    paper = zhang_yan_2024(reading=reading)
+    observer = Printed if reading == "printed" else Momentum
+    return dataclasses.replace(
+        paper,
+        disturbance=disturbances.Nothing(),
+        controller=law_by_name("integral", k1=2.0, K2=0.6, o=0.1, reading=reading),
+        observer=observer(kf=[40.0, 1.1], eta0=[-0.5, 1.4], start="matched"),
+        initial=Initial(q=[0.68, 0.75], dq=[-4.0, -4.0]),
+    )
+
+
 def zhang_yan_2024_saturated(
     *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (7.2, 1.5), kind: str = "hard"
 ) -> Scenario:
@@ -115,6 +142,7 @@ def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str =
 
 PRESETS = {
     "zhang_yan_2024": zhang_yan_2024,
+    "printed_gap": printed_gap,
     "zhang_yan_2024_saturated": zhang_yan_2024_saturated,
     "zhang_yan_2024_funnel": zhang_yan_2024_funnel,
 }

@@ -1,0 +1,201 @@
+"""`certify`: one run, a batch of runs or a study held against Theorem 2."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.certificates import claims
+from iblf_jax.certificates.facts import Facts, facts_of, same_structure, same_tree
+from iblf_jax.certificates.lines import all_lines, applicable_case, bounds_along, left_side
+from iblf_jax.certificates.result import FAILS, NOT_APPLICABLE, Certificate, Line, Traces
+from iblf_jax.results import Rollout
+from iblf_jax.rollout import simulate
+from iblf_jax.scenario import Scenario, canonical
+
+WORST = 16
+
+
+def certify(
+    scenario: Scenario,
+    run: Any = None,
+    *,
+    duration: float = 20.0,
+    dt: float = 1e-3,
+    method: str = "rk4",
+    worst: int | None = WORST,
+) -> Certificate:
+    """Theorem 2, inequality by inequality, with margins.
+
+        V2' + rho V2 - 1/2 |f'|^2 <= 0  at every recorded sample, and what follows from it                  (3.17)-(3.31)
+
+    V2' and f' are exact (by jvp along the vector field of the whole loop).  A law, an observer or a situation without a claim is
+    "not applicable", never "fails".
+
+    Args:
+      scenario: what runs.
+      run: a `Rollout` of it (one run or a batch), or a study (with `replay(i)`, `metrics`, `len`); simulated here if not given.
+      duration, dt, method: of the simulation, if `run` is not given [s].
+      worst: of a study, judge that many runs, those nearest to their bounds; None for all.
+
+    Returns:
+      A `Certificate`; over many runs each line is that of the run with the smallest margin.
+
+    Raises:
+      ValueError: a run of another scenario, without recorded samples, or arguments of the wrong kind.
+
+    Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
+    """
+    scenario = canonical(scenario)
+    if not checks.is_concrete(scenario):
+        raise checks.fail("scenario", "traced values", "numbers", "certify works on the host: call it outside jit, vmap and grad.")
+    if run is None:
+        run = simulate(scenario, duration=duration, dt=dt, method=method)
+    if isinstance(run, Rollout):
+        if run.is_batch:
+            _check_same_kind(scenario, run)
+            on_host = jax.tree.map(np.asarray, run)
+            return _many(((i, on_host[i]) for i in range(len(run))), len(run))
+        _check_same(scenario, run)
+        return _one(run)
+    if hasattr(run, "replay") and hasattr(run, "metrics") and hasattr(run, "__len__"):
+        indices = _worst_of(run, worst)
+        return _many(((i, run.replay(i)) for i in indices), len(indices))
+    raise checks.fail("run", run, "a Rollout, a study or None", "Pass what ij.simulate or ij.monte_carlo returned.")
+
+
+def _check_same_kind(scenario: Scenario, run: Rollout) -> None:
+    if not same_structure(scenario, run.scenario):
+        raise checks.fail("run", "a run of another kind of scenario", "a run of `scenario`", "Pass run.scenario as the scenario.")
+
+
+def _check_same(scenario: Scenario, run: Rollout) -> None:
+    _check_same_kind(scenario, run)
+    if not same_tree(scenario, run.scenario):
+        raise checks.fail("run", "a run of a scenario with other numbers", "a run of `scenario`", "Pass run.scenario as the scenario.")
+
+
+def _worst_of(study: Any, worst: int | None) -> list[int]:
+    """The runs of a study that came nearest to their bounds, the nearest first."""
+    if worst is not None:
+        worst = checks.positive_integer("worst", worst)
+    count = len(study)
+    if worst is None or worst >= count:
+        return list(range(count))
+    try:
+        margin = np.asarray(study.metrics["xi_margin"])
+    except KeyError:
+        raise checks.fail(
+            "run.metrics", list(study.metrics), "the metric xi_margin", "Run the study with metrics.Margin, or pass worst=None."
+        ) from None
+    nearest = np.min(margin.reshape(count, -1), axis=1)
+    return [int(i) for i in np.argsort(np.nan_to_num(nearest, nan=-np.inf), kind="stable")[:worst]]
+
+
+def _heading(scenario: Scenario) -> str:
+    law = claims.law_of(scenario)
+    parts = [type(law).__name__]
+    if hasattr(law, "barrier"):
+        parts.append(f"barrier {type(law.barrier).__name__}")
+    if hasattr(law, "reading"):
+        parts.append(f"reading {law.reading}")
+    return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
+
+
+def _one(run: Rollout) -> Certificate:
+    """The certificate of one run."""
+    facts = facts_of(jax.tree.map(np.asarray, run))
+    return Certificate(_heading(run.scenario), tuple(all_lines(facts)), _numbers(facts), _traces(facts))
+
+
+def _numbers(facts: Facts) -> dict[str, Any]:
+    """The constants of the claim."""
+    evidence = facts.evidence
+    rho = {f"rho_{where}_case_{case}": value for (case, where), value in facts.rho.items()}
+    return rho | {
+        "case": facts.case,
+        "F_m": float(np.max(np.linalg.norm(evidence.f, axis=1))),
+        "F_d": facts.F_d,
+        "rho2": facts.F_d**2 / 2,
+        "V2_start": float(evidence.V[0]),
+        "V2_end": float(evidence.V[-1]),
+        "lambda_min_run": float(evidence.lambda_min.min()),
+        "lambda_max_run": float(evidence.lambda_max.max()),
+        "lambda_min_box": facts.box.lambda_min,
+        "lambda_max_box": facts.box.lambda_max,
+        "lambda_searched": facts.box.searched,
+        "q_of_lambda_max_box": facts.box.q_max,
+        "jump_times": facts.jumps,
+        "samples": int(facts.run.t.size),
+        "samples_left_out": int(np.sum(evidence.held)),
+    }
+
+
+def _traces(facts: Facts) -> Traces:
+    """What the figure shows; NaN where there is no claim."""
+    run, evidence, case = facts.run, facts.evidence, applicable_case(facts)
+    nothing = np.full(run.t.shape, np.nan)
+    envelope, left = (nothing, nothing) if case is None else (facts.envelope[case].bound, left_side(facts, case))
+    bounds = (
+        {"xi, by V1": np.full(run.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
+    )
+    return Traces(
+        t=run.t,
+        V=evidence.V,
+        envelope=envelope,
+        left=np.where(evidence.held, np.nan, left),
+        dropped=evidence.dropped_e2 + evidence.dropped_f,
+        xi=run.xi,
+        xi_bound=bounds["xi, by V1"],
+        e2=np.linalg.norm(evidence.e2, axis=1),
+        e2_bound=bounds["e2"],
+        f_tilde=np.linalg.norm(evidence.f_tilde, axis=1),
+        f_tilde_bound=bounds["f_tilde"],
+        held=evidence.held,
+    )
+
+
+def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], count: int) -> Certificate:
+    """One certificate over many runs: each line is that of its worst run; the traces are those of the worst run of all."""
+    if count == 0:
+        raise checks.fail("run", "no runs", "at least one run")
+    lines: dict[str, list[Line]] = {}
+    judged: list[int] = []
+    worst: tuple[tuple, int, Certificate] | None = None
+    for index, run in runs:
+        certificate = _one(run)
+        judged.append(index)
+        for line in certificate.lines:
+            lines.setdefault(line.name, []).append(dataclasses.replace(line, run=index))
+        badness = min(map(_badness, filter(lambda line: line.name.startswith("inequality"), certificate.lines)))
+        badness = min(badness, (0.0 if certificate.verdict == FAILS else 1.0, badness[1]))
+        if worst is None or badness < worst[0]:
+            worst = (badness, index, certificate)
+    assert worst is not None
+    merged = tuple(_worst_line(same) for same in lines.values())
+    _, index, certificate = worst
+    return Certificate(certificate.heading, merged, certificate.numbers, certificate.traces, tuple(judged), index)
+
+
+def _badness(line: Line) -> tuple[float, float]:
+    """Order of lines: failed first, then by margin, those that do not apply last; where there is no margin, by value downward."""
+    rank = {FAILS: 0.0, NOT_APPLICABLE: 2.0}.get(line.verdict, 1.0)
+    if line.margin is not None:
+        return rank, line.margin
+    return rank, np.inf if line.value is None else -line.value
+
+
+def _worst_line(same: list[Line]) -> Line:
+    """The line of the worst run, with a word on how many runs failed or had no claim."""
+    worst = min(same, key=_badness)
+    failed = sum(line.verdict == FAILS for line in same)
+    absent = sum(line.verdict == NOT_APPLICABLE for line in same)
+    notes = [f"fails in {failed} of {len(same)} runs"] if failed else []
+    if 0 < absent < len(same):
+        notes.append(f"not applicable in {absent} of {len(same)} runs")
+    return dataclasses.replace(worst, note="; ".join([*notes, *([worst.note] if worst.note else [])]))

@@ -1,0 +1,91 @@
+"""What Theorem 2 claims about a scenario, and the constants in it.
+
+    V2' <= -rho V2 + 1/2 |f'|^2,     rho = min( decay rate of V1,  2 lambda_min(K2 - I/2) / lambda_max(M0),  r_f )
+    case 1, f' = 0:         needs K2 > 1/2, kf > 1/2,   r_f = 2 lambda_min(kf - I/2)                              (3.17), (3.19)
+    case 2, |f'| <= F_d:    needs K2 > 1/2, kf > 1,     r_f = 2 lambda_min(kf - I)                                (3.25), (3.27)
+
+The claim belongs to the backstepping law with an observer whose error obeys f_tilde' = f' - kf f_tilde.  Any barrier will do that
+states how fast its V1 decays along alpha (`decay_rate`), because the law cancels the barrier's slope against e2: 2 k1 for the
+integral barrier, 2 p k1 for the logarithmic one, and so on.  K2 and kf are diagonal, so lambda_min is the smallest entry.
+What is no such loop has no claim here, and `why_no_claim` says why.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.controllers import Backstepping
+from iblf_jax.observers import Momentum, Printed
+from iblf_jax.scenario import Scenario
+
+CASES = (1, 2)
+LOWEST_KF = {1: 0.5, 2: 1.0}
+"""kf must be greater than this: (3.17) in case 1, (3.25) in case 2."""
+LOWEST_K2 = 0.5
+
+
+class Claim(NamedTuple):
+    """The constants of the claim; (n,) each."""
+
+    decay: jax.Array
+    """How fast V1 of each joint decays along alpha [1/s]."""
+    K2: jax.Array
+    kf: jax.Array
+
+
+def law_of(scenario: Scenario) -> Any:
+    """The law itself, without what wraps it (a torque limit)."""
+    law: Any = scenario.controller
+    while getattr(law, "wraps", None) is not None:
+        law = getattr(law, law.wraps)
+    return law
+
+
+def why_no_claim(scenario: Scenario) -> str:
+    """Why Theorem 2 claims nothing about a scenario, in words; "" if it does claim something."""
+    law, observer = law_of(scenario), scenario.observer
+    if not isinstance(law, Backstepping):
+        return f"Theorem 2 is about the backstepping law (3.14); {type(law).__name__} has no claim of this kind"
+    if decay_rate(law) is None:
+        return f"the barrier {type(law.barrier).__name__} states no decay rate of its V1"
+    if not isinstance(observer, Printed | Momentum):
+        return f"Theorem 2 needs the observer (3.11), printed or in momentum form; {type(observer).__name__} has no claim of this kind"
+    return ""
+
+
+def decay_rate(law: Backstepping) -> jax.Array | None:
+    """How fast the barrier's V1 decays along alpha, (n,) [1/s], or None if the barrier does not say."""
+    stated = getattr(law.barrier, "decay_rate", None)
+    return None if stated is None else stated(law.k1)
+
+
+def claim(scenario: Scenario) -> Claim:
+    """The constants of the claim; only for a scenario for which `why_no_claim` is empty."""
+    law, observer = law_of(scenario), scenario.observer
+    decay = decay_rate(law)
+    if decay is None or not isinstance(observer, Printed | Momentum):
+        raise TypeError(why_no_claim(scenario))
+    return Claim(decay, law.K2, observer.kf)
+
+
+def rho_terms(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
+    """The three terms of which rho is the least, (3,) [1/s].                                               (3.19), (3.27)
+
+    Args:
+      constants: gains and decay rates.
+      lambda_max: largest eigenvalue of M0, () [kg m^2].
+      case: 1 for f' = 0, 2 for bounded f'.
+    """
+    return jnp.stack([
+        jnp.min(constants.decay),
+        2.0 * jnp.min(constants.K2 - LOWEST_K2) / lambda_max,
+        2.0 * jnp.min(constants.kf - LOWEST_KF[case]),
+    ])  # fmt: skip
+
+
+def rho(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
+    """The rate of the claim, () [1/s].                                                                      (3.19), (3.27)"""
+    return jnp.min(rho_terms(constants, lambda_max, case))

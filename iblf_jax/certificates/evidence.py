@@ -1,0 +1,201 @@
+"""What the closed loop does at one instant, as far as Theorem 2 speaks of it.
+
+The inequality V2' + rho V2 - 1/2 |f'|^2 <= 0 is a statement about states, not about runs.  So it is checked at each state with the
+exact rates: V2' and f' are the derivatives of V2(t, x) and f(t, x) along the vector field of the whole loop,
+
+    V2' = dV2 . (1, x'),   f' = df . (1, x'),   x = (q, q', state of the law, state of the observer),
+
+by forward-mode differentiation of `closed_loop.evaluate`.  No differences along a run enter, and when plant and model differ, f
+contains q" and tau, and its rate is right all the same.
+
+The printed proof drops two terms of V2', which this module measures:
+
+    law with C0 q':             + 1/2 e2^T M0' e2              dropped in (3.13); zero with C0 alpha, by skew symmetry
+    observer (3.11) as printed: - f_tilde^T kf M0' q'          since f_tilde' = f' - kf f_tilde - kf M0' q'
+
+Rounding: V2' is a sum of large terms that cancel, so the error of it is some units of the last place of those terms, whose sizes
+are added up in `Evidence.terms`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.certificates.claims import law_of
+from iblf_jax.closed_loop import LoopState, evaluate, rate
+from iblf_jax.controllers import Backstepping
+from iblf_jax.integrators import step
+from iblf_jax.observers import Printed
+from iblf_jax.robots import mass_matrix_rate
+from iblf_jax.scenario import Scenario
+
+ROUNDING = 2.0
+"""Units of the last place by which V2' may be off, relative to the sizes of its terms; 0.1 is the most that was seen (tests)."""
+UNCHANGED = 8.0
+"""Units of the last place by which a torque may differ and still be the same."""
+
+
+class Evidence(NamedTuple):
+    """The loop at one instant; every field has a leading time axis along a run."""
+
+    V: jax.Array
+    """V2, ()."""
+    dV: jax.Array
+    """V2', exact, () [1/s]."""
+    f: jax.Array
+    """The uncertain term, (n,) [N m]."""
+    df: jax.Array
+    """f', exact, (n,) [N m/s]."""
+    f_tilde: jax.Array
+    """f - f_hat, (n,) [N m]."""
+    e2: jax.Array
+    """q' - alpha, (n,) [rad/s]."""
+    xi: jax.Array
+    lambda_min: jax.Array
+    """Smallest eigenvalue of M0(q), () [kg m^2]."""
+    lambda_max: jax.Array
+    dropped_e2: jax.Array
+    """1/2 e2^T M0' e2 for the law as printed, else 0, () [1/s]."""
+    dropped_f: jax.Array
+    """-f_tilde^T kf M0' q' for the observer as printed, else 0, () [1/s]."""
+    steady: jax.Array
+    """Whether the torque of the disturbance component does not change along the loop, exactly, () bool."""
+    held: jax.Array
+    """Whether the guard at the wall or a torque limit was at work: nothing is claimed then, () bool."""
+    terms: jax.Array
+    """Sizes of the terms of V2', added up, () [1/s]: `rounding` times this is how exactly V2' is known."""
+    df_terms: jax.Array
+    """Sizes of the terms of f', added up, (n,) [N m/s]."""
+    V_terms: jax.Array
+    """Error of sqrt(2 V2) for one unit of relative error, ()."""
+
+
+def rounding(dtype) -> float:
+    """The relative error that is put down to rounding in sums of this floating-point type."""
+    return ROUNDING * float(jnp.finfo(dtype).eps)
+
+
+def _probe(scenario: Scenario, t: jax.Array, state: LoopState):
+    """What is differentiated along the loop's vector field."""
+    slope_of_state, sample = evaluate(scenario, t, state)
+    law = law_of(scenario)
+    barrier_slope = law.barrier.slope(scenario.setting.tube(t), state.q) if isinstance(law, Backstepping) else jnp.zeros_like(state.q)
+    smooth = {name: getattr(sample, name) for name in ("V", "disturbance", "disturbance_estimate", "tau", "alpha", "xi", "e2", "dq_d")}
+    torque = scenario.disturbance.torque(t, state.q, state.dq, scenario.plant, scenario.model)
+    return smooth | {"ddq": slope_of_state.dq, "s": barrier_slope, "torque": torque}, sample
+
+
+def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
+    """The evidence at one state; pure, for `vmap` over states, times and gains.
+
+    Args:
+      scenario: canonical scenario of n joints.
+      t: time, () [s].
+      state: state of the loop at t.
+    """
+    along = rate(scenario, t, state)
+    now, ahead, sample = jax.jvp(partial(_probe, scenario), (t, state), (jnp.ones_like(t), along), has_aux=True)
+    M0 = scenario.model.mass_matrix(state.q)
+    dM0 = mass_matrix_rate(scenario.model, state.q, state.dq)
+    f_tilde = now["disturbance"] - now["disturbance_estimate"]
+    eigenvalues = jnp.linalg.eigvalsh(M0)
+    dropped_e2, dropped_f = _dropped(scenario, dM0, state.dq, now["e2"], f_tilde)
+    terms, df_terms, V_terms = _sizes(scenario, t, state, M0, now, ahead, f_tilde)
+    return Evidence(
+        V=now["V"],
+        dV=ahead["V"],
+        f=now["disturbance"],
+        df=ahead["disturbance"],
+        f_tilde=f_tilde,
+        e2=now["e2"],
+        xi=now["xi"],
+        lambda_min=eigenvalues[0],
+        lambda_max=eigenvalues[-1],
+        dropped_e2=dropped_e2,
+        dropped_f=dropped_f,
+        steady=jnp.all(ahead["torque"] == 0.0),
+        held=jnp.any(sample.guard_active | sample.saturated) | _limited(scenario, t, state, now),
+        terms=terms,
+        df_terms=df_terms,
+        V_terms=V_terms,
+    )
+
+
+def _limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
+    """Whether a wrapper around the law changed its torque (a smooth limit does so before it is reached), () bool."""
+    law = law_of(scenario)
+    if law is scenario.controller or not isinstance(law, Backstepping):
+        return jnp.zeros((), bool)
+    own = law.command(t, state.q, state.dq, now["disturbance_estimate"], scenario.setting, ())[0].tau
+    return jnp.any(jnp.abs(now["tau"] - own) > UNCHANGED * jnp.finfo(own.dtype).eps * jnp.abs(own))
+
+
+def _dropped(scenario: Scenario, dM0, dq, e2, f_tilde) -> tuple[jax.Array, jax.Array]:
+    """The two terms that the printed proof drops; zero for a law or an observer that has none."""
+    law, zero = law_of(scenario), jnp.zeros_like(e2[0])
+    by_law = 0.5 * (e2 @ (dM0 @ e2)) if isinstance(law, Backstepping) and law.reading == "printed" else zero
+    by_observer = -f_tilde @ (scenario.observer.kf * (dM0 @ dq)) if isinstance(scenario.observer, Printed) else zero
+    return by_law, by_observer
+
+
+def _sizes(scenario: Scenario, t: jax.Array, state: LoopState, M0, now, ahead, f_tilde) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Sizes of the terms of V2' and f', and the error of sqrt(2 V2) for one unit of relative error."""
+    law, observer = law_of(scenario), scenario.observer
+    K2, kf = getattr(law, "K2", jnp.zeros_like(state.q)), getattr(observer, "kf", jnp.zeros_like(state.q))
+    guard = getattr(getattr(law, "barrier", None), "guard", -1.0)
+    # How much nearer the wall than the tube is wide: relative errors grow by 1/gap there, if the barrier has a wall.
+    gap = jnp.clip(1.0 - jnp.abs(now["xi"]), guard, 1.0) if guard > 0 else jnp.ones_like(f_tilde)
+    slow = jnp.abs(state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
+    fast = jnp.abs(now["ddq"]) + jnp.abs(ahead["alpha"])
+    torque = jnp.abs(M0) @ fast + jnp.abs(now["tau"]) + jnp.abs(now["disturbance_estimate"]) + K2 * slow + jnp.abs(now["s"]) / gap
+    torque_rate = (
+        jnp.abs(M0) @ jnp.abs(ahead["ddq"])
+        + jnp.abs(ahead["tau"])
+        + jnp.abs(ahead["disturbance_estimate"])
+        + K2 * fast
+        + kf * torque
+        + (jnp.abs(ahead["s"]) + jnp.abs(now["s"]) * slow) / gap
+    )
+    df, df_tilde = ahead["disturbance"], ahead["disturbance"] - ahead["disturbance_estimate"]
+    terms = slow @ (jnp.abs(now["s"]) / gap + torque) + (jnp.abs(f_tilde) + jnp.abs(df)) @ torque_rate + torque @ jnp.abs(df_tilde)
+    tube = scenario.setting.tube(t)
+    width = jnp.minimum(tube.k_l, tube.k_u)
+    reach = jnp.sum((jnp.abs(state.q) / (width * gap)) ** 2) + slow @ (jnp.abs(M0) @ slow) + torque @ torque
+    return terms, torque_rate, jnp.sqrt(reach)
+
+
+def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, method: str) -> jax.Array:
+    """The integrator's error in V2 over one step, (): one step against two half steps, times two for safety.
+
+    With it the envelopes can be held against a run in which V2 has fallen below what the integrator resolves.
+    """
+    vector_field = partial(rate, scenario)
+
+    def two_steps(share: jax.Array) -> jax.Array:
+        """V2 after a step of share * dt and one of the rest."""
+
+        def advance(place, part):
+            t, state = place
+            return (t + part * dt, step(method, vector_field, t, state, part * dt, vector_field(t, state))), None
+
+        (end, last), _ = jax.lax.scan(advance, (t, state), jnp.stack([share, 1.0 - share]))
+        return evaluate(scenario, end, last)[1].V
+
+    whole, halves = jax.vmap(two_steps)(jnp.asarray([1.0, 0.5], dt.dtype))
+    return 2.0 * jnp.abs(whole - halves)
+
+
+@jax.jit
+def along_run(scenario: Scenario, times: jax.Array, states: LoopState) -> Evidence:
+    """The evidence at every recorded sample; time axis first."""
+    return jax.vmap(partial(evidence_at, scenario))(times, states)
+
+
+@partial(jax.jit, static_argnames="method")
+def defects(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str) -> jax.Array:
+    """The integrator's error in V2 over one step from every recorded sample, (T,)."""
+    return jax.vmap(lambda t, state: defect(scenario, t, state, dt, method))(times, states)

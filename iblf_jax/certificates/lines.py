@@ -1,0 +1,285 @@
+"""The lines of a certificate: each inequality of Theorem 2 held against one run.
+
+Assumptions, gain conditions and rates come first, then the differential inequality, which is checked at every sample; then what
+follows from it by integration: the envelope of V2 and the bounds on xi, e2 and f_tilde.  For readings with a gap in their proof,
+the dropped terms are measured beside the margin that the proof leaves for them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.certificates import claims
+from iblf_jax.certificates.facts import Facts
+from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
+from iblf_jax.scenario import Scenario
+
+CONDITION = {1: "(3.17)", 2: "(3.25)"}
+RHO = {1: "(3.19)", 2: "(3.27)"}
+INEQUALITY = {1: "(3.18)", 2: "(3.26)"}
+ENVELOPE = {1: "(3.20)", 2: "(3.28)"}
+XI_BOUND = {1: "(3.22)", 2: "(3.30)"}
+BOUNDS = {1: "(3.23)", 2: "(3.31)"}
+LEFT = {1: "V2' + rho V2 <= 0", 2: "V2' + rho V2 - |f'|^2/2 <= 0"}
+ENVELOPED = {1: "V2(t) <= V2(0) exp(-rho t)", 2: "V2(t) <= V2(0) exp(-rho t) + rho2/rho"}
+
+Description = dict[str, Any]
+"""The fields of a line that do not depend on the run."""
+NO_BOUND = "the barrier states no bound on xi from V1"
+
+
+def all_lines(facts: Facts) -> list[Line]:
+    """Every line of the certificate of one run, in the theorem's order."""
+    lines = [*assumptions(facts), *gains(facts)]
+    for case in claims.CASES:
+        lines += rates(facts, case)
+    lines += [inequality(facts, case) for case in claims.CASES]
+    lines += [envelope(facts, case) for case in claims.CASES]
+    return lines + bounds(facts) + dropped(facts) + [conclusion(facts)]
+
+
+def why_not(facts: Facts, case: int) -> str:
+    """Why the claim of a case does not apply to this run; "" if it does."""
+    if facts.no_claim or facts.no_run:
+        return facts.no_claim or facts.no_run
+    if case == 1 and facts.case == 2:
+        return f"case 1 is for f' = 0; here |f'| reaches {facts.F_d:.4g} N m/s, see case 2"
+    if not facts.rho[case, "run"] > 0:
+        return f"the gain conditions {CONDITION[case]} are not met"
+    if np.all(facts.evidence.held):
+        return "the guard or a torque limit was at work all the time"
+    return ""
+
+
+def applicable_case(facts: Facts) -> int | None:
+    """The case whose bounds apply to the run: the stronger one that does, or None."""
+    return next((case for case in claims.CASES if not why_not(facts, case)), None)
+
+
+def left_side(facts: Facts, case: int) -> np.ndarray:
+    """The left side of the differential inequality at every sample, (T,) [1/s]."""
+    evidence = facts.evidence
+    left = evidence.dV + facts.rho[case, "run"] * evidence.V
+    return left if case == 1 else left - 0.5 * np.sum(evidence.df**2, axis=1)
+
+
+def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, description: Description) -> Line:
+    """A line from margins at every sample, (T,) or (T, n), with NaN where nothing is claimed."""
+    margins = np.asarray(margins, float)
+    tolerances = np.broadcast_to(np.asarray(tolerances, float), margins.shape)
+    claimed = ~(facts.evidence.held if margins.ndim == 1 else np.broadcast_to(facts.evidence.held[:, None], margins.shape))
+    broken = claimed & ~(margins >= -tolerances)
+    watched = np.where(broken if np.any(broken) else claimed, np.nan_to_num(margins, nan=-np.inf), np.inf)
+    place = np.unravel_index(np.argmin(watched), margins.shape)
+    return Line(
+        verdict=FAILS if np.any(broken) else HOLDS,
+        margin=float(margins[place]),
+        tolerance=float(tolerances[place]),
+        time=float(facts.run.t[place[0]]),
+        joint=int(place[1]) if margins.ndim == 2 else None,
+        **description,
+    )
+
+
+def _excluded(facts: Facts) -> str:
+    """What was left out of a line, and where claims start anew, in words."""
+    held, notes = int(np.sum(facts.evidence.held)), []
+    if held:
+        notes.append(f"{held} of {facts.run.t.size} samples are left out: the guard or a torque limit was at work")
+    if facts.jumps.size:
+        notes.append(f"f jumps at t = {', '.join(f'{x:.4g}' for x in facts.jumps)} s, and the claim starts anew there")
+    return "; ".join(notes)
+
+
+def assumptions(facts: Facts) -> list[Line]:
+    """Bounds of Assumption 1 along the run, and feasibility of the reference, Assumption 2."""
+    run, evidence = facts.run, facts.evidence
+    size, speed = np.linalg.norm(evidence.f, axis=1), np.linalg.norm(evidence.df, axis=1)
+    lines = []
+    for name, statement, values, unit in (
+        ("f bounded", "|f| <= F_m", size, "N m"),
+        ("f' bounded", "|f'| <= F_d between jumps", speed if facts.case == 2 else 0.0 * speed, "N m/s"),
+    ):
+        at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
+        jumps = "" if name == "f bounded" or not facts.jumps.size else f"Assumption 1 is broken by a jump of f: {_excluded(facts)}"
+        verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
+        lines.append(Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(run.t[at]), note=jumps))
+    room = np.minimum(run.q_d - run.lower, run.upper - run.q_d)
+    sample, joint = np.unravel_index(np.argmin(room), room.shape)
+    feasible: Description = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
+    lines.append(_plain(feasible, float(room[sample, joint]), joint=int(joint), time=float(run.t[sample])))
+    start = np.minimum(run.q[0] - run.lower[0], run.upper[0] - run.q[0])
+    inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
+    return [*lines, _plain(inside, float(start.min()), joint=int(start.argmin()), time=float(run.t[0]))]
+
+
+def _plain(description: Description, margin: float, **more: Any) -> Line:
+    """A line whose margin must be positive."""
+    return Line(verdict=HOLDS if margin > 0 else FAILS, margin=margin, **description, **more)
+
+
+def gains(facts: Facts) -> list[Line]:
+    """The gain conditions (3.17) and (3.25)."""
+    described = (
+        ("K2", "(3.17)", "lambda_min(K2 - I/2) > 0", "K2", claims.LOWEST_K2, "N m s/rad"),
+        ("kf, case 1", "(3.17)", "lambda_min(kf - I/2) > 0", "kf", claims.LOWEST_KF[1], "1/s"),
+        ("kf, case 2", "(3.25)", "lambda_min(kf - I) > 0", "kf", claims.LOWEST_KF[2], "1/s"),
+    )
+    lines = []
+    for name, equation, statement, field, lowest, unit in described:
+        description: Description = {"name": name, "equation": equation, "statement": statement, "unit": unit}
+        if facts.claim is None:
+            lines.append(Line(verdict=NOT_APPLICABLE, note=facts.no_claim, **description))
+            continue
+        margins = np.asarray(getattr(facts.claim, field)) - lowest
+        spare = name == "kf, case 2" and facts.case == 1
+        note = "f' = 0 on this run, so case 1 is what counts" if spare else ""
+        lines.append(_plain(description, float(margins.min()), joint=int(margins.argmin()), counts=not spare, note=note))
+    return lines
+
+
+def rates(facts: Facts, case: int) -> list[Line]:
+    """The rate rho of one case, with lambda_max(M0) along the run and over the admissible box."""
+    lines = []
+    for where in ("run", "box"):
+        name = f"rho, case {case}" + ("" if where == "run" else ", over the box")
+        description: Description = {"name": name, "equation": RHO[case], "unit": "1/s"}
+        description["statement"] = f"rho = min(decay of V1, 2 (K2 - 1/2)/lambda_max(M0), 2 (kf - {claims.LOWEST_KF[case]:g})) > 0"
+        reason = facts.no_claim or ("" if case == 2 or facts.case == 1 else why_not(facts, 1))
+        if reason or facts.claim is None:
+            lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
+            continue
+        largest = float(facts.evidence.lambda_max.max()) if where == "run" else facts.box.lambda_max
+        terms = np.asarray(claims.rho_terms(facts.claim, jnp.asarray(largest), case))
+        least = ("the decay rate of V1", "K2 over lambda_max(M0)", "kf")[int(np.argmin(terms))]
+        note = f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({facts.box.searched})" if where == "box" else "") + f"; set by {least}"
+        counts = not (case == 2 and facts.case == 1)
+        lines.append(_plain(description, facts.rho[case, where], value=facts.rho[case, where], note=note, counts=counts))
+    return lines
+
+
+def inequality(facts: Facts, case: int) -> Line:
+    """The differential inequality, at every sample."""
+    description: Description = {"name": f"inequality, case {case}", "equation": INEQUALITY[case], "statement": LEFT[case], "unit": "1/s"}
+    reason = why_not(facts, case)
+    if reason:
+        return Line(verdict=NOT_APPLICABLE, note=reason, **description)
+    tolerance = facts.eps * (facts.evidence.terms + facts.rho[case, "run"] * facts.evidence.V)
+    return judged(facts, -left_side(facts, case), tolerance, {**description, "note": _excluded(facts)})
+
+
+def envelope(facts: Facts, case: int) -> Line:
+    """The envelope of V2, at every sample."""
+    description: Description = {"name": f"envelope, case {case}", "equation": ENVELOPE[case], "statement": ENVELOPED[case]}
+    reason = why_not(facts, case)
+    if reason:
+        return Line(verdict=NOT_APPLICABLE, note=reason, **description)
+    upper = facts.envelope[case]
+    return judged(facts, upper.bound - facts.evidence.V, upper.tolerance, {**description, "note": _excluded(facts)})
+
+
+@jax.jit
+def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
+    """The barrier's own bound on |xi| where V1 <= V, (T, n), or None if it states none."""
+    stated = getattr(claims.law_of(scenario).barrier, "xi_bound", None)
+    return None if stated is None else jax.vmap(lambda t, V: stated(V, scenario.setting.tube(t)))(t, V)
+
+
+def bounds_along(facts: Facts, V: np.ndarray) -> dict[str, np.ndarray]:
+    """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
+    by_barrier = _xi_bound(facts.run.scenario, facts.run.t, jnp.asarray(V, facts.run.t.dtype))
+    return {
+        "xi, by V1": np.full(facts.run.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier),
+        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], facts.run.q.shape),
+        "e2": np.sqrt(2 * V / facts.evidence.lambda_min.min()),
+        "f_tilde": np.sqrt(2 * V),
+    }
+
+
+def bounds(facts: Facts) -> list[Line]:
+    """The bounds on xi, e2 and f_tilde that follow from the envelope of the case at hand."""
+    case = applicable_case(facts)
+    shown = case or facts.case
+    descriptions: list[Description] = [
+        {
+            "name": "xi, by V1",
+            "equation": XI_BOUND[shown],
+            "statement": "V1 <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar)), or as the barrier says",
+        },
+        {"name": "xi", "equation": BOUNDS[shown], "statement": "|xi_i| <= sqrt(2 Vbar)"},
+        {"name": "e2", "equation": BOUNDS[shown], "statement": "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "unit": "rad/s"},
+        {"name": "f_tilde", "equation": BOUNDS[shown], "statement": "|f_tilde| <= sqrt(2 Vbar)", "unit": "N m"},
+    ]
+    if case is None:
+        reason = why_not(facts, facts.case)
+        return [Line(verdict=NOT_APPLICABLE, note=reason, **description) for description in descriptions]
+    upper, evidence = facts.envelope[case], facts.evidence
+    tight, wide = bounds_along(facts, upper.bound), bounds_along(facts, upper.bound + upper.tolerance)
+    sizes = {"xi, by V1": np.abs(evidence.xi), "xi": np.abs(evidence.xi)}
+    sizes |= {"e2": np.linalg.norm(evidence.e2, axis=1), "f_tilde": np.linalg.norm(evidence.f_tilde, axis=1)}
+    lines = []
+    for description in descriptions:
+        name = description["name"]
+        reason = _no_xi_bound(tight) if name.startswith("xi") else ""
+        if reason and (name == "xi" or np.all(np.isnan(tight["xi, by V1"]))):
+            lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
+            continue
+        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(facts)) if x)
+        lines.append(judged(facts, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
+    return lines
+
+
+def _no_xi_bound(tight: dict[str, np.ndarray]) -> str:
+    """Why |xi| <= sqrt(2 V) does not follow for this barrier; "" if it does (xi^2/2 <= V1, Theorem 1)."""
+    if np.all(np.isnan(tight["xi, by V1"])):
+        return NO_BOUND
+    stronger = tight["xi, by V1"] <= tight["xi"] * (1 + 1e-9)
+    return "" if np.all(stronger | np.isnan(tight["xi"])) else "xi^2/2 <= V1 (Theorem 1) is not so for this barrier"
+
+
+def dropped(facts: Facts) -> list[Line]:
+    """The size of the terms that the printed proof drops, against the margin that the proof has without them."""
+    law, evidence, case = claims.law_of(facts.run.scenario), facts.evidence, applicable_case(facts)
+    described = (
+        ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", evidence.dropped_e2),
+        ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", evidence.dropped_f),
+    )
+    exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(facts))
+    lines = []
+    for (name, equation, statement, term), none_dropped in zip(described, exact, strict=True):
+        description: Description = {"name": name, "equation": equation, "statement": statement, "unit": "1/s", "counts": False}
+        reason = facts.no_claim or facts.no_run or none_dropped or ("" if case else why_not(facts, facts.case))
+        if reason or case is None:
+            lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
+            continue
+        proven = evidence.dropped_e2 + evidence.dropped_f - left_side(facts, case)
+        tolerance = facts.eps * evidence.terms
+        free = ~evidence.held
+        share = np.max(np.where(free, term / np.maximum(proven, tolerance), 0.0))
+        note = f"at most {max(100 * share, 0.0):.3g} % of that margin at one instant"
+        largest = float(np.max(np.abs(term[free])))
+        lines.append(judged(facts, proven - term, tolerance, {**description, "value": largest, "note": note}))
+    return lines
+
+
+def _exact_observer(facts: Facts) -> str:
+    return "exact: the observer has momentum form" if type(facts.run.scenario.observer).__name__ == "Momentum" else ""
+
+
+def conclusion(facts: Facts) -> Line:
+    """Properties (I) and (II): every joint inside its bounds, at every sample."""
+    description: Description = {"name": "joints inside", "equation": "(I), (II)", "statement": "|xi_i| < 1: -k_l < e1 < k_u"}
+    room = 1.0 - np.abs(facts.run.xi)
+    at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
+    case = applicable_case(facts)
+    line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(facts.run.t[at]))
+    unclaimed = case is not None and _xi_bound(facts.run.scenario, facts.run.t[:1], facts.evidence.V[:1]) is None
+    if case is None or unclaimed:
+        reason = NO_BOUND if unclaimed else why_not(facts, facts.case)
+        note = f"no claim, only seen ({reason})"
+        return Line(**{**vars(line), "verdict": NOT_APPLICABLE, "note": note})
+    return line

@@ -1,0 +1,69 @@
+"""Random states, gains and masses of the closed loop, for tests of what must hold at every state."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import iblf_jax as ij
+from iblf_jax.certificates.evidence import Evidence, evidence_at
+from iblf_jax.closed_loop import LoopState
+from iblf_jax.scenario import canonical
+
+STATES = 4096
+
+
+def loop(reading: str = "corrected", observer: str = "momentum", barrier=None, wall: float = 1e-3) -> ij.Scenario:
+    """The paper's loop with one law and one observer, to be varied by `random_loops`."""
+    barrier = ij.barriers.Integral(guard=wall) if barrier is None else barrier
+    law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier, reading=reading)
+    paper = ij.presets.zhang_yan_2024()
+    return canonical(dataclasses.replace(paper, controller=law, observer=ij.observers.MEMBERS[observer](kf=20.0)))
+
+
+def random_loops(scenario: ij.Scenario, seed: int = 0, *, states: int = STATES, speed: float = 10.0, nearest: float = 0.99):
+    """Scenarios with other gains, masses and disturbances, and a time and state of each: (scenario, t, state), batched."""
+    dtype, rng, n = scenario.initial.q.dtype, np.random.default_rng(seed), scenario.n
+
+    def uniform(low, high, *shape):
+        return rng.uniform(low, high, (states, *shape)).astype(dtype)
+
+    every = jax.tree.map(lambda x: np.broadcast_to(x, (states, *np.shape(x))), scenario)
+    o = {} if scenario.controller.o is None else {"o": 10 ** uniform(-3, 0, n)}
+    batch = _rebuilt(
+        every,
+        controller=_rebuilt(every.controller, k1=10 ** uniform(-1, 1, n), K2=0.5 + 10 ** uniform(-2, 1.7, n), **o),
+        observer=_rebuilt(every.observer, kf=1.0 + 10 ** uniform(-2, 1.7, n)),
+        disturbance=_rebuilt(every.disturbance, phase=uniform(0.0, 6.28)),
+        plant=_rebuilt(every.plant, mass=every.plant.mass * uniform(0.5, 1.5, n), payload=uniform(0.0, 0.5)),
+        model=_rebuilt(every.model, mass=every.model.mass * uniform(0.5, 1.5, n)),
+    )
+    t, dq = uniform(0.0, 20.0), uniform(-speed, speed, n)
+    q, momentum = _position(batch, t, uniform(-nearest, nearest, n), dq)
+    return batch, t, LoopState(q, dq, (), uniform(-5.0, 5.0, n) - batch.observer.kf * momentum)
+
+
+def _rebuilt(part, **changes):
+    """A component with other fields, unchecked: its leaves are batched."""
+    copy = object.__new__(type(part))
+    for field in dataclasses.fields(part):
+        object.__setattr__(copy, field.name, changes.get(field.name, getattr(part, field.name)))
+    return copy
+
+
+@jax.jit
+@jax.vmap
+def _position(scenario: ij.Scenario, t, xi, dq):
+    """The position with this relative error, and M0 q' there."""
+    tube = scenario.setting.tube(t)
+    q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+    return q, scenario.model.mass_matrix(q) @ dq
+
+
+@jax.jit
+def evidence_of(batch: ij.Scenario, t, state: LoopState) -> Evidence:
+    """The evidence at each of the states."""
+    return jax.vmap(evidence_at)(batch, t, state)

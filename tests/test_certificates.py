@@ -1,0 +1,405 @@
+"""Certificates: the inequality at random states, whole runs, what has no claim, many runs, and the printed proof's gap."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from certificate_states import evidence_of, loop, random_loops
+from conftest import PAPER
+
+import iblf_jax as ij
+from iblf_jax.certificates import Certificate, certify, claims, falsify
+from iblf_jax.certificates.box import eigenvalues_over
+from iblf_jax.certificates.evidence import evidence_at, rounding
+from iblf_jax.certificates.facts import facts_of, starts_of
+from iblf_jax.closed_loop import LoopState, initial_state
+from iblf_jax.scenario import canonical
+
+READINGS = (
+    ("corrected", "momentum", "float64"),
+    ("printed", "printed", "float64"),
+    ("corrected", "printed", "float32"),
+    ("printed", "momentum", "float32"),
+    pytest.param("corrected", "momentum", "float32", marks=pytest.mark.slow),
+    pytest.param("printed", "printed", "float32", marks=pytest.mark.slow),
+)
+BARRIERS = {
+    "integral": ij.barriers.Integral(),
+    "log_p2": ij.barriers.Log(p=2),
+    "tan": ij.barriers.Tan(),
+    "state": pytest.param(ij.barriers.State(), marks=pytest.mark.slow),
+    "prescribed_performance": pytest.param(ij.barriers.PrescribedPerformance(), marks=pytest.mark.slow),
+    "mapping": pytest.param(ij.barriers.Mapping(), marks=pytest.mark.slow),
+    "quadratic": pytest.param(ij.barriers.Quadratic(), marks=pytest.mark.slow),
+}
+
+
+def proven_rate(scenario, t, state, evidence):
+    """V2' of the integral barrier as the proof writes it, (3.8) and (3.24), with the terms that it drops."""
+    law, kf = scenario.controller, scenario.observer.kf
+    tube = scenario.setting.tube(t)
+    above = state.q > tube.q_d
+    k, dk = jnp.where(above, tube.k_u, tube.k_l), jnp.where(above, tube.dk_u, tube.dk_l)
+    kappa = jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + law.o)
+    xi, e2, f_tilde = tube.xi(state.q), evidence.e2, evidence.f_tilde
+    position = -jnp.sum(2 * xi**2 / (1 - xi**2) * (law.k1 + kappa + dk / k))
+    rest = -e2 @ (law.K2 * e2) + e2 @ f_tilde + f_tilde @ evidence.df - f_tilde @ (kf * f_tilde)
+    return position + rest + evidence.dropped_e2 + evidence.dropped_f
+
+
+def left_side(batch, evidence):
+    """V2' + rho V2 - |f'|^2/2 with lambda_max of each position."""
+    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.claim(scenario), largest, 2))(batch, evidence.lambda_max)
+    return np.asarray(evidence.dV + rho * evidence.V - 0.5 * jnp.sum(evidence.df**2, axis=-1))
+
+
+# ---------------------------------------------------------------------------------------------------- states
+
+
+@pytest.mark.parametrize(("reading", "observer", "dtype"), READINGS)
+def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, dtype):
+    batch, t, state = random_loops(ij.astype(loop(reading, observer), dtype), nearest=0.998)
+    evidence = evidence_of(batch, t, state)
+    assert evidence.dV.dtype == dtype
+    assert not np.any(evidence.held)
+    error = np.abs(np.asarray(jax.jit(jax.vmap(proven_rate))(batch, t, state, evidence) - evidence.dV))
+    allowed = rounding(dtype) * np.asarray(evidence.terms)
+    assert np.all(error <= allowed)
+    # The tolerance is small beside what it judges, so that it hides nothing.
+    assert np.median(allowed / np.abs(evidence.dV)) < (1e-11 if dtype == "float64" else 5e-3)
+    assert np.any(np.asarray(evidence.dropped_e2) != 0) == (reading == "printed")
+    assert np.any(np.asarray(evidence.dropped_f) != 0) == (observer == "printed")
+
+
+@pytest.mark.parametrize("barrier", list(BARRIERS.values()), ids=list(BARRIERS))
+def test_corrected_keeps_the_inequality_at_every_state(barrier):
+    scenario = loop(barrier=barrier)
+    for seed in range(4):
+        batch, t, state = random_loops(scenario, seed, speed=30.0)
+        evidence = evidence_of(batch, t, state)
+        free = ~np.asarray(evidence.held)
+        assert np.mean(free) > 0.9
+        left, allowed = left_side(batch, evidence), rounding("float64") * np.asarray(evidence.terms)
+        assert np.all(np.isfinite(left[free]))
+        assert np.all(left[free] <= allowed[free])
+
+
+def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
+    # One joint, e1 = 0, e2 = f_tilde = f', and all rates of the claim the same: each step of the proof is an equality.
+    rate = 1.7
+    arm = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
+    scenario = ij.Scenario(
+        plant=arm,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1),
+        bounds=ij.bounds.Bounds(lower=ij.bounds.Constant(-1.0), upper=ij.bounds.Constant(2.0)),
+        disturbance=ij.disturbances.Sinusoids(amplitude=0.8, frequency=1.0),
+        controller=ij.controllers.Backstepping(
+            k1=5.0, K2=0.5 + 0.5 * rate * float(arm.mass_matrix(jnp.zeros(1))[0, 0]), reading="corrected"
+        ),
+        observer=ij.observers.Momentum(kf=1.0 + 0.5 * rate, start="matched"),
+        initial=ij.Initial(q=0.5, dq=0.1 + 0.8),
+    )
+    scenario = canonical(ij.with_parameters(scenario, {"observer.eta0": -0.8}))
+    seen = jax.jit(evidence_at)(scenario, jnp.zeros(()), initial_state(scenario))
+    np.testing.assert_allclose([seen.e2[0], seen.f_tilde[0], seen.df[0]], 0.8, rtol=1e-12)
+    rho = claims.rho(claims.claim(scenario), seen.lambda_max, 2)
+    assert float(rho) == pytest.approx(rate, rel=1e-12)
+    left = float(seen.dV + rho * seen.V - 0.5 * seen.df @ seen.df)
+    assert abs(left) <= rounding("float64") * float(seen.terms) < 1e-11
+
+
+# ---------------------------------------------------------------------------------------------------- runs
+
+
+@pytest.fixture(scope="module")
+def paper_certificate(paper, paper_run) -> Certificate:
+    return certify(paper, paper_run)
+
+
+@pytest.fixture(scope="module")
+def corrected_run():
+    """The paper's run with the corrected law, and a jump of f at 10 s whose size is zero unless a test says otherwise."""
+    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    both = ij.disturbances.Sum((paper.disturbance, ij.disturbances.Step(size=0.0, time=10.0)))
+    return ij.simulate(dataclasses.replace(paper, disturbance=both), **PAPER)
+
+
+@pytest.fixture(scope="module")
+def corrected_certificate(corrected_run) -> Certificate:
+    return certify(corrected_run.scenario, corrected_run)
+
+
+def test_rate_along_the_run_is_its_difference_quotient(paper_run):
+    facts = facts_of(jax.tree.map(np.asarray, paper_run))
+    V, h = facts.evidence.V, 0.01
+    quotient = (V[:-4] - 8 * V[1:-3] + 8 * V[3:-1] - V[4:]) / (12 * h)
+    quiet = slice(100, None)  # from 1 s on, when the fastest modes have died out
+    np.testing.assert_allclose(facts.evidence.dV[2:-2][quiet], quotient[quiet], atol=2e-6 * np.abs(facts.evidence.dV[102:]).max() + 1e-9)
+    np.testing.assert_allclose(V, paper_run.V, rtol=1e-9)
+    np.testing.assert_allclose(facts.evidence.f, paper_run.disturbance, atol=1e-10)
+
+
+def test_paper_run_keeps_the_printed_inequality(paper_certificate):
+    assert paper_certificate.holds
+    numbers = paper_certificate.numbers
+    assert numbers["case"] == 2
+    assert numbers["rho_run_case_2"] == pytest.approx(4.0)
+    assert numbers["V2_start"] == pytest.approx(0.966, abs=1e-3)
+    line = paper_certificate["inequality, case 2"]
+    assert line.verdict == "holds"
+    assert 1e-6 < line.margin < 1e-3
+    for name, equation in (("inequality, case 1", "(3.18)"), ("envelope, case 1", "(3.20)"), ("rho, case 1", "(3.19)")):
+        assert (paper_certificate[name].verdict, paper_certificate[name].equation) == ("not applicable", equation)
+    assert paper_certificate["xi"].equation == "(3.31)"
+    by_law, by_observer = (paper_certificate[f"dropped term of the {part}"] for part in ("law", "observer"))
+    assert 1e-3 < by_law.value < by_observer.value < 0.05
+    assert "at most 18.4 %" in by_observer.note
+
+
+def test_lambda_max_over_the_box_is_that_of_the_stretched_arm(paper_certificate, paper):
+    # M0 of two links depends on q2 alone, and grows as the arm stretches: the box is q2 in (0.06, 1.04).
+    expected = np.linalg.eigvalsh(np.asarray(paper.model.mass_matrix(jnp.array([0.0, 0.06]))))[-1]
+    assert paper_certificate.numbers["lambda_max_box"] == pytest.approx(expected, rel=1e-6)
+    assert paper_certificate.numbers["lambda_max_run"] <= expected
+    assert "grid" in paper_certificate["rho, case 2, over the box"].note
+
+
+def test_lambda_max_over_the_box_of_many_joints():
+    n = 4
+    arm = ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.01] * n)
+    extremes = eigenvalues_over(arm, np.full(n, -1.0), np.full(n, 1.0))
+    straight = np.linalg.eigvalsh(np.asarray(arm.mass_matrix(jnp.zeros(n))))
+    assert extremes.lambda_max == pytest.approx(straight[-1], rel=1e-6)
+    assert "Sobol" in extremes.searched
+    some = np.random.default_rng(0).uniform(-1, 1, (300, n))
+    values = np.linalg.eigvalsh(np.asarray(jax.vmap(arm.mass_matrix)(jnp.asarray(some))))
+    assert extremes.lambda_min <= values.min()
+
+
+def test_corrected_run_holds_and_drops_nothing(corrected_certificate):
+    assert corrected_certificate.holds
+    for part in ("law", "observer"):
+        line = corrected_certificate[f"dropped term of the {part}"]
+        assert line.verdict == "not applicable"
+        assert "exact" in line.note
+
+
+CALM = {"disturbance.parts[0].acceleration_amplitude": 0.0, "disturbance.parts[0].velocity_amplitude": 0.0}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"controller.K2": 0.6, "observer.kf": 1.1, "initial.dq": [2.0, -2.0]},
+        {"plant.mass": [2.6, 0.5], "plant.payload": 0.4},
+        {"plant.mass[1]": 1.2, "controller.k1": 8.0, "disturbance.parts[0].phase": 2.0, "initial.q": [0.4, 0.7]},
+        CALM | {"initial.dq": [3.0, 1.0]},
+    ],
+    ids=["low gains", "another plant", "several", "no disturbance"],
+)
+def test_corrected_holds_on_other_runs(corrected_run, changes):
+    scenario = ij.with_parameters(corrected_run.scenario, changes)
+    certificate = certify(scenario, ij.simulate(scenario, **PAPER))
+    assert certificate.holds, certificate
+    still = set(CALM) <= set(changes)
+    assert certificate.numbers["case"] == (1 if still else 2)
+    assert (certificate["envelope, case 1"].verdict == "holds") == still
+    assert certificate["e2"].equation == ("(3.23)" if still else "(3.31)")
+    if still:  # V2 falls to what rounding leaves of it, and the envelope is followed down to there.
+        assert certificate.numbers["V2_end"] < 1e-12
+        assert certificate["envelope, case 1"].tolerance < 1e-4
+
+
+def test_gains_below_the_conditions_are_named(corrected_run):
+    scenario = ij.with_parameters(corrected_run.scenario, {"observer.kf": [0.8, 20.0]})
+    certificate = certify(scenario, ij.simulate(scenario, **PAPER))
+    line = certificate["kf, case 2"]
+    assert (line.verdict, line.joint, line.equation) == ("fails", 0, "(3.25)")
+    assert line.margin == pytest.approx(-0.2)
+    assert certificate["kf, case 1"].verdict == "holds"
+    assert certificate.verdict == "fails"
+    assert certificate["inequality, case 2"].verdict == "not applicable"
+    assert "(3.25)" in certificate["inequality, case 2"].note
+
+
+def test_envelope_starts_anew_at_jumps_and_after_held_samples():
+    t = np.arange(6.0)
+    held = np.array([False, False, True, False, False, False])
+    np.testing.assert_array_equal(starts_of(t, held, np.array([3.5, 5.0])), [True, False, False, True, True, True])
+
+
+def test_jump_of_the_disturbance_restarts_the_envelope(corrected_run):
+    scenario = ij.with_parameters(corrected_run.scenario, CALM | {"disturbance.parts[1].size": [3.0, -2.0]})
+    run = ij.simulate(scenario, **PAPER)
+    certificate = certify(scenario, run)
+    assert certificate.holds, certificate
+    assert certificate.numbers["case"] == 1
+    assert "t = 10 s" in certificate["f' bounded"].note
+    at = int(np.searchsorted(np.asarray(run.t), 10.0))
+    assert certificate.traces.envelope[at] == pytest.approx(certificate.traces.V[at])
+    assert certificate.traces.V[at] > 1e6 * certificate.traces.envelope[at - 1]
+
+
+# ---------------------------------------------------------------------------------------------------- no claim
+
+
+@pytest.mark.parametrize("name", ["PDGravity", pytest.param("NoObserver", marks=pytest.mark.slow)])
+def test_no_claim_is_not_applicable(paper, name):
+    law = ij.controllers.PDGravity(Kp=60.0, Kd=20.0) if name == "PDGravity" else paper.controller
+    certificate = certify(dataclasses.replace(paper, controller=law, observer=ij.observers.NoObserver()), duration=0.5)
+    assert certificate.verdict == "not applicable"
+    assert not certificate.holds
+    assert name in certificate["inequality, case 2"].note
+    assert {line.verdict for line in certificate.lines} == {"holds", "not applicable"}
+    json.dumps(certificate.to_dict(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_saturated_samples_are_left_out(corrected_run):
+    paper = corrected_run.scenario
+    scenario = dataclasses.replace(paper, controller=ij.controllers.Saturated(law=paper.controller, limit=[8.0, 3.0]))
+    certificate = certify(scenario, duration=2.0)
+    left_out = certificate.numbers["samples_left_out"]
+    assert 0 < left_out < 1000
+    assert certificate["inequality, case 2"].verdict == "holds"
+    assert f"{left_out} of 2001 samples are left out" in certificate["inequality, case 2"].note
+    assert np.all(np.isnan(certificate.traces.envelope[certificate.traces.held]))
+
+
+def test_a_run_that_failed_is_not_judged(corrected_run):
+    run = dataclasses.replace(corrected_run, status=jnp.int32(int(ij.Status.STEP_TOO_LARGE)))
+    certificate = certify(run.scenario, run)
+    assert certificate["inequality, case 2"].verdict == "not applicable"
+    assert "too large" in certificate["inequality, case 2"].note
+
+
+def test_wrong_arguments_are_named(paper, corrected_run):
+    with pytest.raises(ValueError, match=r"run: got .* expected a run of `scenario`"):
+        certify(paper, corrected_run)
+    other = ij.with_parameters(corrected_run.scenario, {"controller.K2": 21.0})
+    with pytest.raises(ValueError, match="other numbers"):
+        certify(other, corrected_run)
+    with pytest.raises(ValueError, match="a Rollout, a study or None"):
+        certify(paper, 3)
+    with pytest.raises(ValueError, match="claim"):
+        falsify(dataclasses.replace(paper, observer=ij.observers.NoObserver()), {"initial.q": (0.4, 0.7)})
+    with pytest.raises(ValueError, match="low <= high"):
+        falsify(paper, {"initial.q": (0.7, 0.4)})
+
+
+# ---------------------------------------------------------------------------------------------------- many runs
+
+
+@pytest.fixture(scope="module")
+def batch(corrected_run):
+    """Three runs of the corrected law; the second has kf below (3.25)."""
+    runs = [corrected_run]
+    for kf in (0.9, 5.0):
+        runs.append(ij.simulate(ij.with_parameters(corrected_run.scenario, {"observer.kf": kf}), **PAPER))
+    return jax.tree.map(lambda *x: jnp.stack(x), *runs)
+
+
+def test_batch_reports_the_worst_run(corrected_run, batch, corrected_certificate):
+    certificate = certify(corrected_run.scenario, batch)
+    assert certificate.runs == (0, 1, 2)
+    assert (certificate["kf, case 2"].run, certificate["kf, case 2"].verdict) == (1, "fails")
+    assert "1 of 3" in certificate["kf, case 2"].note
+    assert "not applicable in 1 of 3" in certificate["inequality, case 2"].note
+    assert certificate.worst_run == 1
+    sound = certify(corrected_run.scenario, batch[np.array([0, 2])])
+    single = [corrected_certificate, certify(batch[2].scenario, batch[2])]
+    margins = [one["inequality, case 2"].margin for one in single]
+    assert sound["inequality, case 2"].margin == pytest.approx(min(margins))
+    assert sound.worst_run == int(np.argmin(margins))
+    assert sound.holds
+    assert f"worst {sound.worst_run}" in repr(sound)
+
+
+class Study:
+    """What `certify` asks of a study."""
+
+    def __init__(self, runs):
+        self.runs, self.metrics, self.status, self.replayed = runs, runs.metrics, runs.status, []
+
+    def __len__(self):
+        return len(self.runs)
+
+    def replay(self, index):
+        self.replayed.append(index)
+        return self.runs[index]
+
+
+def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
+    study = Study(batch)
+    nearest = int(np.argmin(np.min(np.asarray(batch.metrics.xi_margin), axis=1)))
+    certificate = certify(corrected_run.scenario, study, worst=1)
+    assert study.replayed == [nearest]
+    assert certificate.runs == (nearest,)
+    assert certify(corrected_run.scenario, Study(batch), worst=None).runs == (0, 1, 2)
+
+
+# ---------------------------------------------------------------------------------------------------- the gap
+
+
+def test_printed_breaks_its_claim_where_corrected_keeps_it():
+    printed, corrected = (certify(ij.presets.printed_gap(reading=reading), duration=0.5) for reading in ("printed", "corrected"))
+    for certificate in (printed, corrected):  # inside the paper's own conditions
+        assert all(certificate[name].verdict == "holds" for name in ("K2", "kf, case 1", "kf, case 2", "start inside"))
+    broken = printed["inequality, case 1"]
+    assert broken.verdict == "fails"
+    assert broken.margin < -10.0
+    assert broken.time < 0.03
+    assert printed["inequality, case 2"].verdict == "fails"
+    assert printed["envelope, case 1"].verdict == "fails"
+    assert np.max(printed.traces.V) > 1.02 * printed.numbers["V2_start"]
+    assert corrected.holds, corrected
+    assert np.all(np.diff(corrected.traces.V) < 0)
+
+
+def test_search_finds_the_gap_of_the_printed_law_only():
+    ranges = {
+        "initial.q": (0.4, 0.75),
+        "initial.dq": (-4.0, 4.0),
+        "observer.eta0": (-3.0, 3.0),
+        "controller.K2": (0.6, 20.0),
+        "observer.kf": (1.1, 40.0),
+    }
+    found = falsify(ij.presets.printed_gap(), ranges, starts=8)
+    assert found.growth > 0.3
+    for path, (low, high) in ranges.items():
+        assert np.all((found.parameters[path] >= low) & (found.parameters[path] <= high))
+    none = falsify(ij.presets.printed_gap(reading="corrected"), ranges, starts=8)
+    assert none.growth < -1.0 + 1e-9
+
+
+# ---------------------------------------------------------------------------------------------------- what a user sees
+
+
+def test_certificate_shows_itself(paper_certificate):
+    text = repr(paper_certificate)
+    assert text.startswith("Certificate: holds")
+    for words in ("(3.17)", "(3.25)", "(3.27)", "(3.26)", "(3.28)", "(3.31)", "Assumption 2", "t = 7.63 s"):
+        assert words in text
+    assert "<table>" in paper_certificate._repr_html_()
+    assert json.loads(json.dumps(paper_certificate.to_dict(), allow_nan=False))["verdict"] == "holds"
+    with pytest.raises(KeyError, match="envelope, case 1"):
+        paper_certificate["envelopes"]
+
+
+def test_certificate_draws_itself(paper_certificate):
+    figure = paper_certificate.plot(until=5.0)
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    assert len(figure.axes) == 6
+    with pytest.raises(ValueError, match="until"):
+        paper_certificate.plot(until=1e-6)
+
+
+def test_state_is_all_that_evidence_needs(paper_run):
+    state = LoopState(paper_run.q[7], paper_run.dq[7], (), paper_run.observer_state[7])
+    seen = jax.jit(evidence_at)(paper_run.scenario, paper_run.t[7], state)
+    np.testing.assert_allclose(seen.V, paper_run.V[7], rtol=1e-10)
