@@ -1,7 +1,7 @@
 """The figure of a comparison: error, torque and settling time of every law, at the gains given and at equal effort, side by side.
 
-The error is drawn on a logarithmic scale, where an exponential decay is a straight line and its rate a slope; the torque during its own,
-much shorter transient.
+The error is drawn on a logarithmic scale, where an exponential decay is a straight line and its rate a slope; the torque during a tenth
+of that time, because its transient, 1/K2 against 1/k1, is so much shorter.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 SMALLEST = 1e-5
 """Errors below this [rad] are drawn at the foot of the logarithmic axis."""
 
+TORQUE_SHARE = 0.1
+"""The part of the error's time that the torque is shown for."""
+
 
 @_style.styled()
 def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None) -> Figure:
@@ -36,7 +39,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     Args:
       result: what `iblf_jax.compare` returned.
       joint: which joint, from 0.
-      zoom: how much of the start is shown [s]; two and a half transients of error and of torque if not given.
+      zoom: how much of the start is shown [s]; two and a half transients of the error if not given.
 
     Returns:
       The figure.
@@ -49,6 +52,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     given = curves_of(result.rollouts)
     joint = check_joint(given, joint)
     error, torque = (Row(QUANTITIES[field], joint, QUANTITIES[field].label) for field in ("e1", "tau"))
+    start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:
         columns["equal effort (RMS torque above gravity)"] = curves_of(result.equal_effort)
@@ -57,8 +61,8 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     order = list(result.rollouts)
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
-        _errors(column[0], curves, order, joint, windows(given, [error], zoom)[1])
-        _torques(column[1], curves, order, joint, windows(given, [torque], zoom)[1])
+        _errors(column[0], curves, order, joint, (start, end))
+        _torques(column[1], curves, order, joint, (start, TORQUE_SHARE * end))
         _settling(column[2], curves, order)
     table[0, 0].set_ylabel(_style.label("error $|e_1|$", "rad"))
     table[1, 0].set_ylabel(torque.label)

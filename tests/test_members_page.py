@@ -1,0 +1,24 @@
+"""docs/members.md is what the members' docstrings give, and every law, barrier and observer names its source."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+from iblf_jax import barriers, controllers, observers
+
+PAGE = runpy.run_path(str(Path(__file__).resolve().parent.parent / "docs" / "members.py"))
+
+
+def test_the_page_is_not_stale():
+    assert PAGE["TARGET"].read_text(encoding="utf-8") == PAGE["text"](), "run `python docs/members.py`"
+
+
+@pytest.mark.parametrize("cls", [*barriers.MEMBERS.values(), *controllers.MEMBERS.values(), *observers.MEMBERS.values()])
+def test_every_member_says_what_it_is_and_where_it_comes_from(cls):
+    assert len(PAGE["first_line"](cls)) > 10
+    assert len(PAGE["source"](cls)) > 3
+
+
+def test_every_system_is_on_the_page():
+    assert all(f"`{name}`" in PAGE["text"]() for name in controllers.LAWS)
