@@ -13,6 +13,7 @@ from iblf_jax.controllers import LAWS as LAWS
 from iblf_jax.controllers import Saturated, law_by_name
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.observers import Momentum, Printed
+from iblf_jax.paths import with_parameters
 from iblf_jax.robots import TwoLink
 from iblf_jax.scenario import Initial, Scenario
 
@@ -74,7 +75,7 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
 
     The paper's arm, reference and bounds without disturbance, so that V2 should fall at once.  The gains are inside (3.17) and (3.25),
     near their lower limits; the joints move fast, 4 rad/s.  There the terms that the printed proof drops outweigh what it leaves, and
-    V2 grows.  Found by `certificates.falsify` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded.
+    V2 grows.  Found by `certificates.falsify` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded; f_hat(0) = (-0.5, 1.4) N m.
 
     Args:
       reading: "printed" or "corrected"; the same gains and the same start, f_hat(0) included.
@@ -85,14 +86,17 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
     Raises:
       ValueError: an unknown reading.
     """
-    paper = zhang_yan_2024(reading=reading)
-    observer = Printed if reading == "printed" else Momentum
-    return dataclasses.replace(
-        paper,
-        disturbance=disturbances.Nothing(),
-        controller=law_by_name("integral", k1=2.0, K2=0.6, o=0.1, reading=reading),
-        observer=observer(kf=[40.0, 1.1], eta0=[-0.5, 1.4], start="matched"),
-        initial=Initial(q=[0.68, 0.75], dq=[-4.0, -4.0]),
+    return with_parameters(
+        zhang_yan_2024(reading=reading),
+        {
+            "disturbance.acceleration_amplitude": 0.0,
+            "disturbance.velocity_amplitude": 0.0,
+            "controller.K2": 0.6,
+            "observer.kf": [40.0, 1.1],
+            "observer.eta0": [65.0, 1.9],
+            "initial.q": [0.68, 0.75],
+            "initial.dq": [-4.0, -4.0],
+        },
     )
 
 

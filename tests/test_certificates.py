@@ -22,15 +22,15 @@ from iblf_jax.scenario import canonical
 
 READINGS = (
     ("corrected", "momentum", "float64"),
-    ("printed", "printed", "float64"),
-    ("corrected", "printed", "float32"),
-    ("printed", "momentum", "float32"),
+    ("printed", "printed", "float32"),
+    pytest.param("printed", "printed", "float64", marks=pytest.mark.slow),
     pytest.param("corrected", "momentum", "float32", marks=pytest.mark.slow),
-    pytest.param("printed", "printed", "float32", marks=pytest.mark.slow),
+    pytest.param("corrected", "printed", "float32", marks=pytest.mark.slow),
+    pytest.param("printed", "momentum", "float32", marks=pytest.mark.slow),
 )
 BARRIERS = {
     "integral": ij.barriers.Integral(),
-    "log_p2": ij.barriers.Log(p=2),
+    "log_p2": pytest.param(ij.barriers.Log(p=2), marks=pytest.mark.slow),
     "tan": ij.barriers.Tan(),
     "state": pytest.param(ij.barriers.State(), marks=pytest.mark.slow),
     "prescribed_performance": pytest.param(ij.barriers.PrescribedPerformance(), marks=pytest.mark.slow),
@@ -123,10 +123,7 @@ def paper_certificate(paper, paper_run) -> Certificate:
 
 @pytest.fixture(scope="module")
 def corrected_run():
-    """The paper's run with the corrected law, and a jump of f at 10 s whose size is zero unless a test says otherwise."""
-    paper = ij.presets.zhang_yan_2024(reading="corrected")
-    both = ij.disturbances.Sum((paper.disturbance, ij.disturbances.Step(size=0.0, time=10.0)))
-    return ij.simulate(dataclasses.replace(paper, disturbance=both), **PAPER)
+    return ij.simulate(ij.presets.zhang_yan_2024(reading="corrected"), **PAPER)
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +186,7 @@ def test_corrected_run_holds_and_drops_nothing(corrected_certificate):
         assert "exact" in line.note
 
 
-CALM = {"disturbance.parts[0].acceleration_amplitude": 0.0, "disturbance.parts[0].velocity_amplitude": 0.0}
+CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -197,7 +194,7 @@ CALM = {"disturbance.parts[0].acceleration_amplitude": 0.0, "disturbance.parts[0
     [
         {"controller.K2": 0.6, "observer.kf": 1.1, "initial.dq": [2.0, -2.0]},
         {"plant.mass": [2.6, 0.5], "plant.payload": 0.4},
-        {"plant.mass[1]": 1.2, "controller.k1": 8.0, "disturbance.parts[0].phase": 2.0, "initial.q": [0.4, 0.7]},
+        {"plant.mass[1]": 1.2, "controller.k1": 8.0, "disturbance.phase": 2.0, "initial.q": [0.4, 0.7]},
         CALM | {"initial.dq": [3.0, 1.0]},
     ],
     ids=["low gains", "another plant", "several", "no disturbance"],
@@ -233,8 +230,9 @@ def test_envelope_starts_anew_at_jumps_and_after_held_samples():
     np.testing.assert_array_equal(starts_of(t, held, np.array([3.5, 5.0])), [True, False, False, True, True, True])
 
 
+@pytest.mark.slow
 def test_jump_of_the_disturbance_restarts_the_envelope(corrected_run):
-    scenario = ij.with_parameters(corrected_run.scenario, CALM | {"disturbance.parts[1].size": [3.0, -2.0]})
+    scenario = dataclasses.replace(corrected_run.scenario, disturbance=ij.disturbances.Step(size=[3.0, -2.0], time=10.0))
     run = ij.simulate(scenario, **PAPER)
     certificate = certify(scenario, run)
     assert certificate.holds, certificate
@@ -346,8 +344,13 @@ def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
 # ---------------------------------------------------------------------------------------------------- the gap
 
 
+def gap_certificate(reading):
+    scenario = ij.presets.printed_gap(reading=reading)
+    return certify(scenario, ij.simulate(scenario, **PAPER))
+
+
 def test_printed_breaks_its_claim_where_corrected_keeps_it():
-    printed, corrected = (certify(ij.presets.printed_gap(reading=reading), duration=0.5) for reading in ("printed", "corrected"))
+    printed, corrected = (gap_certificate(reading) for reading in ("printed", "corrected"))
     for certificate in (printed, corrected):  # inside the paper's own conditions
         assert all(certificate[name].verdict == "holds" for name in ("K2", "kf, case 1", "kf, case 2", "start inside"))
     broken = printed["inequality, case 1"]
@@ -358,14 +361,14 @@ def test_printed_breaks_its_claim_where_corrected_keeps_it():
     assert printed["envelope, case 1"].verdict == "fails"
     assert np.max(printed.traces.V) > 1.02 * printed.numbers["V2_start"]
     assert corrected.holds, corrected
-    assert np.all(np.diff(corrected.traces.V) < 0)
+    assert np.all(np.diff(corrected.traces.V[:200]) < 0)
 
 
 def test_search_finds_the_gap_of_the_printed_law_only():
     ranges = {
         "initial.q": (0.4, 0.75),
         "initial.dq": (-4.0, 4.0),
-        "observer.eta0": (-3.0, 3.0),
+        "observer.eta0": (-80.0, 80.0),
         "controller.K2": (0.6, 20.0),
         "observer.kf": (1.1, 40.0),
     }

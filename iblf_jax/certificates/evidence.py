@@ -175,18 +175,16 @@ def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, me
     """
     vector_field = partial(rate, scenario)
 
-    def two_steps(share: jax.Array) -> jax.Array:
-        """V2 after a step of share * dt and one of the rest."""
+    def advance(t, state, dt):
+        return step(method, vector_field, t, state, dt, vector_field(t, state))
 
-        def advance(place, part):
-            t, state = place
-            return (t + part * dt, step(method, vector_field, t, state, part * dt, vector_field(t, state))), None
-
-        (end, last), _ = jax.lax.scan(advance, (t, state), jnp.stack([share, 1.0 - share]))
-        return evaluate(scenario, end, last)[1].V
-
-    whole, halves = jax.vmap(two_steps)(jnp.asarray([1.0, 0.5], dt.dtype))
-    return 2.0 * jnp.abs(whole - halves)
+    middle, end = t + 0.5 * dt, t + dt
+    sizes = jnp.stack([dt, 0.5 * dt])
+    first = jax.vmap(lambda size: advance(t, state, size))(sizes)
+    whole, half = (jax.tree.map(lambda x, i=i: x[i], first) for i in (0, 1))
+    ends = jax.tree.map(lambda *x: jnp.stack(x), whole, advance(middle, half, 0.5 * dt))
+    V = jax.vmap(lambda state: evaluate(scenario, end, state)[1].V)(ends)
+    return 2.0 * jnp.abs(V[0] - V[1])
 
 
 @jax.jit

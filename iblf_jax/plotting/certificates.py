@@ -115,11 +115,11 @@ def _relative_error(axes: Axes, traces: Traces) -> None:
         for sign in (1, -1):
             text = "bound" if joint == 0 and sign == 1 else "_"
             axes.plot(*thinned(traces.t, sign * traces.xi_bound[:, joint]), label=text, **own)
-    axes.axhspan(1.0, 1.08, color=BROKEN, linewidth=0, zorder=0)
+    axes.axhspan(1.0, 1.6, color=BROKEN, linewidth=0, zorder=0)
     axes.axhspan(-1.08, -1.0, color=BROKEN, linewidth=0, zorder=0)
-    axes.set_ylim(-1.08, 1.08)
+    axes.set_ylim(-1.08, 1.6)
     _frame(axes, traces.t, r"relative error $\xi$", "1")
-    axes.legend(loc="best", ncols=2, **LEGEND)
+    axes.legend(loc="upper center", ncols=3, **LEGEND)
 
 
 def _mark_held(panels: Any, traces: Traces) -> None:
