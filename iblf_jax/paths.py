@@ -116,7 +116,7 @@ def get(scenario: Scenario, path: str) -> Any:
     full = expand(path)[0]
     for token in parse(full):
         try:
-            value = value[token] if isinstance(token, int) else _field(value, token)
+            value = _entry(value, token) if isinstance(token, int) else _field(value, token)
         except (AttributeError, IndexError, TypeError, KeyError):
             raise _unknown(scenario, path) from None
         if isinstance(token, int) and not isinstance(value, jax.Array | np.ndarray | float) and not dataclasses.is_dataclass(value):
@@ -124,6 +124,25 @@ def get(scenario: Scenario, path: str) -> Any:
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
         raise _unknown(scenario, path)
     return value
+
+
+def _entry(part: Any, index: int) -> Any:
+    """One entry of an array or of a tuple of components; JAX alone would clamp an index that is out of range."""
+    if not -len(part) <= index < len(part):
+        raise IndexError(index)
+    return part[index]
+
+
+def sign_at(scenario: Scenario, path: str) -> str | None:
+    """The sign that the leaf at a path must have: None, "positive" or "nonnegative"."""
+    part, sign = scenario, None
+    for token in parse(expand(path)[0]):
+        if isinstance(token, int):
+            part = _entry(part, token)
+        else:
+            sign = next(f.metadata.get("sign") for f in dataclasses.fields(part) if f.name == token)
+            part = getattr(part, token)
+    return sign
 
 
 def _field(part: Any, name: str) -> Any:
