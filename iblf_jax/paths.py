@@ -63,7 +63,13 @@ def parameters(scenario: Scenario) -> ParameterTable:
     Returns:
       A tuple of `Parameter`, which prints as a table.
     """
+    _need_component(scenario)
     return ParameterTable(_walk(scenario, ""))
+
+
+def _need_component(scenario: Any) -> None:
+    if not dataclasses.is_dataclass(scenario) or isinstance(scenario, type):
+        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
 
 
 def _walk(part: Any, path: str) -> Iterator[Parameter]:
@@ -97,7 +103,8 @@ def parse(path: str) -> list[str | int]:
 
 
 def expand(path: str) -> list[str]:
-    """The full paths that one path stands for: two for `robot.`, else itself."""
+    """The full paths that one path stands for: two for `robot.`, else itself.  ValueError if it is not a path."""
+    parse(path)
     if path == "robot" or path.startswith(("robot.", "robot[")):
         return ["plant" + path[5:], "model" + path[5:]]
     return [path]
@@ -127,8 +134,9 @@ def get(scenario: Scenario, path: str) -> Any:
 
 
 def _entry(part: Any, index: int) -> Any:
-    """One entry of an array or of a tuple of components; JAX alone would clamp an index that is out of range."""
-    if not -len(part) <= index < len(part):
+    """Part or entry `index`; unlike an array of JAX, which takes the nearest entry, it raises IndexError beyond the ends."""
+    size = len(part) if isinstance(part, tuple | list) else jnp.shape(part)[0]
+    if not -size <= index < size:
         raise IndexError(index)
     return part[index]
 
@@ -196,6 +204,7 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     Raises:
       ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the mend.
     """
+    _need_component(scenario)
     if not isinstance(values, Mapping):
         raise checks.fail("values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}')
     for path, value in values.items():

@@ -1,0 +1,64 @@
+"""How the benchmarks measure: compile and run apart, results blocked on, one table, one JSON file.
+
+Machines are shared and noisy, so rows are compared within one run of a benchmark: every timed thing is repeated in turn
+(`interleaved`) and the smallest time of each is kept.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+def once(call: Callable[[], Any]) -> float:
+    """Seconds of one call, its results blocked on."""
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - start
+
+
+def interleaved(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """The smallest seconds of each call, taken in turn so that a slow moment of the machine meets all of them."""
+    best = dict.fromkeys(calls, float("inf"))
+    for _ in range(repeats):
+        for name, call in calls.items():
+            best[name] = min(best[name], once(call))
+    return best
+
+
+def compile_seconds(function: Callable, *args: Any) -> tuple[float, Callable]:
+    """Seconds to trace and compile `jax.jit(function)` for these arguments, and the compiled function."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    return time.perf_counter() - start, compiled
+
+
+def machine() -> dict[str, str]:
+    """What the numbers were measured with (no host names)."""
+    import os
+
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": str(os.cpu_count()),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "backend": jax.default_backend(),
+    }
+
+
+def report(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], json_path: str | None) -> None:
+    """Prints one table and, if asked, writes it as JSON."""
+    shown = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row] for row in rows]
+    widths = [max(len(line[i]) for line in [list(columns), *shown]) for i in range(len(columns))]
+    print(title)
+    for line in [list(columns), *shown]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+    if json_path:
+        table = [dict(zip(columns, row, strict=True)) for row in rows]
+        Path(json_path).write_text(json.dumps({"title": title, "machine": machine(), "rows": table}, indent=1))

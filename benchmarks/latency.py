@@ -1,0 +1,103 @@
+"""Latency of one run: the paper's 20 s at 1 ms (20,000 RK4 steps, float64) against SciPy's LSODA on the same closed loop.
+
+    python benchmarks/latency.py [--quick] [--json FILE]
+
+Rows: LSODA at rtol 1e-6 on the loop in NumPy, LSODA on this package's own compiled vector field, and `simulate`.
+`import` is the time of `import iblf_jax` above `import jax`, each in a fresh process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from functools import partial
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+from _timing import interleaved, report
+from jax.flatten_util import ravel_pytree
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax.closed_loop import initial_state, rate
+from iblf_jax.metrics import STANDARD
+from iblf_jax.rollout import _run_compiled
+
+
+def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
+    """The paper's closed loop (integral barrier, printed reading) as one writes it in NumPy, its derivatives by hand."""
+    q, dq, eta = x[:2], x[2:4], x[4:]
+    p1, p2, p3, p4, p5, g = 0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175, 9.81
+    s2, c2 = p3 * np.sin(q[1]), p3 * np.cos(q[1])
+    M = np.array([[p1 + p2 + 2 * c2, p2 + c2], [p2 + c2, p2]])
+    C = np.array([[-s2 * dq[1], -s2 * (dq[0] + dq[1])], [s2 * dq[0], 0.0]])
+    outer = p5 * g * np.cos(q[0] + q[1])
+    G = np.array([p4 * g * np.cos(q[0]) + outer, outer])
+
+    wave = 0.14 * np.array([np.sin(t), np.cos(t)])
+    dwave = 0.14 * np.array([np.cos(t), -np.sin(t)])
+    swapped, dswapped = wave[::-1], np.array([-0.14 * np.sin(t), 0.14 * np.cos(t)])
+    e1 = q - wave - 0.5
+    k_l, dk_l, ddk_l = 0.3 + wave - swapped, dwave - dswapped, swapped - wave
+    k_u, dk_u, ddk_u = 0.4 - wave + swapped, dswapped - dwave, wave - swapped
+    a, b = dk_u / k_u, dk_l / k_l
+    kappa = np.sqrt(a**2 + b**2 + 0.1)
+    dkappa = (a * (ddk_u / k_u - a**2) + b * (ddk_l / k_l - b**2)) / kappa
+    alpha = dwave - (2.0 + kappa) * e1
+    dalpha = -wave - (2.0 + kappa) * (dq - dwave) - dkappa * e1
+
+    k = np.where(e1 > 0, k_u, k_l)
+    f_hat = eta + 20.0 * M @ dq
+    tau = C @ dq + G + M @ dalpha - f_hat - 20.0 * (dq - alpha) - 2.0 * e1 / (k**2 - e1**2)
+    f = M @ np.array([0.3 * np.sin(t), 0.3 * np.cos(t)]) + C @ np.array([0.3 * np.cos(0.5 * t), 0.3 * np.sin(0.5 * t)])
+    ddq = np.linalg.solve(M, tau + f - C @ dq - G)
+    return np.concatenate([dq, ddq, -20.0 * (f_hat + tau - C @ dq - G)])
+
+
+def import_seconds() -> float:
+    """Seconds of `import iblf_jax` after `import jax`, in a fresh process; the smallest of three."""
+    code = "import jax, time; t = time.perf_counter(); import iblf_jax; print(time.perf_counter() - t)"
+    return min(float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout) for _ in range(3))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="2 s of motion, one repeat")
+    parser.add_argument("--json", help="also write the table to this file")
+    args = parser.parse_args()
+    duration, repeats = (2.0, 1) if args.quick else (20.0, 5)
+    steps = round(duration / 1e-3)
+
+    scenario = ij.presets.zhang_yan_2024()
+    dt = jnp.asarray(1e-3)
+    run = partial(_run_compiled, steps=steps, record_every=1, method="rk4")
+    start = time.perf_counter()
+    compiled = jax.jit(run).lower(scenario, STANDARD, dt).compile()
+    compile_time = time.perf_counter() - start
+
+    x0, unravel = ravel_pytree(initial_state(scenario))
+    field = jax.jit(lambda t, x: ravel_pytree(rate(scenario, t, unravel(x)))[0])
+    assert np.allclose(numpy_loop(0.3, np.asarray(x0) + 0.01), field(0.3, x0 + 0.01), rtol=1e-9, atol=1e-9)
+    lsoda = partial(solve_ivp, t_span=(0.0, duration), y0=np.asarray(x0), method="LSODA", rtol=1e-6, atol=1e-9)
+    calls = {
+        "LSODA, NumPy loop": lambda: lsoda(numpy_loop).y,
+        "LSODA, compiled field": lambda: lsoda(lambda t, x: np.asarray(field(t, x))).y,
+        "simulate, user's call": lambda: ij.simulate(scenario, duration=duration, dt=1e-3).q,
+        "simulate, compiled": lambda: compiled(scenario, STANDARD, dt),
+    }
+    ij.simulate(scenario, duration=duration, dt=1e-3)
+    best = interleaved(calls, repeats)
+    reference = best["LSODA, NumPy loop"]
+    rows = [[name, 1e3 * seconds, reference / seconds] for name, seconds in best.items()]
+    report(f"One run of {duration:g} s at 1 ms, float64", ["row", "ms", "times faster"], rows, args.json)
+    print(f"compile {compile_time:.2f} s; import iblf_jax above import jax {import_seconds():.2f} s")
+
+
+if __name__ == "__main__":
+    main()
