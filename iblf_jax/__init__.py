@@ -13,7 +13,6 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
-from iblf_jax._monte_carlo import monte_carlo as monte_carlo
 from iblf_jax.distributions import choice as choice
 from iblf_jax.distributions import factor as factor
 from iblf_jax.distributions import log_uniform as log_uniform
@@ -40,15 +39,28 @@ from iblf_jax.scenario_file import load_scenario as load_scenario
 from iblf_jax.scenario_file import save_scenario as save_scenario
 from iblf_jax.stability import recommended_dt as recommended_dt
 from iblf_jax.status import Status as Status
-from iblf_jax.study import Study as Study
 
 __version__ = _version("iblf_jax")
 
 if TYPE_CHECKING:
+    from iblf_jax import distributed as distributed
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
+    from iblf_jax._monte_carlo import monte_carlo as monte_carlo
+    from iblf_jax._sensitivity import sensitivity as sensitivity
+    from iblf_jax._sweep import load_sweep as load_sweep
+    from iblf_jax._sweep import sweep as sweep
+    from iblf_jax.store import StoreError as StoreError
+    from iblf_jax.study import Study as Study
 
 _ON_FIRST_USE = {
+    "Study": ("iblf_jax.study", "Study"),
+    "StoreError": ("iblf_jax.store", "StoreError"),
+    "distributed": ("iblf_jax.distributed", None),
+    "load_sweep": ("iblf_jax._sweep", "load_sweep"),
+    "monte_carlo": ("iblf_jax._monte_carlo", "monte_carlo"),
+    "sensitivity": ("iblf_jax._sensitivity", "sensitivity"),
+    "sweep": ("iblf_jax._sweep", "sweep"),
     "plotting": ("iblf_jax.plotting", None),
     "testing": ("iblf_jax.testing", None),
 }

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -33,7 +33,8 @@ VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE
 """What `violation_probability` counts: a run that left its bounds, or that ran away, after which it has no say."""
 
 
-class Run(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Run:
     """One run of a study."""
 
     index: int

@@ -14,7 +14,6 @@ from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, as_one_function, run
 from iblf_jax.scenario import Scenario
 
-
 BACKENDS = ("auto", "vmap")
 """How a batch can be executed."""
 
