@@ -13,6 +13,7 @@ Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -142,7 +143,9 @@ def sensitivity(
 
         rng = np.random.default_rng(setup.seed)
         found = stats.sobol_indices(func=evaluate, n=points, dists=[stats.uniform()] * len(names), rng=rng)
-        ends = found.bootstrap(confidence_level=0.95)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # where an index is 0 in every resample SciPy warns and gives NaN for its interval
+            ends = found.bootstrap(confidence_level=0.95)
     label = output if isinstance(output, str) else getattr(output, "__name__", "output")
     counts = (points * (len(names) + 2), failed)
     orders = (np.ravel(found.first_order), np.ravel(found.total_order), _ends(ends.first_order), _ends(ends.total_order))

@@ -206,8 +206,8 @@ def _chosen_unit(setup: Setup, unit: int | None) -> int:
 
 
 def _into_store(setup: Setup, config: dict[str, Any], how: _How, path: str | os.PathLike, unit: int | None) -> xarray.Dataset:
-    size = _chosen_unit(setup, unit)
-    store = open_store(path, config, _variables(setup, config), setup.cases, size)
+    store = open_store(path, config, _variables(setup, config), setup.cases, _chosen_unit(setup, unit), any_unit=unit is None)
+    size = store.unit
     pending, damaged = store.pending()
     if damaged:
         warnings.warn(

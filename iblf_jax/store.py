@@ -19,6 +19,7 @@ import os
 import shutil
 import time
 import uuid
+import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -208,7 +209,9 @@ def load_store(path: str | os.PathLike) -> Store:
         raise StoreError(f"{place}: is damaged: its description is incomplete ({type(error).__name__}: {error}).") from error
 
 
-def open_store(path: str | os.PathLike, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int) -> Store:
+def open_store(
+    path: str | os.PathLike, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int, *, any_unit: bool = False
+) -> Store:
     """Opens a store to go on with it, or makes it.
 
     Args:
@@ -217,6 +220,7 @@ def open_store(path: str | os.PathLike, config: dict[str, Any], variables: Mappi
       variables: name -> array.
       cases: number of cases.
       unit: cases in a unit.
+      any_unit: take the unit of a store that exists, whatever it is.
 
     Raises:
       StoreError: it was made with another configuration, is foreign or damaged, or cannot be written.
@@ -225,7 +229,11 @@ def open_store(path: str | os.PathLike, config: dict[str, Any], variables: Mappi
     if not _exists(place):
         _make(place, config, variables, cases, unit)
     store = load_store(place)
-    found = differences(store.config, config) or differences({"unit": store.unit, "cases": store.cases}, {"unit": unit, "cases": cases})
+    found = differences(store.config, config)
+    named = [text for text in found if not text.startswith("program:")]
+    found = named or [text + " (the code of a law, a robot or a metric has changed)" for text in found]
+    if not any_unit:
+        found += differences({"unit": store.unit}, {"unit": unit})
     if found:
         more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
         raise StoreError(
@@ -266,6 +274,9 @@ def _make(place: Path, config: dict[str, Any], variables: Mapping[str, Variable]
             array.attrs["units"] = v.unit
         group.create_array(DONE, shape=(-(-cases // unit),), chunks=(1,), dtype="uint64", fill_value=0, dimension_names=("unit",))
         group.attrs.update({_MARK: FORMAT, "config": config, "cases": cases, "unit": unit, "variables": list(variables)})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # zarr says that consolidated metadata are not in its specification yet
+            zarr.consolidate_metadata(group.store)
         os.rename(draft, place)
     except OSError as error:
         shutil.rmtree(draft, ignore_errors=True)
