@@ -280,7 +280,7 @@ def _make(place: Path, config: dict[str, Any], variables: Mapping[str, Variable]
         os.rename(draft, place)
     except OSError as error:
         shutil.rmtree(draft, ignore_errors=True)
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not place.is_dir():
             raise _why(place, error) from error
 
 
