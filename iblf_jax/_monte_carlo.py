@@ -19,7 +19,7 @@ from iblf_jax._designs import check_sampler
 from iblf_jax._progress import bar
 from iblf_jax._setup import prepare
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario
 from iblf_jax.study import Study
 
@@ -33,7 +33,7 @@ def monte_carlo(
     dt: float = 1e-3,
     seed: int = 0,
     method: str = "rk4",
-    metrics: Sequence[Fold] = STANDARD,
+    metrics: Sequence[Fold] | None = None,
     sampler: str = "independent",
     replicates: int = 1,
     backend: str = "auto",
@@ -59,7 +59,7 @@ def monte_carlo(
       dt: time step [s].
       seed: whole number that fixes all draws.
       method: "rk4", "heun" or "euler".
-      metrics: the folds to run (`iblf_jax.metrics`).
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       sampler: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
       backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.

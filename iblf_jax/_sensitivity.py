@@ -28,7 +28,7 @@ from iblf_jax._draws import sample_size
 from iblf_jax._progress import bar
 from iblf_jax._setup import Setup, prepare
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.metrics import Fold
 from iblf_jax.results import Metrics
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED
@@ -89,7 +89,7 @@ def sensitivity(
     points: int = 256,
     seed: int = 0,
     method: str = "rk4",
-    metrics: Sequence[Fold] = STANDARD,
+    metrics: Sequence[Fold] | None = None,
     backend: str = "auto",
     memory: float = MEMORY,
     devices: Sequence[jax.Device] | None = None,
@@ -108,7 +108,7 @@ def sensitivity(
       points: n, a power of two; n (d + 2) runs are made for d perturbed numbers.
       seed: whole number that fixes the design.
       method: "rk4", "heun" or "euler".
-      metrics: the folds to run.
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
       memory: bytes that runs in flight may take.
       devices: devices to use; all of this process if not given.

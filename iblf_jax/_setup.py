@@ -59,7 +59,7 @@ def prepare(
     duration: float,
     dt: float,
     method: str,
-    metrics: Sequence[Fold],
+    metrics: Sequence[Fold] | None,
     backend: str,
     sampler: str = "independent",
     replicates: int = 1,

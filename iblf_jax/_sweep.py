@@ -25,7 +25,7 @@ from iblf_jax._points import make_points
 from iblf_jax._progress import bar
 from iblf_jax._setup import Setup, prepare
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.store import Store, StoreError, Variable, load_store, open_store
 
@@ -64,7 +64,7 @@ def sweep(
     design: str = "grid",
     points: int | None = None,
     method: str = "rk4",
-    metrics: Sequence[Fold] = STANDARD,
+    metrics: Sequence[Fold] | None = None,
     sampler: str = "independent",
     replicates: int = 1,
     store: str | os.PathLike | None = None,
@@ -93,7 +93,7 @@ def sweep(
       design: "grid", "random" or "latin_hypercube".
       points: number of points of a random or Latin-hypercube design.
       method: "rk4", "heun" or "euler".
-      metrics: the folds to run.
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       sampler: of the runs: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a designed sampler is made of.
       store: folder to write to, unit by unit, and to go on from; needs the extra `sweep`.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import socket
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -93,3 +95,10 @@ def test_progress_of_others_keeps_the_patience(monkeypatch):
 def test_bad_jobs_are_refused(words, message):
     with pytest.raises(ValueError, match=message):
         distributed.initialize(*words)
+
+
+def test_importing_the_package_starts_no_device(compiled):
+    """Else neither `jax.distributed.initialize` nor the number of CPU devices could come after the import."""
+    code = "import jax, iblf_jax as ij; ij.monte_carlo, ij.sweep; jax.config.update('jax_num_cpu_devices', 3); print(len(jax.devices()))"
+    done = subprocess.run([sys.executable, "-c", code], env=cases.environment(compiled), capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "3", done.stderr

@@ -318,7 +318,7 @@ def test_ctrl_c_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monk
         plain(self, unit, data)
 
     monkeypatch.setattr(store.Store, "write", write)
-    with pytest.raises(_interrupt.Interrupted, match="after 3 of 12 units.*Start the same call"):
+    with pytest.raises(_interrupt.Interrupted, match=r"after 3 of 12 units.*Start the same call"):
         cases.table(store=path)
     assert "Ctrl-C" in capsys.readouterr().err
     monkeypatch.undo()
