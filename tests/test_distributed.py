@@ -28,18 +28,18 @@ def free_address():
         return f"127.0.0.1:{probe.getsockname()[1]}"
 
 
-def job(compiled, tmp_path, words, more=((), ())):
+def job(compiled, tmp_path, words, more=((), ()), devices="2"):
     """Starts two processes."""
     address = free_address()
     return [
-        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", "2", "--job", address, "2", str(i), *more[i]) for i in (0, 1)
+        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i]) for i in (0, 1)
     ]
 
 
 def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path):
     path = tmp_path / "sweep.zarr"
     words = ("--store", str(path))
-    survivor, victim = job(compiled, tmp_path, words, (("--slow", "1.0"), ("--die-after", "2")))
+    survivor, victim = job(compiled, tmp_path, words, (("--slow", "1.0"), ("--die-after", "2")), devices="1")
     victim.communicate(timeout=300)
     assert victim.returncode == -signal.SIGKILL
     begin = time.monotonic()
@@ -58,6 +58,7 @@ def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, 
         assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), one)
 
 
+@pytest.mark.slow
 def test_a_study_over_two_processes(compiled, tmp_path):
     for process in job(compiled, tmp_path, ("--study",)):
         _, errors = process.communicate(timeout=300)

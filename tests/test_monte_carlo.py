@@ -57,6 +57,7 @@ def test_other_perturbations_change_no_draw(study):
     assert cases.same({"m": alone.samples["plant.mass[1]"]}, {"m": study.samples["plant.mass[1]"][:3]})
 
 
+@pytest.mark.slow
 def test_two_devices_and_one_agree_bit_for_bit(study, tmp_path, compiled):
     process = cases.start(compiled, str(tmp_path / "two.npz"), "--study", "--devices", "2")
     _, errors = process.communicate(timeout=300)

@@ -18,6 +18,9 @@ from iblf_jax.scenario import Scenario
 BACKENDS = ("auto", "vmap")
 """How a batch can be executed."""
 
+_SMALL = 64
+"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
+
 
 def run_batch(
     scenario: Scenario,
@@ -50,4 +53,7 @@ def run_batch(
         return run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
 
     checks.one_of("backend", backend, BACKENDS)
-    return as_one_function(jax.vmap(one))(dict(varied))
+    batched = jax.vmap(one)
+    if min(len(values) for values in varied.values()) <= _SMALL:
+        batched = as_one_function(batched)
+    return batched(dict(varied))
