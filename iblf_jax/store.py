@@ -40,6 +40,10 @@ class StoreError(RuntimeError):
     """A store that cannot be written, read or continued; the message says why, and what to do."""
 
 
+class StoreWriteError(StoreError):
+    """A write that failed: a full disk, a path that may not be written to.  What was written before stays valid."""
+
+
 class Variable(NamedTuple):
     """One array of a store, by its rows: one row a case."""
 
@@ -173,7 +177,7 @@ class Store:
             raise _why(self.path, error, kept) from error
 
 
-def _why(path: Path, error: OSError, kept: str = "") -> StoreError:
+def _why(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
     """The error for a failed write, in words."""
     if error.errno in _FULL:
         text = f"{path}: no space left to write to ({error.strerror}). Make room, or take another disk."
@@ -181,7 +185,7 @@ def _why(path: Path, error: OSError, kept: str = "") -> StoreError:
         text = f"{path}: cannot be written ({error.strerror}). Choose a path that you may write to."
     else:
         text = f"{path}: cannot be written ({error.strerror or error})."
-    return StoreError(text + (f" {kept[0].upper()}{kept[1:]}." if kept else ""))
+    return StoreWriteError(text + (f" {kept[0].upper()}{kept[1:]}." if kept else ""))
 
 
 def load_store(path: str | os.PathLike) -> Store:

@@ -18,7 +18,7 @@ from typing import NoReturn
 
 import jax
 
-COMMANDS = ("reproduce", "simulate", "presets", "parameters")
+COMMANDS = ("reproduce", "simulate", "montecarlo", "sweep", "presets", "parameters")
 
 
 class Parser(argparse.ArgumentParser):
