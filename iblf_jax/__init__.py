@@ -13,6 +13,13 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
+from iblf_jax.distributions import choice as choice
+from iblf_jax.distributions import factor as factor
+from iblf_jax.distributions import log_uniform as log_uniform
+from iblf_jax.distributions import normal as normal
+from iblf_jax.distributions import offset as offset
+from iblf_jax.distributions import uniform as uniform
+from iblf_jax.distributions import value as value
 from iblf_jax.io import load_rollouts as load_rollouts
 from iblf_jax.io import save_rollouts as save_rollouts
 from iblf_jax.paths import parameters as parameters
@@ -37,18 +44,32 @@ __version__ = _version("iblf_jax")
 
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates
+    from iblf_jax import distributed as distributed
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
     from iblf_jax._compare import compare as compare
     from iblf_jax._comparison import Comparison as Comparison
+    from iblf_jax._monte_carlo import monte_carlo as monte_carlo
+    from iblf_jax._sensitivity import sensitivity as sensitivity
+    from iblf_jax._sweep import load_sweep as load_sweep
+    from iblf_jax._sweep import sweep as sweep
     from iblf_jax.certificates import certify as certify
+    from iblf_jax.store import StoreError as StoreError
+    from iblf_jax.study import Study as Study
 
 _ON_FIRST_USE = {
     "certificates": ("iblf_jax.certificates", None),
     "certify": ("iblf_jax.certificates", "certify"),
     "compare": ("iblf_jax._compare", "compare"),
     "Comparison": ("iblf_jax._comparison", "Comparison"),
+    "distributed": ("iblf_jax.distributed", None),
+    "load_sweep": ("iblf_jax._sweep", "load_sweep"),
+    "monte_carlo": ("iblf_jax._monte_carlo", "monte_carlo"),
     "plotting": ("iblf_jax.plotting", None),
+    "sensitivity": ("iblf_jax._sensitivity", "sensitivity"),
+    "StoreError": ("iblf_jax.store", "StoreError"),
+    "Study": ("iblf_jax.study", "Study"),
+    "sweep": ("iblf_jax._sweep", "sweep"),
     "testing": ("iblf_jax.testing", None),
 }
 """Public name -> (module, attribute or None for the module itself): imported when first used, so that `import iblf_jax` stays

@@ -18,7 +18,7 @@ from typing import NoReturn
 
 import jax
 
-COMMANDS = ("reproduce", "simulate", "compare", "presets", "parameters")
+COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "presets", "parameters")
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,63 @@
+"""`montecarlo`: many runs of one scenario with parameters drawn at random."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, table, write_netcdf
+
+if TYPE_CHECKING:
+    from iblf_jax.study import Study
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = subparsers.add_parser(
+        "montecarlo",
+        help="run a scenario many times with parameters drawn at random",
+        description="Run the study that a file describes (a scenario file with [run], [perturbations] and [study]); print how often the "
+        "bounds were violated, quantiles of the metrics, the worst runs, and which parameters go with the margin.",
+        epilog=EPILOG,
+    )
+    parser.add_argument("file", metavar="STUDY.toml", help="the study file")
+    parser.add_argument("--runs", type=int, metavar="N", help="number of runs (default: the file's)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed (default: the file's, else 0)")
+    add_study_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command."""
+
+    def work(how: dict[str, Any]) -> int:
+        from iblf_jax import distributed
+        from iblf_jax._monte_carlo import monte_carlo
+        from iblf_jax.study_file import load_study_file
+
+        file = load_study_file(args.file, "study")
+        given = {key: getattr(args, key) for key in ("runs", "seed") if getattr(args, key) is not None}
+        study = monte_carlo(file.scenario, file.perturbations, **file.options | given | how)
+        if distributed.rank() == 0:
+            print(report(study))
+        write_netcdf(study.to_xarray(), args.out)
+        return 1 if len(study.failed) else 0
+
+    return carried_out(args, work)
+
+
+def report(study: Study) -> str:
+    """What a study found, as text."""
+    from iblf_jax.cli._common import number
+
+    quantiles = study.quantiles()
+    rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
+    for name, values in quantiles.items():
+        if "joint" in values.dims:
+            values = values.min("joint") if name in ("margin", "xi_margin") else values.max("joint")
+        rows.append([str(name), values.attrs.get("units", quantiles[name].attrs["units"]), *(number(x) for x in values.values)])
+    worst = study.worst(5)
+    lines = [repr(study), "", table(rows), "", f"worst runs (smallest margin first): {', '.join(map(str, worst))}"]
+    found = study.correlations(["margin"]).correlation.sel(metric="margin")
+    rows = [["parameter", "rank correlation with the margin"], *([str(p), number(found.sel(parameter=p))] for p in found.parameter.values)]
+    return "\n".join([*lines, "", table(rows)])

@@ -1,0 +1,80 @@
+"""`sweep`: a scenario over many values of its parameters, into a store that survives a kill."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, table, write_netcdf
+
+if TYPE_CHECKING:
+    import xarray
+
+MOST_ROWS = 40
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = subparsers.add_parser(
+        "sweep",
+        help="run a scenario over many values of its parameters",
+        description="Run the sweep that a file describes (a scenario file with [run], [grid], [sweep] and, if runs are perturbed, "
+        "[perturbations]).  With --store it is written unit by unit; killed or interrupted, the same command goes on from there.",
+        epilog=EPILOG,
+    )
+    parser.add_argument("file", metavar="SWEEP.toml", help="the sweep file")
+    parser.add_argument("--store", metavar="FOLDER.zarr", help="write to this store, and go on from what it holds")
+    add_study_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command."""
+
+    def work(how: dict[str, Any]) -> int:
+        from iblf_jax import distributed
+        from iblf_jax._sweep import sweep
+        from iblf_jax.status import FAILED
+        from iblf_jax.study_file import load_study_file
+
+        file = load_study_file(args.file, "sweep")
+        data = sweep(file.scenario, file.grid, perturbations=file.perturbations, store=args.store, **file.options | how)
+        if distributed.rank() == 0:
+            print(report(data))
+        write_netcdf(data, args.out)
+        return 1 if bool((data.status & int(FAILED)).any()) else 0
+
+    return carried_out(args, work)
+
+
+def report(data: xarray.Dataset) -> str:
+    """One line a point: how many runs failed, and the worst and the median of the smallest margin."""
+    import json
+
+    import numpy as np
+
+    from iblf_jax.cli._common import number
+    from iblf_jax.status import FAILED
+
+    config = json.loads(data.attrs["config"])
+    dims, runs = list(config["dims"]), config["runs"]
+    failed = ((data.status & int(FAILED)) != 0).values.reshape(-1, runs).sum(1)
+    rows = [[*(config["points"] if dims else ["point"]), "failed"]]
+    margin = data["margin"].min("joint").values.reshape(-1, runs) if "margin" in data else None
+    if margin is not None:
+        rows[0] += ["worst margin [rad]", "median margin [rad]"]
+    shape = tuple(config["dims"].values())
+    for point, place in enumerate(np.ndindex(shape) if shape else [()]):
+        at = dict(zip(dims, place, strict=True))
+        cells = [_tick(p["values"][at[p["along"]]]) for p in config["points"].values()] if dims else ["nominal"]
+        cells.append(f"{failed[point]} of {runs}")
+        if margin is not None:
+            cells += [number(np.nanmin(margin[point])), number(np.nanmedian(margin[point]))]
+        rows.append(cells)
+    more = [f"... and {len(rows) - 1 - MOST_ROWS} more points"] if len(rows) > MOST_ROWS + 1 else []
+    head = f"{data.attrs['cases']} runs of {data.attrs['duration']:g} s, dt = {data.attrs['dt']:g} s, seed {data.attrs['seed']}"
+    return "\n".join([head, "", table(rows[: MOST_ROWS + 1]), *more])
+
+
+def _tick(value: Any) -> str:
+    return " ".join(f"{x:.4g}" for x in value) if isinstance(value, list) else f"{value:.4g}"
