@@ -35,4 +35,4 @@ def run_batch(
     def one(varied):
         return run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
 
-    return as_one_function(jax.vmap(one))(dict(varied))
+    return jax.vmap(one)(dict(varied))
