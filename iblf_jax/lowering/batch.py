@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import rollout
+from iblf_jax.closed_loop import LoopState
 from iblf_jax.lowering.program import Program
 from iblf_jax.lowering.step import Leaves, Packed, Shapes, lowered, pack, split, unpack
+from iblf_jax.stability import POWER_ITERATIONS, Growth, growth_rate, growth_start, growth_step
 
 Executor = Callable[[Program, jax.Array, jax.Array, Packed, int, int | None], tuple[Packed, jax.Array]]
 """Runs a program: `native.run` or `xla.run`."""
@@ -20,25 +22,77 @@ Executor = Callable[[Program, jax.Array, jax.Array, Packed, int, int | None], tu
 
 @lru_cache(maxsize=64)
 def step_function(treedef, is_lane: tuple[bool, ...], carry_treedef, method: str, recorded: bool) -> Callable:
-    """One step as a function of lists of leaves, for `lowered`; the same object for the same structure."""
+    """One step of the time loop as a function of lists of leaves, for `lowered`; the same object for the same structure."""
 
     def step(shared, lane, carry, index):
         scenario, folds, dt = Leaves(treedef, is_lane, [], []).together(shared, lane)
         carry = jax.tree.unflatten(carry_treedef, carry)
         state = carry.state
         carry, sample = rollout.advance(scenario, folds, method, dt, carry, index)
-        samples = jax.tree.leaves(rollout._recorded(sample, state)) if recorded else []
-        return jax.tree.leaves(carry), samples
+        return jax.tree.leaves(carry), jax.tree.leaves(rollout.recorded(sample, state)) if recorded else []
 
     return step
 
 
-def program_of(leaves: Leaves, dtype, carry: Any, method: str, recorded: bool) -> tuple[Program, Shapes]:
-    """The lowered step and the shapes of its carry; `carry` has a leading batch axis."""
-    flat, treedef = jax.tree.flatten(carry)
-    step = step_function(leaves.treedef, leaves.is_lane, treedef, method, recorded)
-    shapes = Shapes.of(flat, 1)
-    return lowered(step, np.dtype(dtype), Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), shapes), shapes
+class Instants(NamedTuple):
+    """Carry of the power iteration of some instants at once; times and states stay as they are, so what they decide is done once."""
+
+    growth: Growth
+    times: jax.Array
+    states: LoopState
+
+
+@lru_cache(maxsize=64)
+def mode_function(treedef, is_lane: tuple[bool, ...], carry_treedef) -> Callable:
+    """One step of the power iteration, at all critical instants of a run, as a function of lists of leaves."""
+
+    def step(shared, lane, carry, index):
+        scenario, _, _ = Leaves(treedef, is_lane, [], []).together(shared, lane)
+        growth, times, states = jax.tree.unflatten(carry_treedef, carry)
+        growth = jax.vmap(lambda t, state, growth: growth_step(scenario, t, state, growth, index))(times, states, growth)
+        return jax.tree.leaves(Instants(growth, times, states)), []
+
+    return step
+
+
+class Batch(NamedTuple):
+    """The leaves of a batch of runs, and what runs a program."""
+
+    executor: Executor
+    leaves: Leaves
+    dtype: Any
+    runs: int
+
+    def whole(self, lane):
+        """(scenario, folds, dt) of one run, from its leaves."""
+        return self.leaves.together(self.leaves.shared, lane)
+
+    def program(self, make: Callable, carry: Any, *options) -> tuple[Program, Shapes, Any]:
+        """The lowered step that `make` gives, for a carry with a leading batch axis."""
+        flat, treedef = jax.tree.flatten(carry)
+        shapes = Shapes.of(flat, 1)
+        step = make(self.leaves.treedef, self.leaves.is_lane, treedef, *options)
+        program = lowered(step, np.dtype(self.dtype), Shapes.of(self.leaves.shared), Shapes.of(self.leaves.lane, 1), shapes)
+        return program, shapes, treedef
+
+    def advance(self, make: Callable, carry: Any, steps: int, every: int | None, *options) -> tuple[Any, jax.Array]:
+        """The carry after `steps` steps, and samples."""
+        program, shapes, treedef = self.program(make, carry, *options)
+        shared = [jnp.ravel(x).astype(self.dtype) for x in self.leaves.shared]
+        lane = pack(self.leaves.lane, Shapes.of(self.leaves.lane, 1), self.dtype, self.runs).floats
+        packed = pack(jax.tree.leaves(carry), shapes, self.dtype, self.runs)
+        packed, samples = self.executor(program, jnp.concatenate([*shared, jnp.zeros((0,), self.dtype)]), lane, packed, steps, every)
+        return jax.tree.unflatten(treedef, unpack(packed, shapes, self.runs)), samples
+
+    def start(self):
+        """The carry before the first step."""
+        return jax.vmap(lambda lane: rollout.start(*self.whole(lane)), axis_size=self.runs)(self.leaves.lane)
+
+
+def batch_of(executor: Executor, scenario, varied, folds, dt) -> Batch:
+    """The batch of `varied`."""
+    runs = jax.tree.leaves(dict(varied))[0].shape[0]
+    return Batch(executor, split(scenario, varied, folds, dt), dt.dtype, runs)
 
 
 def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: str, record_every: int | None):
@@ -48,33 +102,29 @@ def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: 
       Unsupported: the step does not lower.
       ToolchainError: the native backend has no compiler.
     """
-    runs = jax.tree.leaves(dict(varied))[0].shape[0]
-    leaves = split(scenario, varied, folds, dt)
+    batch = batch_of(executor, scenario, varied, folds, dt)
+    carry, samples = batch.advance(step_function, batch.start(), steps, record_every, method, record_every is not None)
+    outcome, last = finish(batch, method, steps, carry)
+    return outcome if record_every is None else outcome._replace(records=_records(samples, last, steps % record_every == 0))
 
-    def whole(lane):
-        return leaves.together(leaves.shared, lane)
 
-    def begin(lane):
-        scenario, folds, dt = whole(lane)
-        return rollout.start(scenario, folds, dt)
+def finish(batch: Batch, method: str, steps: int, carry: Any):
+    """`rollout.finish` for a batch: the outcome, and what would be recorded of the last sample."""
 
-    carry = jax.vmap(begin, axis_size=runs)(leaves.lane)
-    program, shapes = program_of(leaves, dt.dtype, carry, method, record_every is not None)
-    flat, treedef = jax.tree.flatten(carry)
-    shared = jnp.concatenate([jnp.ravel(x) for x in leaves.shared]) if leaves.shared else jnp.zeros((0,), dt.dtype)
-    lane = pack(leaves.lane, Shapes.of(leaves.lane, 1), dt.dtype, runs).floats
-    packed, samples = executor(program, shared, lane, pack(flat, shapes, dt.dtype, runs), steps, record_every)
-    carry = jax.tree.unflatten(treedef, unpack(packed, shapes, runs))
+    def observe(lane, carry):
+        scenario, folds, dt = batch.whole(lane)
+        carry, sample = rollout.observe_end(scenario, folds, dt, steps, carry)
+        times, states = rollout.critical_instants(scenario, dt, steps, carry)
+        return carry, rollout.recorded(sample, carry.state), Instants(jax.vmap(growth_start)(states), times, states)
 
-    def end(lane, carry):
-        scenario, folds, dt = whole(lane)
-        carry, sample, outcome = rollout.finish(scenario, folds, method, dt, steps, carry)
-        return outcome, rollout._recorded(sample, carry.state)
+    carry, last, instants = jax.vmap(observe)(batch.leaves.lane, carry)
+    instants, _ = batch.advance(mode_function, instants, POWER_ITERATIONS, None)
 
-    outcome, last = jax.vmap(end)(leaves.lane, carry)
-    if record_every is None:
-        return outcome
-    return outcome._replace(records=_records(samples, last, steps % record_every == 0))
+    def judge(lane, carry, growth):
+        _, folds, dt = batch.whole(lane)
+        return rollout.verdict(folds, method, dt, carry, jax.vmap(growth_rate)(growth))
+
+    return jax.vmap(judge)(batch.leaves.lane, carry, instants.growth), last
 
 
 def _records(samples: jax.Array, last: Any, with_last: bool) -> Any:
