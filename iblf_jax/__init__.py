@@ -1,6 +1,8 @@
 """iblf_jax: simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots, in JAX."""
 
+import importlib as _importlib
 from importlib.metadata import version as _version
+from typing import TYPE_CHECKING
 
 from iblf_jax import barriers as barriers
 from iblf_jax import bounds as bounds
@@ -11,6 +13,8 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
+from iblf_jax.io import load_rollouts as load_rollouts
+from iblf_jax.io import save_rollouts as save_rollouts
 from iblf_jax.paths import parameters as parameters
 from iblf_jax.paths import with_parameters as with_parameters
 from iblf_jax.pytree import astype as astype
@@ -24,7 +28,34 @@ from iblf_jax.rollout import SimulationWarning as SimulationWarning
 from iblf_jax.rollout import simulate as simulate
 from iblf_jax.scenario import Initial as Initial
 from iblf_jax.scenario import Scenario as Scenario
+from iblf_jax.scenario_file import load_scenario as load_scenario
+from iblf_jax.scenario_file import save_scenario as save_scenario
 from iblf_jax.stability import recommended_dt as recommended_dt
 from iblf_jax.status import Status as Status
 
 __version__ = _version("iblf_jax")
+
+if TYPE_CHECKING:
+    from iblf_jax import plotting as plotting
+    from iblf_jax import testing as testing
+
+_ON_FIRST_USE = {
+    "plotting": ("iblf_jax.plotting", None),
+    "testing": ("iblf_jax.testing", None),
+}
+"""Public name -> (module, attribute or None for the module itself): imported when first used, so that `import iblf_jax` stays
+quick and brings neither matplotlib nor optax nor xarray."""
+
+
+def __getattr__(name: str):
+    if name not in _ON_FIRST_USE:
+        raise AttributeError(f"module 'iblf_jax' has no attribute {name!r}")
+    module, attribute = _ON_FIRST_USE[name]
+    imported = _importlib.import_module(module)
+    value = imported if attribute is None else getattr(imported, attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(name for name in {*globals(), *_ON_FIRST_USE} if not name.startswith("_") or name == "__version__")

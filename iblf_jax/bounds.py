@@ -15,7 +15,8 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.pytree import component, leaf
+from iblf_jax import checks
+from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.references import Reference
 
 
@@ -31,7 +32,7 @@ class Side(Protocol):
 class Constant:
     """The bound is `value`, for all time."""
 
-    value: jax.Array = leaf("rad")
+    value: Leaf = leaf("rad")
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound, (n,) [rad]."""
@@ -45,10 +46,10 @@ class Sinusoid:
     Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
     """
 
-    offset: jax.Array = leaf("rad")
-    amplitude: jax.Array = leaf("rad")
-    frequency: jax.Array = leaf("rad/s", default=1.0)
-    phase: jax.Array = leaf("rad", default=0.0)
+    offset: Leaf = leaf("rad")
+    amplitude: Leaf = leaf("rad")
+    frequency: Leaf = leaf("rad/s", default=1.0)
+    phase: Leaf = leaf("rad", default=0.0)
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound, (n,) [rad]."""
@@ -63,9 +64,9 @@ class Funnel:
     Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
     """
 
-    initial: jax.Array = leaf("rad")
-    final: jax.Array = leaf("rad")
-    rate: jax.Array = leaf("1/s", sign="nonnegative")
+    initial: Leaf = leaf("rad")
+    final: Leaf = leaf("rad")
+    rate: Leaf = leaf("1/s", sign="nonnegative")
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound, (n,) [rad]."""
@@ -78,6 +79,11 @@ class Bounds:
 
     lower: Side
     upper: Side
+
+    def check(self) -> None:
+        """Raises ValueError for a side that is not one."""
+        for name in ("lower", "upper"):
+            checks.conforms(f"Bounds.{name}", getattr(self, name), Side, "A constant bound is iblf_jax.bounds.Constant(value).")
 
 
 class Tube(NamedTuple):
@@ -117,7 +123,7 @@ class Tube(NamedTuple):
         return self.dupper - self.dq_d
 
     def xi(self, q: jax.Array) -> jax.Array:
-        """xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].                     (2.4), (2.5)"""
+        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].                     (2.4), (2.5)"""
         e1 = q - self.q_d
         return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
 

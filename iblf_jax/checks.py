@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-SIGNS = {None: "finite", "positive": "> 0", "nonnegative": ">= 0"}
+MOST_STEPS = 2**31 - 1
+"""Steps are counted in int32 inside the compiled loop."""
 
 
 def is_concrete(value: Any) -> bool:
@@ -25,7 +26,12 @@ def is_concrete(value: Any) -> bool:
 
 def fail(field: str, got: Any, expected: str, mend: str = "") -> ValueError:
     """The one form of error message: field, value, expectation and mend."""
-    shown = np.array2string(np.asarray(got), precision=6, threshold=8) if isinstance(got, jax.Array | np.ndarray) else repr(got)
+    if not is_concrete(got):
+        shown = "a value that JAX is tracing"
+    elif isinstance(got, jax.Array | np.ndarray):
+        shown = np.array2string(np.asarray(got), precision=6, threshold=8)
+    else:
+        shown = repr(got)
     if len(shown) > 160:
         shown = shown[:157] + "..."
     return ValueError(f"{field}: got {shown}, expected {expected}." + (f" {mend}" if mend else ""))
@@ -46,6 +52,8 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
     declared = field.metadata.get("leaf", False)
     name = f"{owner}.{field.name}"
     if value is None:
+        if field.default is not None:
+            raise fail(name, value, "a number or an array of numbers" if declared else "a component")
         return None
     if isinstance(value, tuple | list) and len(value) == 0 and not declared:
         return tuple(value)
@@ -92,7 +100,9 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
 def structural(owner: str, name: str, value: Any) -> None:
     """Raises if a static field holds something that cannot be part of a compiled program's identity."""
     if isinstance(value, jax.Array | np.ndarray) or not isinstance(value, Hashable):
-        raise fail(f"{owner}.{name}", value, "a hashable value", "It is a structural field: give a number, a string or a tuple, not an array.")
+        raise fail(
+            f"{owner}.{name}", value, "a hashable value", "It is a structural field: give a number, a string or a tuple, not an array."
+        )
     try:
         hash(value)
     except TypeError as error:
@@ -101,8 +111,22 @@ def structural(owner: str, name: str, value: Any) -> None:
 
 def one_of(name: str, value: Any, allowed: Any) -> None:
     """Raises if `value` is not one of the allowed words."""
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         raise fail(name, value, "one of " + ", ".join(repr(x) for x in allowed))
+
+
+def conforms(name: str, value: Any, protocol: type, mend: str = "", optional: tuple[str, ...] = ()) -> None:
+    """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks for, except `optional`."""
+    members = {x for x in (*vars(protocol), *getattr(protocol, "__annotations__", {})) if not x.startswith("_")}
+    expected = f"a component that fits {protocol.__module__.removesuffix('._base')}.{protocol.__name__}"
+    if isinstance(value, type):
+        raise fail(name, value, expected, "It is a class: make an instance, with brackets.")
+    bare = value is None or isinstance(value, str | bytes | tuple | list | dict | jax.Array | np.ndarray) or _is_number_like(value)
+    missing = sorted(x for x in members - set(optional) if bare or not hasattr(value, x))
+    if bare or missing:
+        raise fail(name, value, expected, " ".join(x for x in (mend, "" if bare else f"It lacks {', '.join(missing)}.") if x))
+    if any(leaf is value for leaf in jax.tree.leaves(value)):
+        raise fail(name, value, expected, "JAX does not know its class: decorate it with iblf_jax.component.")
 
 
 def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:
@@ -113,11 +137,18 @@ def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:
 
 def positive_number(name: str, value: Any, unit: str) -> float:
     """A finite positive Python float from a user's argument, or a ValueError."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real | np.generic | np.ndarray | jax.Array):
+    if isinstance(value, jax.core.Tracer):
+        mend = "It decides how many steps are compiled: use a Python number, or static_argnames in your jit."
+        raise fail(name, value, f"a positive number [{unit}]", mend)
+    array_like = isinstance(value, np.generic | np.ndarray | jax.Array)
+    if isinstance(value, bool) or not (array_like or isinstance(value, numbers.Real)):
         raise fail(name, value, f"a positive number [{unit}]")
-    if jnp.ndim(value) != 0 or jnp.iscomplexobj(value):
+    if array_like and (value.ndim != 0 or value.dtype.kind not in "fiu"):
         raise fail(name, value, f"a positive number [{unit}]")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = float("inf")
     if not np.isfinite(number) or number <= 0:
         raise fail(name, value, f"a positive number [{unit}]")
     return number
@@ -136,8 +167,13 @@ def whole_steps(duration: Any, dt: Any) -> int:
     """The number of steps of size `dt` in `duration`, or a ValueError that says which duration would do."""
     duration = positive_number("duration", duration, "s")
     dt = positive_number("dt", dt, "s")
+    if not duration / dt <= MOST_STEPS:
+        raise fail("duration", duration, f"at most {MOST_STEPS} steps dt = {dt:g} s", "Shorten the run or take a larger dt.")
     steps = round(duration / dt)
-    if steps < 1 or abs(steps * dt - duration) > 1e-6 * max(dt, 1e-9 * duration) + 1e-9 * duration:
+    # A thousandth of a step is forgiven, so that a duration that has been through float32 is taken for what it was.
+    if steps < 1 or abs(steps * dt - duration) > 1e-3 * dt + 1e-12 * duration:
         near = max(steps, 1)
-        raise fail("duration", duration, f"a whole number of steps dt = {dt:g} s", f"Take duration={near * dt:.12g} or dt={duration / near:.12g}.")
+        raise fail(
+            "duration", duration, f"a whole number of steps dt = {dt:g} s", f"Take duration={near * dt:.12g} or dt={duration / near:.12g}."
+        )
     return steps

@@ -18,7 +18,8 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.pytree import component, leaf
+from iblf_jax import checks
+from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots import Robot
 
 
@@ -61,13 +62,13 @@ class ModelShaped:
     `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.  Source: Zhang & Yan 2024, (4.3).
     """
 
-    acceleration_amplitude: jax.Array = leaf("rad/s^2")
-    acceleration_frequency: jax.Array = leaf("rad/s")
-    acceleration_phase: jax.Array = leaf("rad")
-    velocity_amplitude: jax.Array = leaf("rad/s")
-    velocity_frequency: jax.Array = leaf("rad/s")
-    velocity_phase: jax.Array = leaf("rad")
-    phase: jax.Array = leaf("rad", shape="scalar", default=0.0)
+    acceleration_amplitude: Leaf = leaf("rad/s^2")
+    acceleration_frequency: Leaf = leaf("rad/s")
+    acceleration_phase: Leaf = leaf("rad")
+    velocity_amplitude: Leaf = leaf("rad/s")
+    velocity_frequency: Leaf = leaf("rad/s")
+    velocity_phase: Leaf = leaf("rad")
+    phase: Leaf = leaf("rad", shape="scalar", default=0.0)
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """f(t, q, q'), (n,) [N m]."""
@@ -84,10 +85,10 @@ class ModelShaped:
 class Sinusoids:
     """Joint torques offset + amplitude sin(frequency t + phase)."""
 
-    amplitude: jax.Array = leaf("N m")
-    frequency: jax.Array = leaf("rad/s")
-    phase: jax.Array = leaf("rad", default=0.0)
-    offset: jax.Array = leaf("N m", default=0.0)
+    amplitude: Leaf = leaf("N m")
+    frequency: Leaf = leaf("rad/s")
+    phase: Leaf = leaf("rad", default=0.0)
+    offset: Leaf = leaf("N m", default=0.0)
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """(n,) [N m]."""
@@ -102,8 +103,8 @@ class Sinusoids:
 class Step:
     """Joint torques that appear at one time: `size` from `time` on."""
 
-    size: jax.Array = leaf("N m")
-    time: jax.Array = leaf("s", shape="scalar")
+    size: Leaf = leaf("N m")
+    time: Leaf = leaf("s", shape="scalar")
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """(n,) [N m]."""
@@ -121,11 +122,11 @@ class TipForce:
     (The paper's f_ext in (2.1) is the force that the tip exerts, hence its minus sign: F = -f_ext.)
     """
 
-    amplitude: jax.Array = leaf("N", shape="any")
+    amplitude: Leaf = leaf("N", shape="any")
     """One number a coordinate of the tip, (2,) for a planar arm."""
-    frequency: jax.Array = leaf("rad/s", shape="any", default=0.0)
-    phase: jax.Array = leaf("rad", shape="any", default=0.0)
-    offset: jax.Array = leaf("N", shape="any", default=0.0)
+    frequency: Leaf = leaf("rad/s", shape="any", default=0.0)
+    phase: Leaf = leaf("rad", shape="any", default=0.0)
+    offset: Leaf = leaf("N", shape="any", default=0.0)
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """J(q)^T F(t), (n,) [N m]."""
@@ -142,9 +143,9 @@ class TipForce:
 class Friction:
     """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' / width))."""
 
-    viscous: jax.Array = leaf("N m s/rad", sign="nonnegative", default=0.0)
-    coulomb: jax.Array = leaf("N m", sign="nonnegative", default=0.0)
-    width: jax.Array = leaf("rad/s", sign="positive", default=0.05)
+    viscous: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
+    coulomb: Leaf = leaf("N m", sign="nonnegative", default=0.0)
+    width: Leaf = leaf("rad/s", sign="positive", default=0.05)
     """Velocity over which the Coulomb part changes sign; smaller is sharper and stiffer."""
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
@@ -161,6 +162,14 @@ class Sum:
     """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`."""
 
     parts: tuple[Disturbance, ...]
+
+    def check(self) -> None:
+        """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""
+        if not isinstance(self.parts, tuple | list):
+            raise checks.fail("Sum.parts", self.parts, "a tuple of disturbances", "Put one part into brackets, Sum((part,)).")
+        object.__setattr__(self, "parts", tuple(self.parts))
+        for i, part in enumerate(self.parts):
+            checks.conforms(f"Sum.parts[{i}]", part, Disturbance)
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """The sum over the parts, (n,) [N m]."""

@@ -30,7 +30,7 @@ def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
 
 
 def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """x with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side."""
+    """X with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side."""
     n = matrix.shape[-1]
     L = cholesky(matrix)
     y: list[jax.Array] = []

@@ -9,13 +9,15 @@ A fold is a component: thresholds are leaves.  Its `units` name what `finish` re
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.closed_loop import Sample
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 
 
 class Fold(Protocol):
@@ -93,7 +95,7 @@ class Settling:
     overshoot: the largest |e1| on the side of zero opposite to the start's.
     """
 
-    tolerance: jax.Array = leaf("rad", sign="positive", default=0.01)
+    tolerance: Leaf = leaf("rad", sign="positive", default=0.01)
     units: ClassVar[dict[str, str]] = {"settling_time": "s", "overshoot": "rad"}
 
     def init(self, sample: Sample) -> _SettlingState:
@@ -152,7 +154,7 @@ class Margin:
         )
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
-        """margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
+        """Margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
         return {
             "margin": acc.margin,
             "xi_margin": acc.xi,
@@ -239,6 +241,26 @@ class Estimation:
         """estimate_rmse, (n,)."""
         mean = acc.square / acc.time
         return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
+
+
+def as_folds(metrics: Sequence[Fold], dtype: jax.typing.DTypeLike) -> tuple[Fold, ...]:
+    """The folds that a user asked for, checked, their numbers in one floating-point type.
+
+    Raises:
+      ValueError: something that is not a fold, or two folds that return the same name.
+    """
+    if not isinstance(metrics, tuple | list):
+        raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
+    owner: dict[str, int] = {}
+    for i, fold in enumerate(metrics):
+        checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
+        for name in fold.units:
+            if name in owner:
+                raise checks.fail(
+                    f"metrics[{i}]", fold, "names that no other fold returns", f"metrics[{owner[name]}] returns {name!r} too."
+                )
+            owner[name] = i
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tuple(metrics))
 
 
 STANDARD: tuple[Fold, ...] = (Tracking(), Settling(), Margin(), Torque(), Estimation())

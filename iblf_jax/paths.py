@@ -63,7 +63,13 @@ def parameters(scenario: Scenario) -> ParameterTable:
     Returns:
       A tuple of `Parameter`, which prints as a table.
     """
+    _need_component(scenario)
     return ParameterTable(_walk(scenario, ""))
+
+
+def _need_component(scenario: Any) -> None:
+    if not dataclasses.is_dataclass(scenario) or isinstance(scenario, type):
+        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
 
 
 def _walk(part: Any, path: str) -> Iterator[Parameter]:
@@ -97,7 +103,8 @@ def parse(path: str) -> list[str | int]:
 
 
 def expand(path: str) -> list[str]:
-    """The full paths that one path stands for: two for `robot.`, else itself."""
+    """The full paths that one path stands for: two for `robot.`, else itself.  ValueError if it is not a path."""
+    parse(path)
     if path == "robot" or path.startswith(("robot.", "robot[")):
         return ["plant" + path[5:], "model" + path[5:]]
     return [path]
@@ -116,7 +123,7 @@ def get(scenario: Scenario, path: str) -> Any:
     full = expand(path)[0]
     for token in parse(full):
         try:
-            value = value[token] if isinstance(token, int) else _field(value, token)
+            value = _entry(value, token) if isinstance(token, int) else _field(value, token)
         except (AttributeError, IndexError, TypeError, KeyError):
             raise _unknown(scenario, path) from None
         if isinstance(token, int) and not isinstance(value, jax.Array | np.ndarray | float) and not dataclasses.is_dataclass(value):
@@ -124,6 +131,14 @@ def get(scenario: Scenario, path: str) -> Any:
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
         raise _unknown(scenario, path)
     return value
+
+
+def _entry(part: Any, index: int) -> Any:
+    """Part or entry `index`; unlike an array of JAX, which takes the nearest entry, it raises IndexError beyond the ends."""
+    size = len(part) if isinstance(part, tuple | list) else jnp.shape(part)[0]
+    if not -size <= index < size:
+        raise IndexError(index)
+    return part[index]
 
 
 def _field(part: Any, name: str) -> Any:
@@ -177,6 +192,7 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     Raises:
       ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the mend.
     """
+    _need_component(scenario)
     if not isinstance(values, Mapping):
         raise checks.fail("values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}')
     for path, value in values.items():

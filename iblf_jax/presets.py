@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from iblf_jax import checks
+import numpy as np
+
 from iblf_jax import bounds as bounds_
-from iblf_jax import disturbances, references
+from iblf_jax import checks, disturbances, references
 from iblf_jax.barriers import Integral, Log
 from iblf_jax.controllers import Backstepping
 from iblf_jax.observers import Momentum, Printed
@@ -20,8 +21,8 @@ def customary_two_link() -> TwoLink:
     The paper prints no parameters and refers to others; these are the customary ones and an ASSUMPTION of this package:
     m = (2, 0.85) kg, l = (0.35, 0.31) m, lc = l/2, I = m l^2/4, g = 9.81 m/s^2.
     """
-    mass, length = (2.0, 0.85), (0.35, 0.31)
-    return TwoLink(mass=mass, length=length, centre=[x / 2 for x in length], inertia=[m * x**2 / 4 for m, x in zip(mass, length, strict=True)])
+    mass, length = np.array([2.0, 0.85]), np.array([0.35, 0.31])
+    return TwoLink(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
 
 
 def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 1) -> Scenario:

@@ -16,13 +16,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
 from iblf_jax import checks
 
 T = TypeVar("T")
+
+Leaf: TypeAlias = Any
+"""Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a `jax.Array` from then on."""
 
 
 def leaf(unit: str, *, sign: str | None = None, shape: str = "joint", default: Any = dataclasses.MISSING) -> Any:
@@ -102,7 +105,17 @@ def float_dtype(tree: Any) -> jax.typing.DTypeLike:
 
 
 def astype(tree: T, dtype: jax.typing.DTypeLike) -> T:
-    """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`."""
+    """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`.
+
+    Raises:
+      ValueError: a type that is not a floating-point one.
+    """
     import jax.numpy as jnp
 
+    try:
+        floating = jnp.issubdtype(dtype, jnp.floating)
+    except TypeError:
+        floating = False
+    if not floating:
+        raise checks.fail("dtype", dtype, 'a floating-point type, such as "float32"')
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)

@@ -7,6 +7,7 @@ and its derivative alpha' is continuous only if q_d" is.
 
 from __future__ import annotations
 
+import functools
 from typing import Protocol
 
 import jax
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 
 
 class Reference(Protocol):
@@ -32,10 +33,10 @@ class Sinusoid:
     Source: Zhang & Yan 2024, equation (4.2).
     """
 
-    offset: jax.Array = leaf("rad")
-    amplitude: jax.Array = leaf("rad")
-    frequency: jax.Array = leaf("rad/s", default=1.0)
-    phase: jax.Array = leaf("rad", default=0.0)
+    offset: Leaf = leaf("rad")
+    amplitude: Leaf = leaf("rad")
+    frequency: Leaf = leaf("rad/s", default=1.0)
+    phase: Leaf = leaf("rad", default=0.0)
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
@@ -51,9 +52,9 @@ class Quintic:
     Velocity and acceleration vanish at both ends.  Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
     """
 
-    start: jax.Array = leaf("rad")
-    end: jax.Array = leaf("rad")
-    duration: jax.Array = leaf("s", sign="positive", shape="scalar")
+    start: Leaf = leaf("rad")
+    end: Leaf = leaf("rad")
+    duration: Leaf = leaf("s", sign="positive", shape="scalar")
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
@@ -73,12 +74,15 @@ class WaypointSpline:
 
     times: tuple[float, ...] = static()
     """Strictly increasing times of the waypoints [s]."""
-    waypoints: jax.Array = leaf("rad", shape="any")
+    waypoints: Leaf = leaf("rad", shape="any")
     """One row a time, (m, n)."""
 
     def check(self) -> None:
         """Raises ValueError for times that do not increase or do not match the waypoints."""
-        times = np.asarray(self.times, float)
+        try:
+            times = np.asarray(self.times, float)
+        except (TypeError, ValueError):
+            times = np.zeros(0)
         if times.ndim != 1 or times.size < 2 or not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
             raise checks.fail("WaypointSpline.times", self.times, "at least two strictly increasing times [s]")
         if self.waypoints.ndim != 2 or self.waypoints.shape[0] != times.size:
@@ -97,6 +101,7 @@ class WaypointSpline:
         return basis @ self.waypoints
 
 
+@functools.lru_cache(maxsize=32)
 def _cardinal_splines(times: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are 1 at one waypoint."""
     from scipy.interpolate import PPoly, make_interp_spline

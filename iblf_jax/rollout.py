@@ -19,16 +19,19 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax import checks
-from iblf_jax.bounds import NARROWEST
+from iblf_jax.bounds import NARROWEST, tube_at
 from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state, rate
 from iblf_jax.integrators import step, tableau
-from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.metrics import STANDARD, Fold, as_folds
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.stability import comfortable_dt, fastest_mode
 from iblf_jax.status import FAILED, VELOCITY_LIMIT, Status, describe, flag
 
 RECORDED = tuple(f.name for f in dataclasses.fields(Rollout) if f.name in Sample._fields and f.name != "dt")
+
+MOST_SAMPLES = 20_000_000
+"""More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""
 
 
 class SimulationError(RuntimeError):
@@ -146,7 +149,7 @@ def verdict(folds, method: str, dt, carry: Carry, modes: jax.Array) -> Outcome:
     return Outcome(None, metrics, status, mode)
 
 
-def recorded(sample: Sample, state: LoopState):
+def record_of(sample: Sample, state: LoopState):
     """What is kept of a sample, and the states of law and observer."""
     return {name: getattr(sample, name) for name in RECORDED}, state.controller, state.observer
 
@@ -156,30 +159,32 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
 
     Records are stacked every `record_every` steps; with None there are none, and memory does not grow with time.
     """
-    if record_every is None:
-        return _run_unrecorded(scenario, folds, dt, steps=steps, method=method)
-    blocks, rest = divmod(steps, record_every)
+    advance_one = partial(advance, scenario, folds, method, dt)
 
-    def one(carry, index):
-        return advance(scenario, folds, method, dt, carry, index)
+    def recorded(carry, index):
+        state = carry.state
+        carry, sample = advance_one(carry, index)
+        return carry, record_of(sample, state)
+
+    def unrecorded(carry, index):
+        return advance_one(carry, index)[0], None
 
     def block(carry, index):
-        state = carry.state
-        carry, sample = one(carry, index)
-        if record_every > 1:
-            carry, _ = jax.lax.scan(lambda c, i: (one(c, i)[0], None), carry, index + jnp.arange(1, record_every))
-        return carry, recorded(sample, state)
+        carry, record = recorded(carry, index)
+        return jax.lax.scan(unrecorded, carry, index + jnp.arange(1, record_every))[0], record
 
-    carry, records = jax.lax.scan(block, start(scenario, folds, dt), record_every * jnp.arange(blocks))
+    carry = start(scenario, folds, dt)
+    if record_every is None:
+        carry, _ = jax.lax.scan(unrecorded, carry, jnp.arange(steps))
+        return finish(scenario, folds, method, dt, steps, carry)[2]
+    blocks, rest = divmod(steps, record_every)
+    carry, records = jax.lax.scan(recorded if record_every == 1 else block, carry, record_every * jnp.arange(blocks))
     if rest:
-        tail_start = carry.state
-        tail_index = blocks * record_every + jnp.arange(rest)
-        carry, samples = jax.lax.scan(one, carry, tail_index)
-        last = recorded(jax.tree.map(lambda x: x[0], samples), tail_start)
-        _, _, outcome = finish(scenario, folds, method, dt, steps, carry)
-    else:
-        carry, sample, outcome = finish(scenario, folds, method, dt, steps, carry)
-        last = recorded(sample, carry.state)
+        last = record_of(evaluate(scenario, dt * (blocks * record_every), carry.state, dt)[1], carry.state)
+        carry, _ = jax.lax.scan(unrecorded, carry, blocks * record_every + jnp.arange(rest))
+    carry, sample, outcome = finish(scenario, folds, method, dt, steps, carry)
+    if not rest:
+        last = record_of(sample, carry.state)
     records = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), records, last)
     return outcome._replace(records=records)
 
@@ -193,13 +198,6 @@ def as_one_function(f):
     if jax.default_backend() != "cpu":
         return f
     return set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(f))
-
-
-def _run_unrecorded(scenario: Scenario, folds, dt, *, steps: int, method: str) -> Outcome:
-    carry, _ = jax.lax.scan(
-        lambda c, i: (advance(scenario, folds, method, dt, c, i)[0], None), start(scenario, folds, dt), jnp.arange(steps)
-    )
-    return finish(scenario, folds, method, dt, steps, carry)[2]
 
 
 @partial(jax.jit, static_argnames=("steps", "record_every", "method"))
@@ -245,10 +243,12 @@ def simulate(
     tableau(method)
     steps = checks.whole_steps(duration, dt)
     record_every = checks.positive_integer("record_every", record_every)
+    if steps // record_every > MOST_SAMPLES:
+        mend = f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all the same."
+        raise checks.fail("record_every", record_every, f"at most {MOST_SAMPLES} recorded samples of {steps} steps", mend)
     scenario = canonical(scenario)
-    folds = tuple(metrics)
     dtype = scenario.initial.q.dtype
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), folds)
+    folds = as_folds(metrics, dtype)
     outcome = _run_compiled(scenario, folds, jnp.asarray(dt, dtype), steps=steps, record_every=record_every, method=method)
     arrays, controller_state, observer_state = outcome.records
     units = tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
@@ -264,15 +264,15 @@ def simulate(
         **arrays,
     )
     if checks.is_concrete(outcome.status) and outcome.status.ndim == 0:
-        _report(result, throw)
+        _report(result, steps, throw)
     return result
 
 
-def _report(result: Rollout, throw: bool) -> None:
+def _report(result: Rollout, steps: int, throw: bool) -> None:
     """Raises or warns, with the physics in the message, if a run failed."""
     status = Status(int(result.status))
     if status & Status.INFEASIBLE_REFERENCE:
-        raise _infeasible(result)
+        raise _infeasible(result, steps)
     if not status & FAILED:
         return
     text = f"The run failed: {describe(status & FAILED)}. " + " ".join(_explanations(result, status))
@@ -302,15 +302,16 @@ def _explanations(result: Rollout, status: Status) -> list[str]:
     return texts
 
 
-def _infeasible(result: Rollout) -> ValueError:
+def _infeasible(result: Rollout, steps: int) -> ValueError:
     """The error for a reference that touches a bound (Assumption 2), with joint and time."""
-    tube = [np.asarray(x) for x in (result.q_d - result.lower, result.upper - result.q_d)]
-    gap = np.minimum(*tube)
-    sample, joint = np.unravel_index(np.argmin(gap), gap.shape)
-    where = f"t = {float(result.t[sample]):.4g} s"
+    times = jnp.arange(steps + 1).astype(result.dt.dtype) * result.dt
+    tube = jax.jit(jax.vmap(partial(tube_at, result.scenario.reference, result.scenario.bounds)))(times)
+    q_d, lower, upper = (np.asarray(x) for x in (tube.q_d, tube.lower, tube.upper))
+    sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)
+    where = f"t = {float(times[sample]):.4g} s"
     return checks.fail(
         f"reference of joint {joint}",
-        float(result.q_d[sample, joint]),
-        f"a value inside the bounds ({float(result.lower[sample, joint]):.6g}, {float(result.upper[sample, joint]):.6g}) at {where}",
-        "The reference must stay strictly inside the bounds for the whole run (Assumption 2): move it, widen the bounds or shorten the run.",
+        float(q_d[sample, joint]),
+        f"a value inside the bounds ({float(lower[sample, joint]):.6g}, {float(upper[sample, joint]):.6g}) at {where}",
+        "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the bounds or shorten the run.",
     )

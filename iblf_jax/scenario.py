@@ -6,6 +6,7 @@ to let them differ, or perturb leaves of `plant` alone.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import warnings
 from typing import Any
@@ -19,17 +20,29 @@ from iblf_jax.bounds import Bounds, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
-from iblf_jax.pytree import component, is_leaf_field, leaf
+from iblf_jax.pytree import Leaf, component, is_leaf_field, leaf
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
+from iblf_jax.status import VELOCITY_LIMIT
 
 
 @component
 class Initial:
     """Where a run starts."""
 
-    q: jax.Array = leaf("rad")
-    dq: jax.Array = leaf("rad/s", default=0.0)
+    q: Leaf = leaf("rad")
+    dq: Leaf = leaf("rad/s", default=0.0)
+
+
+PARTS = (
+    ("plant", Robot, "iblf_jax.robots has them; write your own with from_energy.", ("skeleton",)),
+    ("model", Robot, "iblf_jax.robots has them; write your own with from_energy.", ("skeleton",)),
+    ("reference", Reference, "iblf_jax.references has them.", ()),
+    ("controller", Controller, "iblf_jax.controllers has them; iblf_jax.testing.check_law looks at your own.", ()),
+    ("observer", Observer, "iblf_jax.observers has them; NoObserver() for none.", ()),
+    ("disturbance", Disturbance, "iblf_jax.disturbances has them; Nothing() for none.", ()),
+)
+"""Field, protocol, mend and what may be missing, for each part of a scenario that may be a user's own."""
 
 
 @component
@@ -49,17 +62,23 @@ class Scenario:
     initial: Initial
     observer: Observer = NoObserver()
     disturbance: Disturbance = Nothing()
-    model: Robot | None = None
+    model: Robot = None  # type: ignore[assignment]
     """What law and observer know; the plant itself if not given."""
 
     def check(self) -> None:
-        """Completes the model and gives every joint-wise leaf its n entries."""
+        """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
+        for name, protocol, mend, optional in PARTS:
+            checks.conforms(f"Scenario.{name}", getattr(self, name), protocol, mend, optional)
+        if not isinstance(self.initial, Initial):
+            raise checks.fail("Scenario.initial", self.initial, "an Initial", "Such as Initial(q=[0.8, 0.8]).")
+        if not isinstance(self.bounds, Bounds):
+            raise checks.fail("Scenario.bounds", self.bounds, "a Bounds", "Such as Bounds(lower=Constant(0.1), upper=Constant(0.9)).")
         if self.model.n != self.plant.n:
             raise checks.fail("Scenario.model", f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has")
         for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, _fit_joints(getattr(self, field.name), self.plant.n, field.name))
+            object.__setattr__(self, field.name, fit_joints(getattr(self, field.name), self.plant.n, field.name))
 
     @property
     def n(self) -> int:
@@ -72,23 +91,31 @@ class Scenario:
         return Setting(self.model, self.reference, self.bounds)
 
 
-def _fit_joints(part: Any, n: int, path: str) -> Any:
+def fit_joints(part: Any, n: int, path: str) -> Any:
     """`part` with its joint-wise scalars repeated n times; ValueError where a leaf has another number of joints."""
     if isinstance(part, tuple):
-        return tuple(_fit_joints(x, n, f"{path}[{i}]") for i, x in enumerate(part))
+        parts = tuple(fit_joints(x, n, f"{path}[{i}]") for i, x in enumerate(part))
+        return part if all(a is b for a, b in zip(parts, part, strict=True)) else parts
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return part
-    fitted = object.__new__(type(part))
+    new: dict[str, Any] = {}
     for field in dataclasses.fields(part):
-        value, name = getattr(part, field.name), f"{path}.{field.name}"
+        old, name = getattr(part, field.name), f"{path}.{field.name}"
+        value = old
         if is_leaf_field(field) and field.metadata["shape"] == "joint" and value is not None:
             if jnp.ndim(value) == 0:
                 value = jnp.broadcast_to(value, (n,))
             elif jnp.shape(value) != (n,):
                 raise checks.fail(name, value, f"one number, or {n} (one a joint)", f"Its shape is {jnp.shape(value)}.")
         elif not is_leaf_field(field):
-            value = _fit_joints(value, n, name)
-        object.__setattr__(fitted, field.name, value)
+            value = fit_joints(value, n, name)
+        if value is not old:
+            new[field.name] = value
+    if not new:
+        return part
+    fitted = copy.copy(part)
+    for key, value in new.items():
+        object.__setattr__(fitted, key, value)
     return fitted
 
 
@@ -113,16 +140,12 @@ def canonical(scenario: Scenario) -> Scenario:
 
     Raises:
       ValueError: a leaf is not finite or has the wrong sign, a mass matrix is not positive definite, the start is outside
-        its bounds; the message names the field, the value and the mend.
+        its bounds or faster than VELOCITY_LIMIT; the message names the field, the value and the mend.
     """
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
     check_values(scenario)
-    dtype = jnp.result_type(float)
-    floats = [jnp.result_type(x) for x in jax.tree.leaves(scenario)]
-    floats = [kind for kind in floats if jnp.issubdtype(kind, jnp.floating)]
-    if floats and all(kind == floats[0] for kind in floats):
-        dtype = floats[0]
+    dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: jnp.asarray(x, dtype), scenario)
     if checks.is_concrete(scenario):
         _check_start(scenario)
@@ -132,20 +155,55 @@ def canonical(scenario: Scenario) -> Scenario:
     return scenario
 
 
+def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
+    """float32 if all numbers are float32, else JAX's default."""
+    for path, value in jax.tree_util.tree_leaves_with_path(scenario):
+        if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
+            raise checks.fail(
+                jax.tree_util.keystr(path).lstrip("."), value, "an array of numbers", "Other things belong in a static field."
+            )
+    floats = {jnp.result_type(x) for x in jax.tree.leaves(scenario) if jnp.issubdtype(jnp.result_type(x), jnp.floating)}
+    if len(floats) == 1 and floats <= {jnp.dtype("float32"), jnp.dtype("float64")}:
+        return floats.pop()
+    if floats and not floats & {jnp.dtype("float32"), jnp.dtype("float64")}:
+        raise checks.fail("scenario", f"numbers of type {floats.pop()}", "float32 or float64", 'Use iblf_jax.astype(scenario, "float32").')
+    return jnp.result_type(float)
+
+
+def _shaped(name: str, call, *shape: int) -> jax.Array:
+    """What `call()` returns, or a ValueError that names it if it raises or has another shape."""
+    try:
+        value = call()
+    except Exception as error:
+        raise checks.fail(name, f"{type(error).__name__}: {error}", f"an array of shape {shape}") from error
+    if jnp.shape(value) != shape:
+        raise checks.fail(name, f"shape {jnp.shape(value)}", f"shape {shape}", f"The plant has {shape[0]} joints.")
+    return value
+
+
 @jax.jit
 def _start(scenario: Scenario):
-    q = scenario.initial.q
-    tube = tube_at(scenario.reference, scenario.bounds, jnp.zeros((), q.dtype))
-    M = jnp.stack([scenario.plant.mass_matrix(q), scenario.model.mass_matrix(q)])
-    return tube.q_d, tube.lower, tube.upper, M
+    """Reference, bounds and mass matrices at the start.  Shapes are checked while this is traced, once a structure."""
+    n, q, dq, zero = scenario.n, scenario.initial.q, scenario.initial.dq, jnp.zeros((), scenario.initial.q.dtype)
+    q_d = _shaped("reference.position(t)", lambda: scenario.reference.position(zero), n)
+    _shaped("bounds.lower.at(t, q_d)", lambda: scenario.bounds.lower.at(zero, q_d), n)
+    _shaped("bounds.upper.at(t, q_d)", lambda: scenario.bounds.upper.at(zero, q_d), n)
+    tube = tube_at(scenario.reference, scenario.bounds, zero)
+    M = []
+    for name, robot in (("plant", scenario.plant), ("model", scenario.model)):
+        M.append(_shaped(f"{name}.mass_matrix(q)", lambda r=robot: r.mass_matrix(q), n, n))
+        _shaped(f"{name}.coriolis(q, v, u)", lambda r=robot: r.coriolis(q, dq, dq), n)
+        _shaped(f"{name}.gravity(q)", lambda r=robot: r.gravity(q), n)
+    _shaped(
+        "disturbance.torque(t, q, dq, plant, model)", lambda: scenario.disturbance.torque(zero, q, dq, scenario.plant, scenario.model), n
+    )
+    return tube.q_d, tube.lower, tube.upper, jnp.stack(M)
 
 
 def _check_start(scenario: Scenario) -> None:
     q = np.asarray(scenario.initial.q)
     q_d, lower, upper, M = (np.asarray(x) for x in _start(scenario))
     for name, values in (("reference", q_d), ("bounds.lower", lower), ("bounds.upper", upper)):
-        if values.shape != (scenario.n,):
-            raise checks.fail(name, values, f"{scenario.n} joints", f"Its shape at t = 0 is {values.shape}.")
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
     for i in range(scenario.n):
@@ -153,11 +211,30 @@ def _check_start(scenario: Scenario) -> None:
             raise checks.fail(f"bounds of joint {i}", (lower[i], upper[i]), "lower < upper at t = 0", "Exchange or widen them.")
         if not lower[i] < q_d[i] < upper[i]:
             raise checks.fail(
-                f"reference of joint {i}", q_d[i], f"a value inside the bounds ({lower[i]:.6g}, {upper[i]:.6g}) at t = 0", "Move the reference or widen the bounds (Assumption 2)."
+                f"reference of joint {i}",
+                q_d[i],
+                f"a value inside the bounds ({lower[i]:.6g}, {upper[i]:.6g}) at t = 0",
+                "Move the reference or widen the bounds (Assumption 2).",
             )
         if not lower[i] < q[i] < upper[i]:
-            raise checks.fail(f"initial.q[{i}]", q[i], f"a start inside the bounds ({lower[i]:.6g}, {upper[i]:.6g}) at t = 0", "Move the start or widen the bounds.")
+            raise checks.fail(
+                f"initial.q[{i}]",
+                q[i],
+                f"a start inside the bounds ({lower[i]:.6g}, {upper[i]:.6g}) at t = 0",
+                "Move the start or widen the bounds.",
+            )
+    if not np.all(np.abs(scenario.initial.dq) < VELOCITY_LIMIT):
+        raise checks.fail(
+            "initial.dq", scenario.initial.dq, f"speeds below {VELOCITY_LIMIT:g} rad/s", "A run that fast counts as diverged."
+        )
     for name, matrix in zip(("plant", "model"), M, strict=True):
         symmetric = 0.5 * (matrix + matrix.T)
-        if not np.all(np.isfinite(matrix)) or np.linalg.eigvalsh(symmetric)[0] <= 0:
-            raise checks.fail(f"{name}.mass_matrix(initial.q)", matrix, "a positive definite matrix", "Check the masses, lengths and inertias.")
+        if not np.all(np.isfinite(matrix)) or np.ptp(matrix - matrix.T) > 1e-4 * np.max(np.abs(matrix)):
+            raise checks.fail(
+                f"{name}.mass_matrix(initial.q)", matrix, "a finite symmetric matrix", "Check the masses, lengths and inertias."
+            )
+        modes = np.linalg.eigvalsh(symmetric)
+        if modes[0] <= scenario.n * np.finfo(matrix.dtype).eps * modes[-1]:
+            raise checks.fail(
+                f"{name}.mass_matrix(initial.q)", matrix, "a positive definite matrix", "Check the masses, lengths and inertias."
+            )

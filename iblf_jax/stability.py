@@ -27,6 +27,9 @@ AVERAGED = 16
 COMFORT = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
 
+SLOWEST = 1.0
+"""1/s.  A loop slower than this still follows a reference, so a step is never advised beyond that."""
+
 
 class Growth(NamedTuple):
     """State of the power iteration: a direction of length one, and the sum of the last logarithms of its growth."""
@@ -75,7 +78,7 @@ def stable_dt(mode: float, method: str) -> float:
 
 def comfortable_dt(mode: float) -> float:
     """A round step (1, 2 or 5 times a power of ten) that follows a mode [1/s] comfortably, [s]."""
-    limit = COMFORT / mode
+    limit = COMFORT / max(mode, SLOWEST)
     decade = 10.0 ** math.floor(math.log10(limit))
     factor = max(f for f in (1.0, 2.0, 5.0) if f * decade <= limit * (1 + 1e-12))
     return float(f"{factor * decade:.1g}")

@@ -17,7 +17,9 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.bounds import Tube
+from iblf_jax.pytree import Leaf
 
 GUARD = 1e-3
 """Default distance from the wall, in xi, at which the guard takes over."""
@@ -26,22 +28,35 @@ GUARD = 1e-3
 class Barrier(Protocol):
     """What the package asks of a barrier.  All arrays are (n,), one number a joint, and joints do not mix."""
 
-    guard: float
-    """Static: the law is exact for |xi| <= 1 - guard."""
-    uses_o: bool
-    """Class attribute: whether `virtual_velocity` uses `o`."""
+    @property
+    def guard(self) -> float:
+        """A static field: the law is exact for |xi| <= 1 - guard."""
+        ...
+
+    @property
+    def uses_o(self) -> bool:
+        """A class attribute: whether `virtual_velocity` uses `o`."""
+        ...
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1 of each joint at position q [rad]."""
         ...
 
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
-        """s = dV1/dq of each joint."""
+        """S = dV1/dq of each joint."""
         ...
 
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
-        """alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
+        """Alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
         ...
+
+
+def check_guard(owner: str, guard: float) -> None:
+    """Raises ValueError unless 0 < guard < 1."""
+    if not 0.0 < checks.positive_number(f"{owner}.guard", guard, "1") < 1.0:
+        raise checks.fail(
+            f"{owner}.guard", guard, "a number between 0 and 1", f"It is a distance from the wall in xi; the default is {GUARD:g}."
+        )
 
 
 class GuardedError(NamedTuple):
@@ -80,13 +95,13 @@ def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
 
 
 def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:
-    """kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].                          (3.7), root restored
+    """Kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].                          (3.7), root restored
 
     With the root, kappa + k'/k >= 0 on both sides for every o > 0, which is what the proof needs.
     """
     return jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + o)
 
 
-def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array) -> jax.Array:
-    """alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s]; shared by the integral and the logarithmic barrier.     (3.5)"""
+def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: Leaf) -> jax.Array:
+    """Alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s]; shared by the integral and the logarithmic barrier.     (3.5)"""
     return tube.dq_d - (k1 + bound_motion_gain(tube, o)) * (q - tube.q_d)

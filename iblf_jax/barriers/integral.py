@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.barriers._base import GUARD, guarded_error, paper_virtual_velocity
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error, paper_virtual_velocity
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
 
@@ -24,6 +24,10 @@ class Integral:
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raises ValueError for a guard outside (0, 1)."""
+        check_guard("Integral", self.guard)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [1]."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
-from iblf_jax.barriers._base import GUARD, guarded_error, paper_virtual_velocity
+from iblf_jax.barriers._base import GUARD, check_guard, guarded_error, paper_virtual_velocity
 from iblf_jax.bounds import Tube
 from iblf_jax.pytree import component, static
 
@@ -27,7 +27,8 @@ class Log:
     uses_o: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raises ValueError unless p is a whole number >= 1."""
+        """Raises ValueError unless p is a whole number >= 1 and the guard in (0, 1)."""
+        check_guard("Log", self.guard)
         checks.positive_integer("Log.p", self.p)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:

@@ -53,9 +53,7 @@ class Controller(Protocol):
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
         ...
 
-    def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State
-    ) -> tuple[Command, State]:
+    def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
         """The command, and the rate of the law's own state (same structure as the state).
 
         Args:

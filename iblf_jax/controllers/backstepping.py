@@ -18,7 +18,7 @@ from iblf_jax import checks
 from iblf_jax.barriers import Barrier, Integral
 from iblf_jax.barriers._base import guard_is_active
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 
 READINGS = ("printed", "corrected")
 
@@ -30,11 +30,11 @@ class Backstepping:
     Source: Zhang & Yan 2024, (3.5), (3.14); `corrected` as said at the head of this module.
     """
 
-    k1: jax.Array = leaf("1/s", sign="positive")
+    k1: Leaf = leaf("1/s", sign="positive")
     """Gain of the virtual velocity."""
-    K2: jax.Array = leaf("N m s/rad", sign="positive")
+    K2: Leaf = leaf("N m s/rad", sign="positive")
     """Diagonal of the velocity error's gain; Theorem 2 asks for more than 1/2."""
-    o: jax.Array | None = leaf("1/s^2", sign="positive", default=None)
+    o: Leaf = leaf("1/s^2", sign="positive", default=None)
     """Margin under the root of kappa (3.7), for barriers that compensate a moving bound by kappa; else None."""
     barrier: Barrier = Integral()
     reading: str = static(default="printed")
@@ -42,15 +42,21 @@ class Backstepping:
     def check(self) -> None:
         """Raises ValueError for an unknown reading; fits `o` to the barrier (0.1, the paper's, if it needs one)."""
         checks.one_of("Backstepping.reading", self.reading, READINGS)
+        checks.conforms("Backstepping.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().")
         uses_o = getattr(self.barrier, "uses_o", True)
         if uses_o and self.o is None:
             object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
         if not uses_o and self.o is not None:
-            raise checks.fail("Backstepping.o", self.o, f"None with the barrier {type(self.barrier).__name__}", "That barrier has no kappa; leave `o` out.")
+            raise checks.fail(
+                "Backstepping.o",
+                self.o,
+                f"None with the barrier {type(self.barrier).__name__}",
+                "That barrier has no kappa; leave `o` out.",
+            )
 
     def advice(self) -> list[str]:
         """Warnings about gains outside the conditions of Theorem 2."""
-        if bool(jnp.all(self.K2 > 0.5)):
+        if not checks.is_concrete(self.K2) or bool(jnp.all(self.K2 > 0.5)):
             return []
         return [f"controller.K2 = {self.K2}: Theorem 2 needs K2 > 1/2 on every joint (3.17); below it nothing is claimed. Raise K2."]
 

@@ -29,7 +29,7 @@ def step_function(treedef, is_lane: tuple[bool, ...], carry_treedef, method: str
         carry = jax.tree.unflatten(carry_treedef, carry)
         state = carry.state
         carry, sample = rollout.advance(scenario, folds, method, dt, carry, index)
-        return jax.tree.leaves(carry), jax.tree.leaves(rollout.recorded(sample, state)) if recorded else []
+        return jax.tree.leaves(carry), jax.tree.leaves(rollout.record_of(sample, state)) if recorded else []
 
     return step
 
@@ -115,7 +115,7 @@ def finish(batch: Batch, method: str, steps: int, carry: Any):
         scenario, folds, dt = batch.whole(lane)
         carry, sample = rollout.observe_end(scenario, folds, dt, steps, carry)
         times, states = rollout.critical_instants(scenario, dt, steps, carry)
-        return carry, rollout.recorded(sample, carry.state), Instants(jax.vmap(growth_start)(states), times, states)
+        return carry, rollout.record_of(sample, carry.state), Instants(jax.vmap(growth_start)(states), times, states)
 
     carry, last, instants = jax.vmap(observe)(batch.leaves.lane, carry)
     instants, _ = batch.advance(mode_function, instants, POWER_ITERATIONS, None)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 
 from iblf_jax import checks
-from iblf_jax.observers.printed import STARTS, initial_eta
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
+from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot, mass_matrix_rate
 
 
@@ -18,8 +18,8 @@ class Momentum:
     Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for the form.
     """
 
-    kf: jax.Array = leaf("1/s", sign="positive")
-    eta0: jax.Array = leaf("N m", default=0.0)
+    kf: Leaf = leaf("1/s", sign="positive")
+    eta0: Leaf = leaf("N m", default=0.0)
     """eta(0), added to what `start` says."""
     start: str = static(default="zero")
     """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""
@@ -27,6 +27,10 @@ class Momentum:
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""
         checks.one_of("Momentum.start", self.start, STARTS)
+
+    def advice(self) -> list[str]:
+        """Warnings about gains outside the conditions of Theorem 2."""
+        return kf_advice(self.kf)
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
         """eta(0), (n,) [N m]."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot
 
 STARTS = ("zero", "matched")
@@ -20,8 +20,8 @@ class Printed:
     Source: Zhang & Yan 2024, (3.11), signs restored.
     """
 
-    kf: jax.Array = leaf("1/s", sign="positive")
-    eta0: jax.Array = leaf("N m", default=0.0)
+    kf: Leaf = leaf("1/s", sign="positive")
+    eta0: Leaf = leaf("N m", default=0.0)
     """eta(0), added to what `start` says."""
     start: str = static(default="zero")
     """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""
@@ -29,6 +29,10 @@ class Printed:
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""
         checks.one_of("Printed.start", self.start, STARTS)
+
+    def advice(self) -> list[str]:
+        """Warnings about gains outside the conditions of Theorem 2."""
+        return kf_advice(self.kf)
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
         """eta(0), (n,) [N m]."""
@@ -42,6 +46,14 @@ class Printed:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
         return -self.kf * (f_hat + tau - model.coriolis(q, dq, dq) - model.gravity(q))
+
+
+def kf_advice(kf: jax.Array) -> list[str]:
+    """What to tell a user whose kf is below the condition of Theorem 2; nothing for traced values."""
+    if not checks.is_concrete(kf) or bool(jnp.all(kf > 0.5)):
+        return []
+    need = "Theorem 2 needs kf > 1/2 on every joint (3.17), and kf > 1 where f changes (3.25)"
+    return [f"observer.kf = {kf}: {need}; below it nothing is claimed. Raise kf."]
 
 
 def initial_eta(observer, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:

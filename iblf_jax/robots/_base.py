@@ -53,7 +53,7 @@ class Robot(Protocol):
         ...
 
     def jacobian(self, q: jax.Array) -> jax.Array:
-        """d tip / dq, (2, n) or (3, n) [m/rad]."""
+        """D tip / dq, (2, n) or (3, n) [m/rad]."""
         ...
 
     def skeleton(self, q: jax.Array) -> jax.Array:
@@ -101,7 +101,7 @@ def from_energy(cls: type[T]) -> type[T]:
         return jax.grad(self.potential)(q)
 
     def jacobian(self, q):
-        """d tip / dq [m/rad], by automatic differentiation."""
+        """D tip / dq [m/rad], by automatic differentiation."""
         return jax.jacfwd(self.tip)(q)
 
     for method in (coriolis, gravity, jacobian):

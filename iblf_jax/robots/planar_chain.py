@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots._base import from_energy, planar_skeleton
 
 
@@ -28,14 +28,14 @@ class PlanarChain:
     Source: Lagrange's equations (head of this module).
     """
 
-    mass: jax.Array = leaf("kg", sign="positive")
-    length: jax.Array = leaf("m", sign="positive")
-    centre: jax.Array = leaf("m", sign="nonnegative")
+    mass: Leaf = leaf("kg", sign="positive")
+    length: Leaf = leaf("m", sign="positive")
+    centre: Leaf = leaf("m", sign="nonnegative")
     """Distance of each link's centre of mass from its joint."""
-    inertia: jax.Array = leaf("kg m^2", sign="nonnegative")
+    inertia: Leaf = leaf("kg m^2", sign="nonnegative")
     """Moment of inertia of each link about its centre of mass."""
-    g: jax.Array = leaf("m/s^2", shape="scalar", default=9.81)
-    payload: jax.Array = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
+    g: Leaf = leaf("m/s^2", shape="scalar", default=9.81)
+    payload: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
     """Point mass at the tip."""
 
     def check(self) -> None:
@@ -43,7 +43,9 @@ class PlanarChain:
         names = ("mass", "length", "centre", "inertia")
         sizes = {name: getattr(self, name).shape for name in names if getattr(self, name).ndim == 1}
         if not sizes:
-            raise checks.fail("PlanarChain.mass", self.mass, "one number a link, (n,)", "At least one field must say how many links there are.")
+            raise checks.fail(
+                "PlanarChain.mass", self.mass, "one number a link, (n,)", "One field must say how many links."
+            )
         shape = next(iter(sizes.values()))
         if shape[0] == 0:
             raise checks.fail("PlanarChain.mass", self.mass, "at least one link")

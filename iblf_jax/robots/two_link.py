@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
-from iblf_jax.pytree import component, leaf
+from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots._base import planar_skeleton
 
 
@@ -38,14 +38,14 @@ class TwoLink:
     Source: Zhang & Yan 2024, section 4, which refers to others for the matrices; see the head of this module.
     """
 
-    mass: jax.Array = leaf("kg", sign="positive")
-    length: jax.Array = leaf("m", sign="positive")
-    centre: jax.Array = leaf("m", sign="nonnegative")
+    mass: Leaf = leaf("kg", sign="positive")
+    length: Leaf = leaf("m", sign="positive")
+    centre: Leaf = leaf("m", sign="nonnegative")
     """Distance of each link's centre of mass from its joint."""
-    inertia: jax.Array = leaf("kg m^2", sign="nonnegative")
+    inertia: Leaf = leaf("kg m^2", sign="nonnegative")
     """Moment of inertia of each link about its centre of mass."""
-    g: jax.Array = leaf("m/s^2", shape="scalar", default=9.81)
-    payload: jax.Array = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
+    g: Leaf = leaf("m/s^2", shape="scalar", default=9.81)
+    payload: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
     """Point mass at the tip."""
 
     def check(self) -> None:
@@ -103,7 +103,7 @@ class TwoLink:
         return self.skeleton(q)[-1]
 
     def jacobian(self, q: jax.Array) -> jax.Array:
-        """d tip / dq, (2, 2) [m/rad]."""
+        """D tip / dq, (2, 2) [m/rad]."""
         l1, l2 = self.length[0], self.length[1]
         s1, c1 = l1 * jnp.sin(q[0]), l1 * jnp.cos(q[0])
         s12, c12 = l2 * jnp.sin(q[0] + q[1]), l2 * jnp.cos(q[0] + q[1])

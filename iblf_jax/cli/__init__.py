@@ -1,0 +1,103 @@
+"""The command line: `python -m iblf_jax COMMAND`, or `iblf-jax COMMAND`.
+
+One module a command, each with `add_parser(subparsers)` and `run(args) -> int`; a new command is a new module and a word in `COMMANDS`.
+Exit codes: 0 done, 1 a run failed (a bound was violated, the state ran away, the step was too large), 2 bad arguments or files, with
+one line on stderr.  What is slow to import is imported by `run`, so that `--help` is quick.  The CLI computes in float64.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import jax
+
+COMMANDS = ("reproduce", "simulate", "presets", "parameters")
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Prints one line and exits with 2."""
+        complain(f"{message} (see {self.prog} --help)")
+        raise SystemExit(2)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+      argv: the words after the program's name; those of the process if not given.
+
+    Returns:
+      The exit code (head of this module).
+    """
+    try:
+        args = build_parser().parse_args(argv)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
+        try:
+            prepare_jax()
+            code = args.run(args)
+            sys.stdout.flush()
+            return code
+        except BrokenPipeError:  # the reader of a pipe has gone, as `head` does
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except ValueError as error:
+            complain(str(error))
+        except OSError as error:
+            complain(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error))
+        except (MemoryError, jax.errors.JaxRuntimeError) as error:
+            complain(f"the machine gave up: {error}. A shorter --duration or a larger --record-every takes less memory.")
+        except KeyboardInterrupt:
+            complain("interrupted")
+            return 130
+    return 2
+
+
+def complain(message: str, kind: str = "error") -> None:
+    """One line on stderr."""
+    print(f"iblf-jax: {kind}: {' '.join(message.split())}", file=sys.stderr)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    import iblf_jax
+
+    parser = Parser(
+        prog="iblf-jax",
+        description="Simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots.",
+        epilog="Exit codes: 0 done; 1 a run failed; 2 bad arguments or files.",
+    )
+    parser.add_argument("--version", action="version", version=f"iblf_jax {iblf_jax.__version__} (jax {jax.__version__})")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, dest="command")
+    for name in COMMANDS:
+        importlib.import_module(f"iblf_jax.cli.{name}").add_parser(subparsers)
+    return parser
+
+
+def prepare_jax() -> None:
+    """Float64, and compiled programs kept between calls in a folder of the user's (unless he has chosen one, or none can be written)."""
+    jax.config.update("jax_enable_x64", True)
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK | os.X_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

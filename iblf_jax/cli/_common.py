@@ -1,0 +1,174 @@
+"""What the commands share: how a scenario is named, changed and run, how results are printed and written."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from iblf_jax.results import Rollout
+    from iblf_jax.scenario_file import ScenarioFile
+
+RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "record_every": 1}
+"""How a scenario is run if neither the command line nor its file says."""
+
+
+def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
+    """SCENARIO, --arg and --set."""
+    parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help="a scenario file, or the name of a preset")
+    parser.add_argument(
+        "--arg", action="append", default=[], metavar="NAME=VALUE", help="an argument of the preset, such as law=log; may be repeated"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="PATH=VALUE",
+        help="another value for a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be repeated",
+    )
+
+
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """--duration, --dt, --method, --record-every."""
+    parser.add_argument("--duration", type=float, metavar="S", help="length of the run [s] (default: the file's, else 20)")
+    parser.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the file's, else 0.001)")
+    parser.add_argument("--method", help="rk4, heun or euler (default: the file's, else rk4)")
+    parser.add_argument("--record-every", type=int, metavar="N", help="record every N-th step (default: the file's, else 1)")
+
+
+def scenario_of(args: argparse.Namespace) -> ScenarioFile:
+    """The scenario that the arguments name, with their changes, and the [run] table of its file."""
+    from iblf_jax.paths import with_parameters
+    from iblf_jax.plain import numbers
+    from iblf_jax.presets import PRESETS
+    from iblf_jax.scenario_file import ScenarioFile, from_dict, load_scenario_file
+
+    words = assignments("--arg", args.arg)
+    if args.scenario in PRESETS:
+        file = from_dict({"preset": args.scenario, "arguments": words}, source="--arg" if words else "")
+    elif words:
+        raise ValueError(f"--arg: {args.scenario} is not a preset, and only presets take arguments; use --set for parameters.")
+    else:
+        _check_exists(args.scenario)
+        file = load_scenario_file(args.scenario)
+    changes = assignments("--set", args.set)
+    try:
+        changes = {path: numbers(value, path) for path, value in changes.items()}
+        return ScenarioFile(with_parameters(file.scenario, changes), file.run)
+    except ValueError as error:
+        raise ValueError(f"--set: {error}") from error
+
+
+def _check_exists(name: str) -> None:
+    from iblf_jax.plain import did_you_mean
+    from iblf_jax.presets import PRESETS
+
+    if not Path(name).is_file():
+        mend = did_you_mean(name, PRESETS) if not name.endswith(".toml") else "Give the path of a scenario file."
+        raise ValueError(f"{name}: no such file, and no such preset. {mend}")
+
+
+def assignments(option: str, words: list[str]) -> dict[str, Any]:
+    """NAME=VALUE words as a dict; values are TOML, and a bare word is a string."""
+    values = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or not name.strip() or not text.strip():
+            raise ValueError(
+                f"{option}: got {word!r}, expected NAME=VALUE, such as {'law=log' if option == '--arg' else 'controller.K2=30'}."
+            )
+        try:
+            values[name.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[name.strip()] = text.strip()
+    return values
+
+
+def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
+    """Duration, dt, method and record_every: the command line's, else the file's, else the defaults."""
+    given = {key: getattr(args, key) for key in RUN_DEFAULTS if getattr(args, key, None) is not None}
+    return RUN_DEFAULTS | file.run | given
+
+
+def output_folder(name: str) -> Path:
+    """The folder of --out, made if it is not there; ValueError if it cannot be written."""
+    folder = Path(name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--out: got {name!r}, expected a folder that can be written ({error.strerror}).") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"--out: got {name!r}, expected a folder that can be written (no permission).")
+    return folder
+
+
+# --------------------------------------------------------------------------------------------------------- numbers as text
+
+
+def strict(value: Any) -> Any:
+    """`value` in what strict JSON has: arrays become lists, NaN and infinities null."""
+    if isinstance(value, Mapping):
+        return {str(key): strict(x) for key, x in value.items()}
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if isinstance(value, list | tuple):
+        return [strict(x) for x in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return strict(np.asarray(value).tolist())
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes strict JSON."""
+    path.write_text(json.dumps(strict(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def verdict(run: Rollout) -> dict[str, Any]:
+    """Status and metrics of one run, for JSON."""
+    from iblf_jax.status import Status, describe
+
+    status = Status(int(run.status))
+    return {
+        "status": describe(status),
+        "flags": [flag.name for flag in Status if flag and flag in status],
+        "fastest_mode": {"value": run.fastest_mode, "unit": "1/s"},
+        "metrics": {name: {"value": value, "unit": run.metrics.units.get(name, "1")} for name, value in run.metrics.items()},
+    }
+
+
+def number(value: Any) -> str:
+    """A number in four significant digits; a dash for what never happened."""
+    value = float(value)
+    return f"{value:.4g}" if math.isfinite(value) else "-"
+
+
+def metrics_table(runs: Mapping[str, Rollout]) -> str:
+    """Metrics of runs side by side, one column a joint, with units."""
+    first = next(iter(runs.values()))
+    joints = [f"joint {i}" for i in range(first.n)]
+    rows = [["metric", "unit", *(cell for _ in runs for cell in joints)]]
+    for name, unit in first.metrics.units.items():
+        row = [name, unit]
+        for run in runs.values():
+            cells = [number(x) for x in np.ravel(run.metrics[name])]
+            row += [*cells, *[""] * (run.n - len(cells))][: run.n]
+        rows.append(row)
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        numbers = [cell.rjust(width) for cell, width in zip(row[2:], widths[2:], strict=True)]
+        lines.append("  ".join([row[0].ljust(widths[0]), row[1].ljust(widths[1]), *numbers]))
+    start, head = widths[0] + widths[1] + 4, ""
+    for i, name in enumerate(runs):
+        span = sum(w + 2 for w in widths[2 + i * first.n : 2 + (i + 1) * first.n]) - 2
+        head += name.center(span) + "  "
+    named = [" " * start + head] if head.strip() else []
+    return "\n".join(line.rstrip() for line in [*named, *lines])

@@ -1,0 +1,42 @@
+"""`presets`: which scenarios are ready to run, and any of them as TOML to start from."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = subparsers.add_parser(
+        "presets",
+        help="list the scenarios that are ready to run",
+        description="List the presets, describe one, or print it as a scenario file.",
+    )
+    parser.add_argument("name", nargs="?", metavar="PRESET", help="describe this one")
+    parser.add_argument("--toml", action="store_true", help="print it as a scenario file: start from that")
+    parser.add_argument(
+        "--arg", action="append", default=[], metavar="NAME=VALUE", help="an argument of the preset, such as law=log; may be repeated"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command."""
+    from iblf_jax.cli._common import assignments
+    from iblf_jax.presets import PRESETS
+    from iblf_jax.scenario_file import preset_scenario, scenario_to_toml
+
+    if args.name is None:
+        if args.toml or args.arg:
+            raise ValueError("--toml and --arg: expected the name of a preset before them; `presets` lists the names.")
+        width = max(len(name) for name in PRESETS)
+        for name, preset in PRESETS.items():
+            print(f"{name.ljust(width)}  {' '.join((inspect.getdoc(preset) or '').partition(chr(10))[0].split())}")
+        return 0
+    scenario = preset_scenario(args.name, assignments("--arg", args.arg))
+    if args.toml:
+        print(scenario_to_toml(scenario, run={"duration": 20.0, "dt": 1e-3}), end="")
+    else:
+        print(f"{args.name}{inspect.signature(PRESETS[args.name])}\n\n{inspect.getdoc(PRESETS[args.name])}")
+    return 0

@@ -1,0 +1,67 @@
+"""`simulate`: one run of a scenario file or preset, its verdict and metrics, and files to look at."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from iblf_jax.cli._common import (
+    add_run_arguments,
+    add_scenario_arguments,
+    metrics_table,
+    output_folder,
+    run_options,
+    scenario_of,
+    verdict,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from iblf_jax.results import Rollout
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    """Adds the command."""
+    parser = subparsers.add_parser(
+        "simulate",
+        help="run a scenario once",
+        description="Run a scenario once; print its verdict and metrics.",
+        epilog="Exit code 1 if the run failed: a bound was violated, the state ran away, or the step was too large.",
+    )
+    add_scenario_arguments(parser)
+    add_run_arguments(parser)
+    parser.add_argument("--out", metavar="DIR", help="write rollout.nc, metrics.json, overview.png and scenario.toml into this folder")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the command."""
+    from iblf_jax.rollout import simulate
+    from iblf_jax.status import FAILED, describe
+
+    file = scenario_of(args)
+    options = run_options(args, file)
+    folder = output_folder(args.out) if args.out else None
+    result = simulate(file.scenario, **options)
+    failed = bool(int(result.status) & int(FAILED))
+    print(f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}")
+    print(f"status: {describe(int(result.status))}")
+    print("\n" + metrics_table({"": result}))
+    if folder is not None:
+        _write(folder, args.scenario, result, options)
+    return 1 if failed else 0
+
+
+def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any]) -> None:
+    import iblf_jax
+    from iblf_jax import plotting
+    from iblf_jax.io import save_rollouts
+    from iblf_jax.scenario_file import save_scenario
+
+    save_scenario(result.scenario, folder / "scenario.toml", run=options)
+    save_rollouts(folder / "rollout.nc", result)
+    write_json(folder / "metrics.json", {"source": source, "run": options, "iblf_jax_version": iblf_jax.__version__, **verdict(result)})
+    plotting.save({"overview": plotting.overview(result)}, folder, formats=("png",))
+    print(f"\nwritten to {folder}: rollout.nc, metrics.json, overview.png, scenario.toml")

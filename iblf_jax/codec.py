@@ -1,0 +1,203 @@
+"""Components as plain tables (dicts, lists, numbers, strings) and back: what scenario files are made of.
+
+Nothing here knows a robot or a law by name.  A component's table has one key a field, and `kind = "<name>"` where the field may
+hold any member of a family; the family is read from the field's annotation (`barrier: Barrier`), its members from the family's
+MEMBERS.  So a new member, or a law that holds another law, needs no change here.
+
+Every refusal is a ValueError that names the dotted key, what came, what was expected, and the mend.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax import barriers, bounds, checks, controllers, disturbances, observers, references, robots
+from iblf_jax.plain import (
+    NONE,
+    Words,
+    as_table,
+    decode_static,
+    did_you_mean,
+    entry_hint,
+    known_keys,
+    numbers,
+    plain_numbers,
+    plain_static,
+    without_none,
+)
+from iblf_jax.pytree import is_leaf_field
+
+FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
+    robots.Robot: ("robots", robots.MEMBERS),
+    references.Reference: ("references", references.MEMBERS),
+    bounds.Side: ("bounds", bounds.MEMBERS),
+    disturbances.Disturbance: ("disturbances", disturbances.MEMBERS),
+    controllers.Controller: ("controllers", controllers.MEMBERS),
+    barriers.Barrier: ("barriers", barriers.MEMBERS),
+    observers.Observer: ("observers", observers.MEMBERS),
+}
+"""Contract -> the module that holds the family, and the family's members by name."""
+
+
+def field_hints(cls: Any) -> dict[str, Any]:
+    """Field name -> annotation of a component class; empty where it cannot be resolved."""
+    try:
+        return typing.get_type_hints(cls)
+    except (NameError, TypeError, AttributeError):
+        return {}
+
+
+def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
+    """The family that an annotation names; for any other annotation all members whose names are unique."""
+    if hint in FAMILIES:
+        return FAMILIES[hint]
+    seen: dict[str, list[Any]] = {}
+    for _, members in FAMILIES.values():
+        for name, cls in members.items():
+            seen.setdefault(name, []).append(cls)
+    return "any family", {name: found[0] for name, found in seen.items() if len(found) == 1}
+
+
+# ---------------------------------------------------------------------------------------------------------------- to tables
+
+
+def encode(part: Any, hint: Any, path: str) -> Any:
+    """What a file holds for one non-static field.
+
+    Args:
+      part: a component, an array, or a tuple of these.
+      hint: annotation of the field that holds it.
+      path: dotted key, for messages.
+
+    Raises:
+      ValueError: a class that is in no MEMBERS, or something that a file cannot hold.
+    """
+    hint, _ = without_none(hint)
+    if isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
+        return plain_numbers(part)
+    if isinstance(part, tuple | list):
+        return [encode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(part)]
+    if not dataclasses.is_dataclass(part) or isinstance(part, type):
+        raise checks.fail(path, part, "a component, an array or a tuple of these", "A scenario file cannot hold it.")
+    if type(part) is hint:
+        return encode_fields(part, path)
+    family, members = members_of(hint)
+    name = next((name for name, cls in members.items() if cls is type(part)), None)
+    if name is None:
+        where = family if hint in FAMILIES else "<family>"
+        raise checks.fail(
+            path,
+            Words(f"an object of class {type(part).__name__}"),
+            f"a member of {family} that a file can name ({', '.join(members)})",
+            f'Name your class before saving and loading: iblf_jax.{where}.MEMBERS["my_name"] = {type(part).__name__}.',
+        )
+    return {"kind": name, **encode_fields(part, path)}
+
+
+def encode_fields(part: Any, path: str) -> dict[str, Any]:
+    """The table of one component, without its kind."""
+    table, hints = {}, field_hints(type(part))
+    for field in dataclasses.fields(part):
+        value, name = getattr(part, field.name), f"{path}.{field.name}" if path else field.name
+        if value is None:
+            if field.default is not None:
+                table[field.name] = NONE
+        elif field.metadata.get("static"):
+            table[field.name] = plain_static(value, name)
+        else:
+            table[field.name] = encode(value, hints.get(field.name, Any), name)
+    return table
+
+
+# -------------------------------------------------------------------------------------------------------------- from tables
+
+
+def decode(value: Any, hint: Any, path: str) -> Any:
+    """The component, array or tuple that `encode` wrote for one non-static field.
+
+    Args:
+      value: what the file holds.
+      hint: annotation of the field.
+      path: dotted key, for messages.
+
+    Raises:
+      ValueError: anything that does not fit; the message names the dotted key.
+    """
+    hint, optional = without_none(hint)
+    if optional and value == NONE:
+        return None
+    if hint not in FAMILIES and dataclasses.is_dataclass(hint):
+        return decode_fields(hint, as_table(value, path), path)
+    if isinstance(value, list) and hint not in FAMILIES:
+        if typing.get_origin(hint) is tuple or any(isinstance(x, dict) for x in value):
+            return tuple(decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
+        return checks.as_floats(path, numbers(value, path))
+    if typing.get_origin(hint) is tuple:
+        raise checks.fail(path, value, "a list")
+    if hint not in FAMILIES and not isinstance(value, dict):
+        return checks.as_floats(path, numbers(value, path))
+    return _decode_member(as_table(value, path), hint, path)
+
+
+def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
+    family, members = members_of(hint)
+    kind = table.get("kind")
+    if kind is None:
+        raise checks.fail(
+            f"{path}.kind",
+            Words("nothing"),
+            f"the name of one of the {family}: {', '.join(members)}",
+            f'Write kind = "{next(iter(members))}".',
+        )
+    if not isinstance(kind, str) or kind not in members:
+        raise checks.fail(f"{path}.kind", kind, f"the name of one of the {family}", did_you_mean(kind, members))
+    return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
+
+
+def decode_fields(cls: Any, table: dict[str, Any], path: str) -> Any:
+    """A component of class `cls` from its table, every key checked."""
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    known_keys(table, path, fields)
+    hints, values = field_hints(cls), {}
+    for name, field in fields.items():
+        key = f"{path}.{name}" if path else name
+        if name in table:
+            values[name] = _decode_field(table[name], field, hints.get(name, Any), key)
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise checks.fail(key, Words("nothing"), _expectation(field), f"Add {name} to [{path}]; {cls.__name__} has no default for it.")
+    return construct(cls, values, path)
+
+
+def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> Any:
+    if field.metadata.get("static"):
+        return decode_static(value, hint, key)
+    if not is_leaf_field(field):
+        return decode(value, hint, key)
+    if value == NONE and without_none(hint)[1]:
+        return None
+    return numbers(value, key, field.metadata["unit"])
+
+
+def _expectation(field: dataclasses.Field) -> str:
+    if is_leaf_field(field):
+        many = {"joint": ", or one a joint", "any": " or a list of numbers", "scalar": ""}[field.metadata["shape"]]
+        return f"a number{many} [{field.metadata['unit']}]"
+    return "a value" if field.metadata.get("static") else "a table with a kind"
+
+
+def construct(make: Any, values: dict[str, Any], path: str) -> Any:
+    """`make(**values)`; what it refuses becomes a ValueError that names the key in the file in place of the class."""
+    try:
+        return make(**values)
+    except Exception as error:
+        own, text = f"{make.__name__}.", str(error)
+        if text.startswith(own):
+            text = (f"{path}." if path else "") + text.removeprefix(own)
+        elif path and not text.startswith(path):
+            text = f"{path}: {text}"
+        raise ValueError(text) from error

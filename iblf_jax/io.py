@@ -1,0 +1,286 @@
+"""Runs as labelled data: `xarray.Dataset`s in memory, netCDF or npz on disk.
+
+A Dataset has the dimensions `time` and `joint` (and `run`, before them, for a batch), a unit and a description on every variable, the
+metrics beside the trajectories, and in its attributes what is needed to do the run again: the scenario as TOML where a file can
+hold it, its parameters as JSON, the versions.  In a batch, a parameter that differs between runs is a variable named by its path.
+
+On disk, several runs by name share one file.  They may differ in length, joints and states, so nothing is stacked: every variable
+and dimension is stored as `<name>.<variable>`, and `load_rollouts` gives one Dataset a name back.  netCDF is version 3, written by SciPy.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.paths import parameters
+from iblf_jax.results import Rollout
+from iblf_jax.scenario_file import scenario_to_toml
+from iblf_jax.status import Status, describe
+
+if TYPE_CHECKING:
+    import xarray
+
+FIELDS = {
+    "q": ("rad", "joint position"),
+    "dq": ("rad/s", "joint velocity"),
+    "tau": ("N m", "applied torque"),
+    "e1": ("rad", "position error q - q_d"),
+    "e2": ("rad/s", "velocity error dq - alpha"),
+    "xi": ("1", "position error relative to its bound"),
+    "q_d": ("rad", "reference position"),
+    "dq_d": ("rad/s", "reference velocity"),
+    "lower": ("rad", "lower bound of q"),
+    "upper": ("rad", "upper bound of q"),
+    "alpha": ("rad/s", "virtual velocity"),
+    "disturbance": ("N m", "lumped uncertain term f"),
+    "disturbance_estimate": ("N m", "estimate of the uncertain term"),
+    "V": ("1", "Lyapunov function V2"),
+}
+"""Recorded field -> unit and description."""
+
+STATES = {"controller_state": "state of the law, in its own unit", "observer_state": "state of the observer, in its own unit"}
+"""Recorded state -> description."""
+
+ENDINGS = (".nc", ".npz")
+_ATTRIBUTES = "attributes"
+
+
+def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
+    """A Rollout as an `xarray.Dataset`.
+
+    Args:
+      run: one run, arrays (T, ...), or a batch, (B, T, ...).
+
+    Returns:
+      Dimensions time (T), joint (n), and run (B) first for a batch; variables as the Rollout's fields and metrics, each with
+      `units` and `description`.  A metric whose name is taken is called `metric_<name>`.
+
+    Raises:
+      ValueError: not a Rollout, or one that is being traced.
+    """
+    import xarray
+
+    if not isinstance(run, Rollout):
+        raise checks.fail("run", run, "a Rollout", "ij.simulate returns one.")
+    if not checks.is_concrete(run):
+        raise checks.fail("run", run, "a Rollout that holds numbers", "Call this outside of jit, vmap and grad.")
+    batch = _batch_dims(run)
+    variables = _trajectories(run, batch)
+    variables |= _states(run, batch)
+    for name, value in run.metrics.items():
+        dims = (*batch, *_own_dims(name, np.shape(value)[len(batch) :], run.n))
+        label = f"metric_{name}" if name in variables else name
+        variables[label] = (dims, np.asarray(value), _attrs(run.metrics.units.get(name, "1"), f"metric {name.replace('_', ' ')}"))
+    variables |= _verdict(run, batch)
+    varying, attributes = _parameters(run, batch)
+    coordinates: dict[str, Any] = {"joint": ("joint", np.arange(run.n, dtype=np.int32), _attrs("1", "joint, from 0"))}
+    if len(batch) == 1:
+        coordinates["run"] = ("run", np.arange(len(run), dtype=np.int32), _attrs("1", "run, from 0"))
+    coordinates["time"], more = _time(run, batch)
+    return xarray.Dataset(variables | varying | more, coordinates, attributes)
+
+
+def save_rollouts(path: str | os.PathLike, runs: Mapping[str, Rollout] | Rollout) -> None:
+    """Writes runs to one file.
+
+    Args:
+      path: the file; its ending decides, ".nc" for netCDF or ".npz" for NumPy.
+      runs: runs by name (letters, digits, "_", "-" and blanks), or one Rollout, which is then called "run".
+
+    Raises:
+      ValueError: another ending, no runs, a bad name, or something that is not a Rollout.
+      OSError: the file cannot be written.
+    """
+    ending = _ending(path)
+    runs = {"run": runs} if isinstance(runs, Rollout) else runs
+    if not isinstance(runs, Mapping) or not runs:
+        raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
+    for name in runs:
+        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII) or name == _ATTRIBUTES:
+            raise checks.fail("name of a run", name, 'letters, digits, "_", "-" and blanks', "Choose another key.")
+    data = {name: rollout_to_xarray(run) for name, run in runs.items()}
+    (_write_netcdf if ending == ".nc" else _write_npz)(path, data)
+
+
+def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
+    """The runs of a file that `save_rollouts` wrote, as Datasets by name.
+
+    Args:
+      path: a ".nc" or ".npz" file.
+
+    Raises:
+      ValueError: another ending, or a file that `save_rollouts` did not write.
+      OSError: the file cannot be read.
+    """
+    read = _read_netcdf if _ending(path) == ".nc" else _read_npz
+    with open(path, "rb"):  # a missing or locked file is an OSError, whatever the reader would make of it
+        pass
+    try:
+        return read(path)
+    except Exception as error:
+        raise checks.fail(f"{os.fspath(path)}", type(error).__name__, "a file written by save_rollouts", str(error)) from error
+
+
+# ------------------------------------------------------------------------------------------------------------ the Dataset
+
+
+def _attrs(units: str, description: str) -> dict[str, str]:
+    return {"units": units, "description": description}
+
+
+def _batch_dims(run: Rollout) -> tuple[str, ...]:
+    depth = np.ndim(run.status)
+    return ("run",) if depth == 1 else tuple(f"run_{i}" for i in range(depth))
+
+
+def _own_dims(name: str, shape: tuple[int, ...], n: int) -> tuple[str, ...]:
+    """Dimension names of one sample of a variable: joint for (n,), else its own."""
+    if shape == (n,):
+        return ("joint",)
+    return tuple(f"{name}_axis_{i}" for i in range(len(shape)))
+
+
+def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
+    variables = {}
+    for name, (unit, description) in FIELDS.items():
+        value = np.asarray(getattr(run, name))
+        dims = (*batch, "time", *_own_dims(name, value.shape[len(batch) + 1 :], run.n))
+        variables[name] = (dims, value, _attrs(unit, description))
+    return variables
+
+
+def _states(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
+    variables = {}
+    for whole, description in STATES.items():
+        for keys, value in jax.tree_util.tree_leaves_with_path(getattr(run, whole)):
+            name = re.sub(r"\W+", "_", whole + jax.tree_util.keystr(keys)).strip("_")
+            dims = (*batch, "time", *_own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
+            variables[name] = (dims, np.asarray(value), _attrs("1", description))
+    return variables
+
+
+def _verdict(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
+    flags = [flag for flag in Status if flag]
+    status = np.asarray(run.status)
+    attributes: dict[str, Any] = _attrs("1", "bit flags; 0 is ok")
+    attributes["flag_masks"] = np.array([int(f) for f in flags], np.int32)
+    attributes["flag_meanings"] = " ".join(f.name.lower() for f in flags if f.name)
+    words = {value: describe(value) for value in np.unique(status).tolist()}
+    return {
+        "status": (batch, status.astype(np.int32), attributes),
+        "status_words": (batch, np.vectorize(words.get, otypes=[str])(status), _attrs("1", "status in words")),
+        "fastest_mode": (batch, np.asarray(run.fastest_mode), _attrs("1/s", "largest measured mode of the closed loop")),
+        "dt": (batch, np.asarray(run.dt), _attrs("s", "time step")),
+    }
+
+
+def _time(run: Rollout, batch: tuple[str, ...]) -> tuple[Any, dict[str, Any]]:
+    """The time coordinate; if the runs of a batch differ in it, sample numbers, and a variable `t` (run, time)."""
+    t = np.asarray(run.t)
+    first = t.reshape(-1, t.shape[-1])[0]
+    if np.all(t == first):
+        return ("time", first, _attrs("s", "time")), {}
+    numbers = np.arange(t.shape[-1], dtype=np.int32)
+    return ("time", numbers, _attrs("1", "sample, from 0; the time is t")), {"t": ((*batch, "time"), t, _attrs("s", "time"))}
+
+
+def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Variables for what differs between the runs of a batch; attributes for the rest."""
+    import iblf_jax
+
+    fixed, varying = {}, {}
+    batched = np.ndim(run.scenario.initial.q) > 1
+    for p in parameters(run.scenario):
+        value = np.asarray(p.value)
+        if batched:
+            one = value[(0,) * len(batch)]
+            if not np.all(value == one):
+                varying[p.path] = ((*batch, *_own_dims(p.path, one.shape, run.n)), value, _attrs(p.unit or "1", f"parameter {p.path}"))
+                continue
+            value = one
+        fixed[p.path] = value.tolist()
+    attributes = {
+        "parameters": json.dumps(fixed),
+        "method": run.method,
+        "iblf_jax_version": iblf_jax.__version__,
+        "jax_version": jax.__version__,
+    }
+    if not batch:
+        attributes["status"] = describe(int(run.status))
+        try:
+            attributes["scenario"] = scenario_to_toml(run.scenario)
+        except ValueError as error:
+            attributes["scenario_not_saved"] = str(error)
+    return varying, attributes
+
+
+# ------------------------------------------------------------------------------------------------------------------ files
+
+
+def _ending(path: str | os.PathLike) -> str:
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise checks.fail("path", os.fspath(path), "a file that ends in .nc (netCDF) or .npz (NumPy)")
+    return ending
+
+
+def _write_netcdf(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:
+    import xarray
+
+    attributes: dict[str, Any] = {"names": json.dumps(list(data))}
+    renamed = []
+    for name, one in data.items():
+        attributes |= {f"{name}.{key}": value for key, value in one.attrs.items()}
+        labels = {*one.variables, *one.dims}
+        renamed.append(one.drop_attrs(deep=False).rename({label: f"{name}.{label}" for label in labels}))
+    merged = xarray.merge(renamed).assign_attrs(attributes)
+    merged.to_netcdf(path, engine="scipy")
+
+
+def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
+    import xarray
+
+    merged = xarray.load_dataset(path, engine="scipy")
+    found = {}
+    for name in json.loads(merged.attrs["names"]):
+        start = f"{name}."
+        mine = merged[[v for v in merged.variables if str(v).startswith(start)]]
+        labels = {x for x in (*mine.variables, *mine.dims) if str(x).startswith(start)}
+        mine = mine.rename({x: str(x).removeprefix(start) for x in labels})
+        mine.attrs = {key.removeprefix(start): value for key, value in merged.attrs.items() if key.startswith(start)}
+        found[name] = mine
+    return found
+
+
+def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:
+    arrays: dict[str, np.ndarray] = {}
+    described: dict[str, Any] = {}
+    for name, one in data.items():
+        arrays |= {f"{name}.{label}": np.asarray(variable.values) for label, variable in one.variables.items()}
+        variables = {}
+        for label, variable in one.variables.items():
+            variables[str(label)] = [list(variable.dims), {key: np.asarray(x).tolist() for key, x in variable.attrs.items()}]
+        described[name] = {"variables": variables, "coords": [str(c) for c in one.coords], "attrs": dict(one.attrs)}
+    with open(path, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{_ATTRIBUTES: np.array(json.dumps(described))}, **arrays)
+
+
+def _read_npz(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
+    import xarray
+
+    found = {}
+    with np.load(path, allow_pickle=False) as arrays:
+        for name, described in json.loads(str(arrays[_ATTRIBUTES])).items():
+            variables = {label: (dims, arrays[f"{name}.{label}"], attrs) for label, (dims, attrs) in described["variables"].items()}
+            coords = {label: variables.pop(label) for label in described["coords"]}
+            found[name] = xarray.Dataset(variables, coords, described["attrs"])
+    return found

@@ -1,0 +1,127 @@
+"""What a text file can hold, checked: tables, numbers, strings, lists, each against what was expected of it.
+
+Every refusal is a ValueError that names the dotted key, what came, what was expected, and the mend.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from iblf_jax import checks
+
+NONE = "none"
+"""What a file says for a field that is None though its default is something else; TOML has no null."""
+
+
+class Words(str):
+    """Words in place of a value in an error message: "got nothing", not "got 'nothing'"."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def did_you_mean(name: Any, known: Iterable[str]) -> str:
+    """The mend for a misspelt word: the nearest known ones, or all of them."""
+    words = [str(word) for word in known]
+    close = difflib.get_close_matches(str(name), words, n=2, cutoff=0.6)
+    if close:
+        return f"Did you mean {' or '.join(close)}?"
+    return f"There are: {', '.join(words)}." if words else ""
+
+
+def as_table(value: Any, path: str) -> dict[str, Any]:
+    """`value` if it is a table, else a ValueError."""
+    if isinstance(value, dict):
+        return value
+    raise checks.fail(path, value, f"a table, [{path}]")
+
+
+def known_keys(table: dict[str, Any], path: str, known: Iterable[str]) -> None:
+    """Raises ValueError for the first key that is not known."""
+    known = list(known)
+    for key in table:
+        if key not in known:
+            name = f"{path}.{key}" if path else str(key)
+            expected = "one of the keys of this table" if known else "no keys in this table"
+            raise checks.fail(name, Words("an unknown key"), expected, did_you_mean(key, known))
+
+
+def numbers(value: Any, path: str, unit: str = "") -> Any:
+    """A number, or nested lists of numbers, as floats; ValueError for anything else."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            raise checks.fail(path, value, "a number that fits into a float") from None
+    if isinstance(value, list | tuple):
+        return [numbers(entry, f"{path}[{i}]", unit) for i, entry in enumerate(value)]
+    raise checks.fail(path, value, "a number or a list of numbers" + (f" [{unit}]" if unit else ""))
+
+
+def without_none(hint: Any) -> tuple[Any, bool]:
+    """An annotation without its `| None`, and whether it had one.  A union of several others becomes Any."""
+    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
+        return hint, False
+    rest = [option for option in typing.get_args(hint) if option is not type(None)]
+    return rest[0] if len(rest) == 1 else Any, len(rest) < len(typing.get_args(hint))
+
+
+def entry_hint(hint: Any, index: int) -> Any:
+    """The annotation of one entry of a tuple."""
+    if typing.get_origin(hint) is not tuple:
+        return Any
+    entries = typing.get_args(hint)
+    if len(entries) == 2 and entries[1] is Ellipsis:
+        return entries[0]
+    return entries[index] if index < len(entries) else Any
+
+
+def plain_numbers(array: Any) -> Any:
+    """Floats whose decimal form gives the same bits back, in the array's own precision."""
+    array = np.asarray(array)
+    if array.ndim:
+        return [plain_numbers(x) for x in array]
+    short = float(str(array[()])) if array.dtype.itemsize < 8 else float(array)
+    return short if array.dtype.type(short) == array else float(array)
+
+
+def plain_static(value: Any, path: str) -> Any:
+    """A structural value as a file holds it: tuples become lists; ValueError for what a file cannot hold."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, tuple):
+        return [plain_static(x, f"{path}[{i}]") for i, x in enumerate(value)]
+    if isinstance(value, bool | str | int) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    raise checks.fail(path, value, "a finite number, a string, a bool or a tuple of these", "A scenario file cannot hold it.")
+
+
+def decode_static(value: Any, hint: Any, path: str) -> Any:
+    """A structural value of the annotated type: a string, a bool, a number, or a tuple of these."""
+    hint, optional = without_none(hint)
+    if optional and value == NONE:
+        return None
+    if isinstance(value, list):
+        if hint not in (Any, tuple) and typing.get_origin(hint) is not tuple:
+            raise checks.fail(path, value, f"{_WORDS.get(hint, 'one value')}, not a list")
+        return tuple(decode_static(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
+    if hint is tuple or typing.get_origin(hint) is tuple:
+        raise checks.fail(path, value, "a list")
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = numbers(value, path)
+    fits = type(value) is hint if hint in _WORDS else isinstance(value, bool | int | float | str)
+    if not fits or (isinstance(value, float) and not math.isfinite(value)):
+        raise checks.fail(path, value, _WORDS.get(hint, "a finite number, a string or a bool"))
+    return value
+
+
+_WORDS: dict[Any, str] = {str: "a string", int: "a whole number", float: "a finite number", bool: "true or false"}
