@@ -12,7 +12,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, Unsupported
+from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, Unsupported, frontier
 
 INFIX = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
@@ -94,13 +94,6 @@ class _Emitter:
         """The C function of the statements so far."""
         body, self.lines = "\n".join(self.lines), []
         return f"{head} {{\n{body}\n}}\n"
-
-
-def frontier(program: Program, classes: list[int], of: int, used_by) -> list[int]:
-    """The operations and inputs of class `of` that a node of a class accepted by `used_by` reads, and no constants."""
-    found = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
-    found |= {i for i in [*(o for _, o in program.carry), *program.samples] if used_by(LANE | TIME)}
-    return sorted(a for a in found if classes[a] == of and program.nodes[a].op != "const")
 
 
 def _unpacked(node: Node, place: str) -> str:

@@ -15,6 +15,7 @@ Every node has one of four classes, by what it depends on; each is computed as s
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,3 +150,10 @@ def finished(builder: Builder, carry_in: list[int], carry_out: list[int], sample
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
     return Program(builder.dtype, nodes, carry, tuple(place[s] for s in samples), kinds)
+
+
+def frontier(program: Program, classes: list[int], of: int, used_by: Callable[[int], bool]) -> list[int]:
+    """The operations and inputs of class `of` that a node of a class accepted by `used_by` reads, and no constants."""
+    found = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
+    found |= {i for i in [*(o for _, o in program.carry), *program.samples] if used_by(LANE | TIME)}
+    return sorted(a for a in found if classes[a] == of and program.nodes[a].op != "const")
