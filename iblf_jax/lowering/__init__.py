@@ -19,7 +19,7 @@ import jax
 
 from iblf_jax import checks
 from iblf_jax.lowering import batch, native, sensitivities, xla
-from iblf_jax.lowering.program import Unsupported
+from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, run
@@ -69,7 +69,7 @@ def with_fallback(backend: str, run_on: Callable, plain: Callable):
                 backend = "xla"
         if backend == "xla":
             return run_on(xla.run)
-    except Unsupported as reason:
+    except UnsupportedError as reason:
         _tell(f"This scenario runs on plain vmap, several times slower: {reason}.")
     return plain()
 

@@ -99,7 +99,7 @@ def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: 
     """`rollout.run` for every entry of `varied`, by a lowered step.
 
     Raises:
-      Unsupported: the step does not lower.
+      UnsupportedError: the step does not lower.
       ToolchainError: the native backend has no compiler.
     """
     batch = batch_of(executor, scenario, varied, folds, dt)

@@ -12,7 +12,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, Unsupported, frontier
+from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, UnsupportedError, frontier
 
 INFIX = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
@@ -43,7 +43,7 @@ def expression(node: Node, args: list[str], kinds: list[str]) -> str:
     op = node.op
     if op in ("eq", "ne") and kinds[0] == "b":
         return f"{'~' if op == 'eq' else ''}({args[0]} ^ {args[1]})"
-    if op in INFIX and kinds[0] != "b" or op in ("and", "or", "xor"):
+    if (op in INFIX and kinds[0] != "b") or op in ("and", "or", "xor"):
         return f"{args[0]} {INFIX[op]} {args[1]}"
     if op in ("neg", "not"):
         return f"{'-' if op == 'neg' else '~'}{args[0]}"
@@ -55,7 +55,7 @@ def expression(node: Node, args: list[str], kinds: list[str]) -> str:
         return f"i_{op}({args[0]}, {args[1]})"
     if op in CALLS and kinds[0] == "f":
         return f"f_{op}({', '.join(args)})"
-    raise Unsupported(f"the native backend has no {op} of kind {kinds}")
+    raise UnsupportedError(f"the native backend has no {op} of kind {kinds}")
 
 
 def _conversion(source: str, target: str, arg: str) -> str:
@@ -104,7 +104,7 @@ def source(program: Program, shared_leaves: int, lane_leaves: int) -> str:
     """The whole C source of a program's kernel."""
     e = _Emitter(program)
     constants = frontier(program, e.classes, SHARED, lambda c: c != SHARED)
-    columns = frontier(program, e.classes, TIME, lambda c: c & LANE)
+    columns = frontier(program, e.classes, TIME, lambda c: bool(c & LANE))
     floats = [i for i, kind in enumerate(program.kinds) if kind == "f"]
     ints = [i for i, kind in enumerate(program.kinds) if kind != "f"]
     sizes = {
@@ -139,7 +139,9 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
     names |= {i: "index" for i, n in enumerate(nodes) if n.op == "index"}
     e.lines.append("  I index;\n  for (int l = 0; l < W; l++) index[l] = first + l;")
     e.statements(names, columns)
-    e.lines += [f"  for (int l = 0; l < W; l++) table[l * COLUMNS + {k}].{_part(nodes[i])} = ({names[i]})[l];" for k, i in enumerate(columns)]
+    e.lines += [
+        f"  for (int l = 0; l < W; l++) table[l * COLUMNS + {k}].{_part(nodes[i])} = ({names[i]})[l];" for k, i in enumerate(columns)
+    ]
     return e.function("static void shared_signals(const word *constants, integer first, word *table)")
 
 
@@ -153,7 +155,7 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
         e.lines.append(f"  {'F' if kind == 'f' else 'I'} c{c} = {'-' if kind == 'b' else ''}{places[c]};")
         if program.carry[c][0] >= 0:
             names[program.carry[c][0]] = f"c{c}"
-    e.statements(names, [i for i in frontier(program, classes, LANE, lambda k: k == LANE | TIME)])
+    e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
     e.lines.append("  for (int s = 0; s < count; s++, row += COLUMNS) {")
     names |= {i: _unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
     e.statements(names, [o for _, o in program.carry])

@@ -1,7 +1,7 @@
 """A jaxpr taken apart into scalars: every array becomes a NumPy array of node numbers.
 
 So what only moves numbers about (reshape, slice, gather) is done here and now on the node numbers, and what computes becomes one
-node a number.  Nested functions are inlined, short scans unrolled; a primitive that has no rule raises `Unsupported`.
+node a number.  Nested functions are inlined, short scans unrolled; a primitive that has no rule raises `UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jax.extend import core
 import numpy as np
+from jax.extend import core
 
-from iblf_jax.lowering.program import Builder, Unsupported
+from iblf_jax.lowering.program import Builder, UnsupportedError
 
 Ids = np.ndarray
 """An array of node numbers, int64, of the shape of the array that it stands for."""
@@ -26,14 +26,14 @@ INLINED = {
 
 
 def kind_of(dtype) -> str:
-    """ "f", "i" or "b" for an array's type; Unsupported for others."""
+    """The kind "f", "i" or "b" of an array's type; UnsupportedError for others."""
     if np.issubdtype(dtype, np.floating):
         return "f"
     if np.issubdtype(dtype, np.signedinteger):
         return "i"
     if dtype == np.bool_:
         return "b"
-    raise Unsupported(f"arrays of type {dtype} are not lowered")
+    raise UnsupportedError(f"arrays of type {dtype} are not lowered")
 
 
 def constants(b: Builder, array) -> Ids:
@@ -66,10 +66,10 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
             out = RULES[name](b, eqn, *operands)
             results = list(out) if isinstance(out, (list, tuple)) else [out]
         else:
-            raise Unsupported(f"the primitive {name!r} is not lowered")
+            raise UnsupportedError(f"the primitive {name!r} is not lowered")
         for v, ids in zip(eqn.outvars, results, strict=True):
             if ids.shape != v.aval.shape:
-                raise Unsupported(f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}")
+                raise UnsupportedError(f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}")
             known[v] = ids
     return [read(v) for v in jaxpr.outvars]
 
@@ -77,7 +77,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
 def _check_float(b: Builder, dtype, eqn) -> None:
     """Refuses floats of another type than the program's (constants, which are rounded once, aside)."""
     if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
-        raise Unsupported(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
+        raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
 
 
 def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
@@ -91,7 +91,7 @@ def _scan(b: Builder, eqn, operands):
     params = eqn.params
     length, n_const, n_carry = params["length"], params["num_consts"], params["num_carry"]
     if length > LONGEST_SCAN:
-        raise Unsupported(f"an inner loop of {length} steps is too long to unroll (at most {LONGEST_SCAN})")
+        raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {LONGEST_SCAN})")
     const, carry, xs = operands[:n_const], operands[n_const : n_const + n_carry], operands[n_const + n_carry :]
     stacked: list[list[Ids]] = []
     for i in reversed(range(length)) if params["reverse"] else range(length):
@@ -115,16 +115,14 @@ def _cond(b: Builder, eqn, operands):
         return closed(b, branches[min(max(int(value), 0), len(branches) - 1)], rest)
     results = closed(b, branches[-1], rest)
     for i in reversed(range(len(branches) - 1)):
-        if b.nodes[which].kind == "b":
-            condition = b.emit("not", which, kind="b")
-        else:
-            condition = b.emit("le", which, b.constant(i, "i"), kind="b")
+        is_flag = b.nodes[which].kind == "b"
+        condition = b.emit("not", which, kind="b") if is_flag else b.emit("le", which, b.constant(i, "i"), kind="b")
         results = [choose(b, condition, yes, no) for yes, no in zip(closed(b, branches[i], rest), results, strict=True)]
     return results
 
 
 def _while(b: Builder, eqn, operands):
-    raise Unsupported("a while loop inside a step has no fixed length")
+    raise UnsupportedError("a while loop inside a step has no fixed length")
 
 
 def choose(b: Builder, condition: int, yes: Ids, no: Ids) -> Ids:

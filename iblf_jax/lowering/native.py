@@ -6,7 +6,6 @@ cache finds the same kernel in another process.
 
 from __future__ import annotations
 
-import os
 from functools import lru_cache
 
 import jax
@@ -16,17 +15,9 @@ import numpy as np
 from iblf_jax.lowering.emit_c import source
 from iblf_jax.lowering.program import Program
 from iblf_jax.lowering.step import Packed
-from iblf_jax.lowering.toolchain import built, loaded
+from iblf_jax.lowering.toolchain import built, loaded, threads
 
 _registered: set[str] = set()
-
-
-def threads() -> int:
-    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the processors that this process may run on."""
-    wanted = os.environ.get("IBLF_JAX_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
-        return int(wanted)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @lru_cache(maxsize=64)
@@ -40,7 +31,7 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
 
     Raises:
       ToolchainError: no compiler, or an error from it.
-      Unsupported: an operation that C has no word for.
+      UnsupportedError: an operation that C has no word for.
     """
     library, key = built(source(program, shared, lane), ("-DVECTOR_BYTES=16",) if narrow else ())
     name = f"iblf_jax_{key}"
@@ -74,7 +65,5 @@ def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, ste
         jax.ShapeDtypeStruct((rows, len(program.samples) * runs), carry.floats.dtype),
     )
     settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
-    floats, ints, samples = jax.ffi.ffi_call(name, outputs)(
-        shared.reshape(1, -1), lane, carry.floats, carry.ints, jnp.asarray(settings)
-    )
+    floats, ints, samples = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, carry.floats, carry.ints, jnp.asarray(settings))
     return Packed(floats, ints), samples.reshape(rows, len(program.samples), runs)

@@ -27,7 +27,7 @@ INPUTS = ("shared", "lane", "carry", "index")
 """Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step to step, number of the step."""
 
 
-class Unsupported(Exception):
+class UnsupportedError(Exception):
     """What a scalar program cannot express; the message is one line for the user."""
 
 
@@ -50,7 +50,7 @@ class Builder:
 
     def constant(self, value, kind: str) -> int:
         """The node of a constant."""
-        value = {"f": lambda v: float(self.dtype.type(v)), "i": int, "b": bool}[kind](value)
+        value = float(self.dtype.type(value)) if kind == "f" else int(value) if kind == "i" else bool(value)
         return self._add(Node("const", (), kind, value), value.hex() if kind == "f" else value)
 
     def input(self, op: str, index: int, kind: str) -> int:

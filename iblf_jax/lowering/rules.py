@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
 from iblf_jax.lowering.from_jaxpr import Ids, kind_of
-from iblf_jax.lowering.program import Builder, Unsupported
+from iblf_jax.lowering.program import Builder, UnsupportedError
 from iblf_jax.lowering.structure import STRUCTURE
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
@@ -88,7 +87,7 @@ def _convert(b: Builder, eqn, x: Ids) -> Ids:
 
 def _round(b: Builder, eqn, x: Ids) -> Ids:
     if int(eqn.params["rounding_method"]) != 1:
-        raise Unsupported("rounding half away from zero is not lowered; use jnp.round")
+        raise UnsupportedError("rounding half away from zero is not lowered; use jnp.round")
     return each(b, "round_even", eqn, x)
 
 
@@ -193,5 +192,3 @@ RULES: dict[str, Callable] = {
     "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"), "cummin": _cumulative("min"),
     "dot_general": _dot_general,
 }  # fmt: skip
-
-__all__ = ["RULES", "each", "partial", "power"]

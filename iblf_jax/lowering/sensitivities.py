@@ -32,7 +32,7 @@ class Directions(NamedTuple):
         return Directions(tuple((path, x.shape, tuple(x.ravel().tolist())) for path, x in arrays.items()))
 
     @property
-    def count(self) -> int:
+    def tangents(self) -> int:
         """P."""
         return self.items[0][1][0]
 
@@ -86,7 +86,7 @@ def pushed(function: Callable, directions: Directions, scenario, before: Differe
         value, tangent, rest = jax.jvp(of, (jnp.zeros_like(unit), floats), (unit, tangents), has_aux=True)
         return value, tangent, rest
 
-    units = np.eye(directions.count, dtype=dtype)
+    units = np.eye(directions.tangents, dtype=dtype)
     return jax.vmap(along, out_axes=(None, 0, None))(units, before.tangents if before else [])
 
 
@@ -151,9 +151,9 @@ def plain_jvp(scenario, varied, directions: Directions, folds, dt, *, steps: int
             outcome = rollout.run(moved, folds, dt, steps=steps, record_every=None, method=method)
             return _floats_of(outcome.metrics), outcome
 
-        zero = jnp.zeros((directions.count,), dt.dtype)
+        zero = jnp.zeros((directions.tangents,), dt.dtype)
         along = jax.vmap(lambda unit: jax.jvp(metrics, (zero,), (unit,), has_aux=True), out_axes=(None, 0, None))
-        _, tangents, outcome = along(np.eye(directions.count, dtype=dt.dtype))
+        _, tangents, outcome = along(np.eye(directions.tangents, dtype=dt.dtype))
         return outcome, tangents
 
     return jax.vmap(one)(dict(varied))

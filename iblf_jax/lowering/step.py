@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.lowering.from_jaxpr import closed, constants, kind_of
+from iblf_jax.lowering.from_jaxpr import closed, kind_of
 from iblf_jax.lowering.passes import with_reciprocals
-from iblf_jax.lowering.program import Builder, Program, Unsupported, finished
+from iblf_jax.lowering.program import Builder, Program, UnsupportedError, finished
 from iblf_jax.paths import with_parameters
 
 
@@ -83,7 +83,7 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
     """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, samples)`.
 
     Raises:
-      Unsupported: the step holds something that a scalar program cannot express.
+      UnsupportedError: the step holds something that a scalar program cannot express.
     """
     index = jax.ShapeDtypeStruct((), jnp.int32)
     jaxpr, shapes = jax.make_jaxpr(step, return_shape=True)(shared.structs(), lane.structs(), carry.structs(), index)
@@ -104,15 +104,15 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
     carry_out = [int(i) for ids in out[:n_carry] for i in ids.ravel()]
     samples = [_as_float(b, int(i)) for ids in out[n_carry:] for i in ids.ravel()]
     if Shapes.of(shapes[0]).kinds() != carry.kinds():
-        raise Unsupported("the step changes the types of what it carries")
+        raise UnsupportedError("the step changes the types of what it carries")
     return with_reciprocals(finished(b, read, carry_out, samples))
 
 
 def _accepted(kind: str, array_dtype, op: str, dtype) -> str:
     if kind == "f" and array_dtype != dtype:
-        raise Unsupported(f"it mixes {array_dtype} with {dtype}")
+        raise UnsupportedError(f"it mixes {array_dtype} with {dtype}")
     if op != "carry" and kind != "f":
-        raise Unsupported(f"a leaf of type {array_dtype}")
+        raise UnsupportedError(f"a leaf of type {array_dtype}")
     return kind
 
 
@@ -151,6 +151,3 @@ def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
         rows = (packed.floats if group == "f" else packed.ints)[start : start + size]
         result.append(rows.T.reshape(runs, *shape).astype(dtype))
     return result
-
-
-__all__ = ["Leaves", "Packed", "Shapes", "constants", "lowered", "pack", "split", "unpack"]

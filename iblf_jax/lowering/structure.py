@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from iblf_jax.lowering.from_jaxpr import Ids, choose, constants
-from iblf_jax.lowering.program import Builder, Unsupported
+from iblf_jax.lowering.program import Builder, UnsupportedError
 
 MOST_CHOICES = 64
 """Entries among which an index of the run may choose."""
@@ -88,7 +88,7 @@ def _chosen(b: Builder, index: Ids, size: int, at: Callable) -> Ids:
     if not open_nodes:
         return at(np.asarray([b.value(i) for i in flat], np.int32).reshape(index.shape))
     if len(open_nodes) > 1 or size > MOST_CHOICES:
-        raise Unsupported(f"an index that only the run knows chooses among too many entries ({len(open_nodes)} indices of {size})")
+        raise UnsupportedError(f"an index that only the run knows chooses among too many entries ({len(open_nodes)} indices of {size})")
     (node,) = open_nodes
 
     def with_value(v: int) -> Ids:
@@ -133,17 +133,17 @@ def _scatter(op: str | None) -> Callable:
     def rule(b: Builder, eqn, x: Ids, index: Ids, new: Ids) -> Ids:
         values = [b.value(i) for i in index.ravel().tolist()]
         if any(v is None for v in values):
-            raise Unsupported(f"{eqn.primitive.name} at an index that only the run knows")
+            raise UnsupportedError(f"{eqn.primitive.name} at an index that only the run knows")
         places = np.asarray(values, np.int32).reshape(index.shape)
         with jax.ensure_compile_time_eval():
             numbers = jax.numpy.arange(new.size, dtype=np.int32).reshape(new.shape)
             params = {k: eqn.params[k] for k in eqn.params if k not in ("update_jaxpr", "update_consts")}
             landed = jax.lax.scatter(jax.numpy.full(x.shape, -1, np.int32), places, numbers, **params)
-        landed = np.asarray(landed)
-        if np.sum(landed >= 0) != new.size:
-            raise Unsupported(f"{eqn.primitive.name} with repeated or outlying places")
+        source = np.asarray(landed)
+        if np.sum(source >= 0) != new.size:
+            raise UnsupportedError(f"{eqn.primitive.name} with repeated or outlying places")
         result, flat = x.copy().ravel(), new.ravel()
-        for place, which in enumerate(landed.ravel().tolist()):
+        for place, which in enumerate(source.ravel().tolist()):
             if which >= 0:
                 old, update = int(result[place]), int(flat[which])
                 result[place] = update if op is None else b.emit(op, old, update, kind=b.nodes[old].kind)

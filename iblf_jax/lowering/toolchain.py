@@ -68,7 +68,7 @@ def _run(command: list[str]) -> str:
 
 
 def cache_directory() -> Path:
-    """Where kernels are kept: $XDG_CACHE_HOME/iblf_jax, mode 0700; ToolchainError if it belongs to someone else or others may write there."""
+    """Where kernels are kept: $XDG_CACHE_HOME/iblf_jax, mode 0700; ToolchainError if it cannot be made or is not this user's."""
     base = os.environ.get("XDG_CACHE_HOME")
     path = (Path(base) if base else Path.home() / ".cache") / "iblf_jax"
     try:
@@ -116,3 +116,11 @@ def loaded(library: Path) -> ctypes.CDLL:
         return ctypes.CDLL(str(library))
     except OSError as error:
         raise ToolchainError(f"a kernel does not load: {error}") from None
+
+
+def threads() -> int:
+    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the processors that this process may run on."""
+    wanted = os.environ.get("IBLF_JAX_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

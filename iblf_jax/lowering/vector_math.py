@@ -41,7 +41,7 @@ def _polynomial(z, coefficients):
 
 
 def _parts(x: jax.Array):
-    """sin and cos of x - k pi/2, and the quadrant k."""
+    """Sin and cos of x - k pi/2, and the quadrant k."""
     dtype = np.dtype(x.dtype)
     k = jnp.round(x * (2 / np.pi))
     r = x
@@ -58,12 +58,12 @@ def _quadrant(s, c, k):
 
 
 def sin(x: jax.Array) -> jax.Array:
-    """sin x."""
+    """Sin x."""
     s, c, k = _parts(x)
     return _quadrant(s, c, k)
 
 
 def cos(x: jax.Array) -> jax.Array:
-    """cos x."""
+    """Cos x."""
     s, c, k = _parts(x)
     return _quadrant(s, c, k + 1)

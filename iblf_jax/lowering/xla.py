@@ -5,22 +5,30 @@ What time decides is tabulated for a stretch of steps at once.  Needs nothing bu
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.scipy import special
 
 from iblf_jax.lowering import vector_math
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, frontier
 from iblf_jax.lowering.step import Packed
+from iblf_jax.lowering.toolchain import threads
 
-STRETCH = 1024
-"""Steps whose signals are tabulated at once."""
+BLOCK = 1024
+"""Runs that go through all steps together on CPU."""
+MOST_STREAMS = 8
+SEGMENT = 200
+"""Operations that XLA may fuse with one another on CPU: it computes shared values again for every result of a step, and without a border
+does twice the work."""
+STRETCH = 8192
+"""Steps whose signals are tabulated at once, at most."""
 
-FUNCTIONS = {
+FUNCTIONS: dict[str, Callable] = {
     "add": jnp.add, "sub": jnp.subtract, "mul": jnp.multiply, "neg": jnp.negative, "abs": jnp.abs, "max": jnp.maximum, "min": jnp.minimum,
     "sqrt": jnp.sqrt, "rsqrt": jax.lax.rsqrt, "cbrt": jnp.cbrt, "sign": jnp.sign, "floor": jnp.floor, "ceil": jnp.ceil,
     "round_even": jnp.round, "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin, "acos": jnp.arccos, "atan": jnp.arctan,
@@ -38,7 +46,9 @@ class Evaluator:
     """Evaluates nodes of a program on arrays; `known` maps a node to its array."""
 
     def __init__(self, program: Program, vectors: bool) -> None:
+        """`vectors`: for arrays of runs, which are many, rather than of times."""
         self.program = program
+        self.segment = SEGMENT if vectors and jax.default_backend() == "cpu" else 0
         self.functions = FUNCTIONS | (ON_CPU if vectors and jax.default_backend() == "cpu" else {})
         self.types = {"f": program.dtype, "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
 
@@ -50,8 +60,27 @@ class Evaluator:
             if i not in known and i not in needed:
                 needed.add(i)
                 stack.extend(nodes[i].args)
-        for i in sorted(needed):
-            known[i] = self._value(nodes[i], [known[a] for a in nodes[i].args])
+        order = sorted(needed)
+        size = self.segment or len(order)
+        last_use = {a: i for i in order for a in nodes[i].args} | dict.fromkeys(wanted, len(nodes))
+        for start in range(0, len(order), max(size, 1)):
+            self._segment(known, order[start : start + size], last_use)
+
+    def _segment(self, known: dict[int, Any], order: list[int], last_use: dict[int, int]) -> None:
+        """Adds the nodes of `order` to `known`; on CPU as a function of its own, whose results are stored once."""
+        nodes = self.program.nodes
+        outputs = [i for i in order if last_use.get(i, -1) > order[-1] and nodes[i].op != "const"]
+        inputs = sorted({a for i in order for a in nodes[i].args} - set(order))
+
+        def body(*values):
+            local = dict(zip(inputs, values, strict=True))
+            for i in order:
+                local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
+            return [local[i] for i in outputs]
+
+        call = as_function(body) if self.segment else body
+        known |= {i: self._value(nodes[i], []) for i in order if nodes[i].op == "const"}
+        known |= zip(outputs, call(*(known[i] for i in inputs)), strict=True)
 
     def _value(self, node: Node, args: list[Any]) -> Any:
         if node.op == "const":
@@ -64,7 +93,44 @@ class Evaluator:
 
 
 def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
-    """All steps of all runs; arguments and results as `native.run`."""
+    """All steps of all runs; arguments and results as `native.run`.
+
+    On CPU a block of runs goes through all steps before the next one, so that its numbers stay in the cache, and several streams of
+    blocks go side by side, one a core.  The last blocks repeat the last run.
+    """
+    runs = carry.floats.shape[1]
+    if runs <= BLOCK or jax.default_backend() != "cpu":
+        return _block(program, shared, lane, carry, steps, every)
+    streams = min(threads(), MOST_STREAMS, -(-runs // BLOCK))
+    blocks = -(-runs // (BLOCK * streams))
+
+    def apart(rows):
+        padded = jnp.pad(rows, ((0, 0), (0, streams * blocks * BLOCK - runs)), mode="edge")
+        return jnp.moveaxis(padded.reshape(-1, streams, blocks, BLOCK), 0, 2)
+
+    def together(*streams):
+        rows = jnp.concatenate(streams)
+        return jnp.moveaxis(rows, 0, -2).reshape(*rows.shape[1:-1], -1)[..., :runs]
+
+    def one(part):
+        return _block(program, shared, part[0], part[1], steps, every)
+
+    stream = as_function(lambda parts: jax.lax.map(one, parts))
+    parts = jax.tree.map(apart, (lane, carry))
+    return jax.tree.map(together, *(stream(entry(parts, i)) for i in range(streams)))
+
+
+def entry(parts: Any, i: int) -> Any:
+    """Entry i of every array."""
+    return jax.tree.map(lambda x: x[i], parts)
+
+
+def as_function(f):
+    """`f` as a function that XLA does not inline: fusion stops at its border, and two of them may run side by side."""
+    return set_xla_metadata(inlineable="false")(jax.jit(f))
+
+
+def _block(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
     classes = program.classes()
     runs = carry.floats.shape[1]
     once = {i: shared[n.value] for i, n in enumerate(program.nodes) if n.op == "shared"}
@@ -99,11 +165,14 @@ def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, ste
 
 
 def _stretches(stretch, state, steps: int):
-    whole, rest = divmod(steps, STRETCH)
+    """The state after all steps, in stretches of one length where a length divides the number of steps, so as to compile one."""
+    length = max((d for d in range(1, min(steps, STRETCH) + 1) if steps % d == 0), default=1)
+    length = length if length >= STRETCH // 16 else min(steps, STRETCH)
+    whole, rest = divmod(steps, max(length, 1))
     if whole:
-        starts = STRETCH * jnp.arange(whole, dtype=jnp.int32)
-        state, _ = jax.lax.scan(lambda s, first: (stretch(s, first, STRETCH), None), state, starts)
-    return stretch(state, jnp.int32(whole * STRETCH), rest) if rest else state
+        starts = length * jnp.arange(whole, dtype=jnp.int32)
+        state, _ = jax.lax.scan(lambda s, first: (stretch(s, first, length), None), state, starts)
+    return stretch(state, jnp.int32(whole * length), rest) if rest else state
 
 
 def _sampled(program, once, columns, step, state, steps: int, every: int):
