@@ -31,7 +31,7 @@ def fail(field: str, got: Any, expected: str, mend: str = "") -> ValueError:
     elif isinstance(got, jax.Array | np.ndarray):
         shown = np.array2string(np.asarray(got), precision=6, threshold=8)
     else:
-        shown = repr(got)
+        shown = repr(got.item() if isinstance(got, np.generic) else got)
     if len(shown) > 160:
         shown = shown[:157] + "..."
     return ValueError(f"{field}: got {shown}, expected {expected}." + (f" {mend}" if mend else ""))

@@ -16,11 +16,12 @@ from iblf_jax.lowering import batch, native, program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.identities import FUNCTIONS
 from iblf_jax.lowering.step import Shapes, pack
-from iblf_jax.metrics import STANDARD
+from iblf_jax.metrics import standard
 from iblf_jax.scenario import canonical
 
 PRESET = ij.presets.zhang_yan_2024()
 DT = 1e-3
+STANDARD = standard()
 SPECIAL = {
     "planar_chain": lambda cls: cls(mass=[2.0, 0.85], length=[0.35, 0.31], centre=0.16, inertia=0.03),
     "waypoint_spline": lambda cls: cls(times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]),

@@ -21,6 +21,7 @@ from iblf_jax import checks
 from iblf_jax.lowering import batch, native, sensitivities, xla
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.one_function import as_one_function
 from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
@@ -110,7 +111,7 @@ def run_batch(
     def run_on(executor):
         return batch.run(executor, scenario, varied, folds, dt, steps=steps, method=method, record_every=record_every)
 
-    return with_fallback(backend, run_on, lambda: jax.vmap(one)(dict(varied)))
+    return with_fallback(backend, run_on, lambda: as_one_function(jax.vmap(one))(dict(varied)))
 
 
 def run_batch_jvp(

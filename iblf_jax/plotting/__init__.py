@@ -1,0 +1,20 @@
+"""Figures and animations of runs: the one place of the package that imports matplotlib.
+
+    run.plot()                                                      one run at a glance (`overview`)
+    figures = plotting.paper_figures({"iBLF": run, "log-BLF": other})
+    plotting.save(figures, "figures")                               PNG and PDF
+    plotting.animate(run, "arm.gif")                                or "arm.html"
+
+Every function takes one run or a dict of runs by name (`overview`: one run) and returns a matplotlib Figure, which a notebook
+shows when it is the value of a cell.  Runs may differ in length; of a batch, select a run first.
+"""
+
+from iblf_jax.plotting._figures import joint as joint
+from iblf_jax.plotting._figures import paper_figures as paper_figures
+from iblf_jax.plotting._figures import phase_portrait as phase_portrait
+from iblf_jax.plotting._figures import save as save
+from iblf_jax.plotting._figures import torques as torques
+from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
+from iblf_jax.plotting._figures import velocity_errors as velocity_errors
+from iblf_jax.plotting._overview import overview as overview
+from iblf_jax.plotting.animation import animate as animate

@@ -1,0 +1,173 @@
+"""What a figure draws: the runs that were given, on the host, checked, cut where they broke and thinned for drawing.
+
+A run whose state ran away was frozen there by the simulator; it is drawn up to that sample.  Lines are thinned so that no peak is
+lost: every piece of the time axis keeps its first, lowest and highest sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.results import Rollout
+from iblf_jax.status import FAILED, Status, describe
+
+POINTS = 2400
+"""About as many points as a line of a figure can show."""
+
+DERIVED = {
+    "error_lower": lambda run: np.asarray(run.lower) - np.asarray(run.q_d),
+    "error_upper": lambda run: np.asarray(run.upper) - np.asarray(run.q_d),
+    "wall_lower": lambda run: -np.ones(run.q.shape),
+    "wall_upper": lambda run: np.ones(run.q.shape),
+    "estimate_error": lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate),
+}
+"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, and f - f_hat."""
+
+GIVEN = {"t", "q_d", "dq_d", "lower", "upper", "error_lower", "error_upper", "wall_lower", "wall_upper"}
+"""Signals that do not depend on the state, and are drawn to the end whatever became of it."""
+
+SAME = 0.03
+"""Signals that differ by less than this part of their range are drawn once for all runs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One run as figures see it: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run was frozen before its end."""
+
+    name: str
+    """What the caller called it; empty for a run that came alone."""
+    run: Rollout
+    samples: int
+    """How many samples are worth drawing."""
+
+    def __getitem__(self, field: str) -> np.ndarray:
+        values = DERIVED[field](self.run) if field in DERIVED else np.asarray(getattr(self.run, field))
+        return values if field in GIVEN else values[: self.samples]
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time, (T,) [s]."""
+        return self["t"]
+
+    def at(self, field: str, t: np.ndarray) -> np.ndarray:
+        """A signal at other times t [s], linearly between its samples and constant after its end, (len(t), n)."""
+        values = self[field]
+        return np.stack([np.interp(t, self.t[: len(values)], column) for column in values.T], axis=-1)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the run has no flag."""
+        return self.run.ok
+
+    @property
+    def failed(self) -> bool:
+        """Whether the run did not do its job."""
+        return bool(int(self.run.status) & FAILED)
+
+    @property
+    def status(self) -> str:
+        """The run's flags in words."""
+        return describe(int(self.run.status))
+
+    def break_index(self) -> int | None:
+        """The first sample at which the run was outside its bounds, or its last one if it ran away; None if neither."""
+        lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
+        inside = (lower < self["q"]) & (self["q"] < upper)
+        outside = np.flatnonzero(~inside.all(axis=1))
+        if outside.size:
+            return int(outside[0])
+        return self.samples - 1 if int(self.run.status) & Status.NOT_FINITE else None
+
+
+def _sound_samples(run: Rollout) -> int:
+    """How many samples there are until the state was frozen: all, unless the run ran away."""
+    q, dq = np.asarray(run.q), np.asarray(run.dq)
+    if not int(run.status) & Status.NOT_FINITE or len(q) < 2:
+        return len(q)
+    moved = np.any((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0), axis=1)
+    finite = np.isfinite(q).all(axis=1)
+    last = np.flatnonzero(moved & finite[1:])
+    return int(last[-1]) + 2 if last.size else len(q)
+
+
+def _checked(name: str, run: Any) -> Curve:
+    called = f"runs[{name!r}]" if name else "run"
+    if not isinstance(run, Rollout):
+        raise checks.fail(called, type(run).__name__, "a Rollout", "Draw what ij.simulate returns, or a dict of such runs.")
+    if not checks.is_concrete(run):
+        raise checks.fail(called, "a run that is being traced", "one with numbers", "Draw outside of jit, vmap and grad.")
+    if run.is_batch:
+        raise checks.fail(called, f"a batch of {len(run)} runs", "one run", "Select a run: run[0].")
+    return Curve(name, run, _sound_samples(run))
+
+
+def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
+    """The runs to draw, in the order given.
+
+    Args:
+      runs: one run, or a dict of such runs by name; they may differ in length and in what they recorded.
+
+    Raises:
+      ValueError: nothing to draw, a batch, something that is no Rollout, or runs of robots with different numbers of joints.
+    """
+    if not isinstance(runs, Mapping):
+        return [_checked("", runs)]
+    if not runs:
+        raise checks.fail("runs", runs, "at least one run")
+    curves = [_checked(str(name), run) for name, run in runs.items()]
+    joints = {curve.name: curve.run.n for curve in curves}
+    if len(set(joints.values())) > 1:
+        raise checks.fail("runs", joints, "runs with one number of joints", "Draw the robots one by one.")
+    return curves
+
+
+def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> int:
+    """`joint` if the robot has it; ValueError if not."""
+    n = curves[0].run.n
+    if isinstance(joint, bool) or not isinstance(joint, int | np.integer) or not 0 <= joint < n:
+        raise checks.fail(field, joint, f"a joint, 0 to {n - 1}")
+    return int(joint)
+
+
+def distinct(curves: Sequence[Curve], fields: Sequence[str], joints: Sequence[int]) -> list[Curve]:
+    """The curves that can be told apart in these fields on the time they share, longest first; one, if all follow one reference."""
+    kept: list[Curve] = []
+    for curve in sorted(curves, key=lambda c: -float(c.t[-1])):
+        if all(_differ(curve, other, fields, joints) for other in kept):
+            kept.append(curve)
+    return kept
+
+
+def _differ(a: Curve, b: Curve, fields: Sequence[str], joints: Sequence[int]) -> bool:
+    t = np.linspace(0.0, min(a.t[-1], b.t[-1]), 400)
+    for field in fields:
+        for joint in joints:
+            one, two = (c.at(field, t)[:, joint] for c in (a, b))
+            if not np.allclose(one, two, rtol=0.0, atol=SAME * np.ptp(one) + 1e-9, equal_nan=True):
+                return True
+    return False
+
+
+def thinned(t: np.ndarray, y: np.ndarray, points: int = POINTS) -> tuple[np.ndarray, np.ndarray]:
+    """At most about `points` of the samples (t, y), with every peak among them.
+
+    Args:
+      t: time, (T,) [s].
+      y: signal, (T,).
+      points: how many to keep.
+    """
+    if len(t) <= points:
+        return t, y
+    width = int(np.ceil(3 * len(t) / points))
+    whole = len(t) // width * width
+    pieces = np.nan_to_num(y[:whole], posinf=np.inf, neginf=-np.inf).reshape(-1, width)
+    starts = np.arange(0, whole, width)
+    rest = np.append(np.arange(whole, len(t)), len(t) - 1)
+    picked = np.concatenate([starts, starts + pieces.argmin(axis=1), starts + pieces.argmax(axis=1), rest])
+    index = np.unique(picked)
+    return t[index], y[index]

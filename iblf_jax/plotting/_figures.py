@@ -1,0 +1,258 @@
+"""The six figures of the paper, on any run or any dict of runs by name, for any number of joints.
+
+Every figure against time is a table of panels, one a row, with the start of the run magnified in a column beside it: an
+inset of its own that covers no curve.  Source: Zhang & Yan 2024, figures 1 to 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from iblf_jax import checks
+from iblf_jax.plotting import _style
+from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct
+from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, show, transient_end
+from iblf_jax.results import Rollout
+
+Runs = Rollout | Mapping[str, Rollout]
+
+ZOOM_SHARE = 0.1
+"""The part of the time that the zoom shows if the caller does not say and the runs have no transient."""
+
+
+class Row(NamedTuple):
+    """One row of a figure: a quantity of a joint, and the label of its axis."""
+
+    quantity: Quantity
+    joint: int
+    label: str
+
+
+def _windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) -> tuple[Window, Window]:
+    """The whole time and the zoom's, by default two and a half transients in a round number; ValueError if the zoom is no time."""
+    end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves) or 1e-3
+    if zoom is None:
+        wanted = 2.5 * max(transient_end(curves, row.quantity, row.joint) for row in rows)
+        zoom = float(f"{max(wanted, 0.01 * end):.0e}") if wanted else ZOOM_SHARE * end
+    if isinstance(zoom, bool) or not isinstance(zoom, int | float | np.number) or not np.isfinite(zoom) or zoom <= 0:
+        raise checks.fail("zoom", zoom, "a time > 0 [s]")
+    return (0.0, end), (0.0, min(float(zoom), end))
+
+
+@_style.styled()
+def _rows_with_zoom(title: str, curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None, height: float) -> Figure:
+    """A figure of rows against time, with the start magnified in a second column."""
+    whole, start = _windows(curves, rows, zoom)
+    figure = _style.new_figure(_style.WIDTH, 1.0 + height * len(rows))
+    table = figure.subplots(len(rows), 2, sharex="col", squeeze=False, width_ratios=(2.1, 1))
+    for (main, inset), row in zip(table, rows, strict=True):
+        show(main, curves, row.quantity, row.joint, whole)
+        show(inset, curves, row.quantity, row.joint, start, tight=True)
+        main.set_ylabel(row.label)
+        _outline(main, inset)
+    for axes in table[-1]:
+        axes.set_xlabel(_style.label("time $t$", "s"))
+    table[0, 1].set_title(f"the first {start[1]:.3g} s, magnified")
+    figure.align_ylabels(table[:, 0])
+    _style.entitle(figure, title, curves)
+    _style.legend_below(figure)
+    return figure
+
+
+def _outline(main: Axes, inset: Axes) -> None:
+    """A box in the main panel around what the inset shows."""
+    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    floor, ceiling = main.get_ylim()
+    low, high = max(low, floor), min(high, ceiling)
+    main.indicate_inset((left, low, right - left, high - low), edgecolor="#555555", alpha=1.0, linewidth=0.7)
+    inset.spines[["top", "right"]].set_visible(True)
+    for spine in inset.spines.values():
+        spine.set_color("#555555")
+
+
+def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figure:
+    """A figure with one row a joint."""
+    curves = curves_of(runs)
+    n, quantity = curves[0].run.n, QUANTITIES[field]
+    rows = [Row(quantity, joint, f"joint {joint}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
+    return _rows_with_zoom(title, curves, rows, zoom, 1.75 if n <= 3 else 1.25)
+
+
+def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
+    """Position of one joint in its tube, and its error e1 between -k_l and k_u: the paper's figures 1 and 2.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      joint: which joint, from 0.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure; a notebook shows it, `save` or its `savefig` writes it.
+
+    Raises:
+      ValueError: no run, a batch, no such joint, or a zoom that is no time.
+    """
+    curves = curves_of(runs)
+    joint = check_joint(curves, joint)
+    rows = [Row(quantity, joint, quantity.label) for quantity in (QUANTITIES["q"], QUANTITIES["e1"])]
+    return _rows_with_zoom(f"Position and tracking error of joint {joint}", curves, rows, zoom, 2.1)
+
+
+def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Velocity error e2 = q' - alpha [rad/s] of every joint: the paper's figure 3.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: no run, a batch, or a zoom that is no time.
+    """
+    return _every_joint("Velocity error", runs, "e2", zoom)
+
+
+def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """The uncertain term f [N m] of every joint and its estimate f_hat: the paper's figure 4.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: no run, a batch, or a zoom that is no time.
+    """
+    return _every_joint(r"Uncertain term $f$ and its estimate $\hat f$", runs, "disturbance_estimate", zoom)
+
+
+def torques(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Torque [N m] of every joint: the paper's figure 5.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: no run, a batch, or a zoom that is no time.
+    """
+    return _every_joint("Torque", runs, "tau", zoom)
+
+
+def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, int]) -> None:
+    """Draws one joint's position against another's, with reference and starts; limits follow the reference and sound runs."""
+    frame = []
+    for i, curve in enumerate(distinct(curves, ["q_d"], joints)):
+        path = curve["q_d"][:, joints]
+        own = {"color": _style.series(curves.index(curve))["color"], "alpha": 0.6} if i else {}
+        axes.plot(*path.T, **(_style.REFERENCE | {"zorder": 3, "label": "reference $q_d$"} | own))
+        frame.append(path)
+    starts = np.stack([curve["q"][0, joints] for curve in curves])
+    axes.plot(*starts.T, marker="o", color="black", markerfacecolor="white", markersize=6, linestyle="none", zorder=4, label="start")
+    for i, curve in enumerate(curves):
+        path = curve["q"][:, joints]
+        look = _style.series(i) | (_style.FAINT if curve.failed and len(curves) > 1 else {})
+        axes.plot(*path[:: max(1, len(path) // POINTS)].T, label=curve.name or "$q$", **look)
+        frame.append(path[:1] if curve.failed else path)
+    points = np.concatenate(frame)
+    points = points[np.isfinite(points).all(axis=1)] if np.isfinite(points).any() else np.zeros((1, 2))
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 0.55 * max(float(np.max(high - low)), 1e-3)
+    middle = 0.5 * (low + high)
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+    axes.set_aspect("equal")
+    axes.set_xlabel(_style.label(f"position of joint {joints[0]}", "rad"))
+    axes.set_ylabel(_style.label(f"position of joint {joints[1]}", "rad"))
+
+
+@_style.styled()
+def phase_portrait(runs: Runs, joints: tuple[int, int] = (0, 1)) -> Figure:
+    """Position of one joint against another's, with the reference: the paper's figure 6.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      joints: which two joints, from 0.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: no run, a batch, or not two joints that the robot has.
+    """
+    curves = curves_of(runs)
+    if not isinstance(joints, tuple | list) or len(joints) != 2 or joints[0] == joints[1]:
+        raise checks.fail("joints", joints, "two different joints, such as (0, 1)")
+    pair = (check_joint(curves, joints[0], "joints"), check_joint(curves, joints[1], "joints"))
+    figure = _style.new_figure(4.6, 4.9)
+    draw_phase_portrait(figure.subplots(), curves, pair)
+    _style.entitle(figure, "Phase portrait of the positions", curves)
+    _style.legend_below(figure, 4)
+    return figure
+
+
+def paper_figures(runs: Runs, *, zoom: float | None = None) -> dict[str, Figure]:
+    """The figures of the paper by name, "figure_1" to "figure_6", for runs of two joints or more.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; each figure's transient if not given.
+
+    Returns:
+      The figures, ready for `save`.
+
+    Raises:
+      ValueError: no run, a batch, or a robot of one joint, which has no phase portrait.
+    """
+    return {
+        "figure_1": joint(runs, 0, zoom=zoom),
+        "figure_2": joint(runs, 1, zoom=zoom),
+        "figure_3": velocity_errors(runs, zoom=zoom),
+        "figure_4": uncertain_terms(runs, zoom=zoom),
+        "figure_5": torques(runs, zoom=zoom),
+        "figure_6": phase_portrait(runs),
+    }
+
+
+def save(figures: Mapping[str, Figure], folder: str | Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
+    """Writes figures as `folder/name.format`; the folder is made if it is not there.
+
+    Args:
+      figures: figures by name, as from `paper_figures`.
+      folder: where to.
+      formats: file endings that matplotlib can write.
+
+    Returns:
+      The paths of the files.
+
+    Raises:
+      ValueError: an unknown format.
+    """
+    formats = (formats,) if isinstance(formats, str) else tuple(formats)
+    known = Figure().canvas.get_supported_filetypes()
+    for ending in formats:
+        if ending not in known:
+            raise checks.fail("formats", ending, f"one of {', '.join(sorted(known))}")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, figure in figures.items():
+        engine = figure.get_layout_engine()  # set aside after the first format: parts keep the places that it gave them
+        for ending in formats:
+            paths.append(folder / f"{name}.{ending}")
+            figure.savefig(paths[-1], format=ending)
+            figure.set_layout_engine("none")
+        figure.set_layout_engine(engine)
+    return paths

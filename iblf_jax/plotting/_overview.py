@@ -1,0 +1,112 @@
+"""One run at a glance: every joint in its tube, then errors, phase portrait, torque, estimate and Lyapunov function."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
+
+from iblf_jax import checks
+from iblf_jax.plotting import _style
+from iblf_jax.plotting._curves import Curve, curves_of, thinned
+from iblf_jax.plotting._figures import draw_phase_portrait
+from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, draw, draw_frame, set_limits, show
+from iblf_jax.results import Rollout
+
+WIDTH = 10.0
+COLUMNS = 4
+"""Tubes side by side at most."""
+
+
+@_style.styled()
+def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
+    """One run at a glance, its status in the title: what `run.plot()` shows.
+
+    Position of every joint in its tube; then, with the joints together, e1, xi and the phase portrait of the first two
+    joints; torque, uncertain term with estimate, and Lyapunov function.
+
+    Args:
+      run: one run of n joints.
+      title: the first line of the title.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: a batch, or something that is no Rollout.
+    """
+    if not isinstance(run, Rollout):
+        raise checks.fail("run", type(run).__name__, "a Rollout", "To compare several, use plotting.joint and the other figures.")
+    (curve,) = curves_of(run)
+    rows = int(np.ceil(run.n / COLUMNS))
+    figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows + 4.4)
+    halves = figure.add_gridspec(2, 1, height_ratios=(2.0 * rows, 4.4))
+    whole = (0.0, float(np.asarray(run.t)[-1]) or 1e-3)
+    _tubes(figure, halves[0], curve, whole, rows)
+    _together(figure, halves[1], curve, whole)
+    _style.entitle(figure, title, [curve], always=True)
+    _style.legend_below(figure, 8)
+    return figure
+
+
+def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window, rows: int) -> None:
+    """Position of every joint in its tube."""
+    n = curve.run.n
+    columns = int(np.ceil(n / rows))
+    grid = where.subgridspec(rows, columns)
+    for joint in range(n):
+        axes = figure.add_subplot(grid[joint // columns, joint % columns])
+        show(axes, [curve], QUANTITIES["q"], joint, whole)
+        for line in axes.get_lines():
+            if line.get_label() == "$q$":
+                line.set(**_style.series(joint), label="_")
+        axes.set_title(f"joint {joint}")
+        axes.set_ylabel(QUANTITIES["q"].label if joint % columns == 0 else "")
+        axes.set_xlabel(_style.label("time $t$", "s") if joint + columns >= n else "")
+
+
+def _together(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
+    """The panels that show all joints together."""
+    grid = where.subgridspec(2, 3)
+    places: dict[str, Any] = {"e1": grid[0, 0], "xi": grid[0, 1], "tau": grid[1, 0], "disturbance_estimate": grid[1, 1]}
+    for field, place in places.items():
+        _joints(figure.add_subplot(place), curve, QUANTITIES[field], whole)
+    if curve.run.n > 1:
+        axes = figure.add_subplot(grid[0, 2])
+        draw_phase_portrait(axes, [curve], (0, 1))
+        for line in axes.get_lines():
+            if line.get_label() == "$q$":
+                line.set(color="#9a9a9a", linewidth=2.4)
+            line.set_label("_")
+    _lyapunov(figure.add_subplot(grid[1, 2]), curve, whole)
+
+
+def _joints(axes: Axes, curve: Curve, quantity: Quantity, whole: Window) -> None:
+    """One quantity of all joints, each in its colour."""
+    # The walls of xi are the same for all joints; those of e1 are not, and are in the tubes above.
+    frame = draw_frame(axes, curve, quantity, 0, whole, label="_") if quantity.field == "xi" else []
+    drawn = []
+    for joint in range(curve.run.n):
+        look = _style.series(joint)
+        if quantity.truth:
+            drawn.append(draw(axes, curve, quantity.truth, joint, whole, color=look["color"], linewidth=4.0, alpha=0.3, label="_"))
+        drawn.append(draw(axes, curve, quantity.field, joint, whole, label=f"joint {joint}", **look))
+    axes.set_xlim(*whole)
+    set_limits(axes, [curve] * len(drawn), drawn, frame)
+    axes.set_ylabel(r"$f$ (broad), $\hat f$ [N m]" if quantity.truth else quantity.label)
+    axes.set_xlabel(_style.label("time $t$", "s"))
+
+
+def _lyapunov(axes: Axes, curve: Curve, whole: Window) -> None:
+    """The Lyapunov function on a logarithmic axis."""
+    V = curve["V"]
+    positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
+    axes.plot(*thinned(curve.t[: len(V)], positive), color="#444444")
+    if np.isfinite(positive).any():
+        axes.set_yscale("log")
+    axes.set_xlim(*whole)
+    axes.set_ylabel("Lyapunov function $V_2$")
+    axes.set_xlabel(_style.label("time $t$", "s"))

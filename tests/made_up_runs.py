@@ -1,0 +1,65 @@
+"""Runs of known arrays, which no simulator made: for tests of what is drawn."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+import iblf_jax as ij
+
+
+class Arm3D:
+    """A robot in space: the first joint turns it about z, the others lift it.  All that a drawing asks for."""
+
+    def __init__(self, n):
+        self.n = n
+
+    def skeleton(self, q):
+        lift = jnp.cumsum(q[1:])
+        out = jnp.concatenate([jnp.zeros(1), jnp.cos(lift)])
+        up = jnp.concatenate([jnp.ones(1), jnp.sin(lift)])
+        links = 0.3 * jnp.stack([out * jnp.cos(q[0]), out * jnp.sin(q[0]), up], axis=-1)
+        return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(links, axis=0)])
+
+
+@dataclasses.dataclass
+class Holder:
+    """In place of a Scenario: a drawing asks it for the plant only."""
+
+    plant: object
+
+
+def chain(n):
+    return ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.02] * n)
+
+
+def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
+    """A run of known arrays, which no simulator made."""
+    t = np.arange(round(duration / dt) + 1) * dt
+    joints = np.arange(plant.n)
+    q_d = 0.5 + 0.2 * np.sin(t[:, None] + 0.5 * joints)
+    e1 = 0.15 * np.exp(-3 * t[:, None]) * (1 + 0.1 * joints) + shift * np.sin(3 * t[:, None])
+    lower, upper = q_d - 0.3 - 0.05 * np.cos(t[:, None] + joints), q_d + 0.4 + 0.05 * np.sin(t[:, None] + joints)
+    f = 0.1 * np.cos(2 * t[:, None] + joints)
+    arrays = {
+        "t": t, "q": q_d + e1, "dq": np.gradient(q_d + e1, dt, axis=0), "tau": 3.0 - 8 * np.exp(-9 * t[:, None]) + joints, "e1": e1,
+        "e2": -3 * e1, "xi": e1 / 0.45, "q_d": q_d, "dq_d": np.gradient(q_d, dt, axis=0), "lower": lower, "upper": upper, "alpha": 0 * q_d,
+        "disturbance": f, "disturbance_estimate": f * (1 - np.exp(-5 * t[:, None])), "V": np.exp(-2 * t),
+    }  # fmt: skip
+    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}
+    return ij.Rollout(
+        scenario=Holder(plant), controller_state=(), observer_state=(), metrics=ij.Metrics({}, ()), status=jnp.int32(status),
+        fastest_mode=jnp.asarray(10.0), dt=jnp.asarray(dt), method="rk4", **arrays,
+    )  # fmt: skip
+
+
+def runaway(plant, at=150):
+    """A run that blew up to 1e4, with NaN in what follows from it, and was frozen."""
+    run = made_up(plant, status=int(ij.Status.NOT_FINITE | ij.Status.BOUND_VIOLATED))
+    growth = np.exp(np.clip(np.arange(run.t.size) - at + 20, 0, 20))[:, None] - 1
+    frozen = np.minimum(np.arange(run.t.size), at)
+    arrays = {}
+    for name in ("q", "dq", "e1", "e2", "tau", "xi", "disturbance", "disturbance_estimate"):
+        arrays[name] = jnp.asarray((np.asarray(getattr(run, name)) + 1e-4 * growth)[frozen])
+    arrays["tau"] = arrays["tau"].at[at:].set(jnp.nan)
+    return dataclasses.replace(run, **arrays)
