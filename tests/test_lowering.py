@@ -49,16 +49,13 @@ def with_member(family: str, name: str, cls):
         barrier = cls()
         o = law.o if getattr(barrier, "uses_o", True) else None
         return dataclasses.replace(PRESET, controller=ij.controllers.Backstepping(law.k1, law.K2, o, barrier))
-    part = PRESET.plant if name == "two_link" else example(name, cls)
-    changes = {
-        "robots": {"plant": part, "model": part},
-        "observers": {"observer": part},
-        "controllers": {"controller": PRESET.controller if name == "backstepping" else part},
-        "references": {"reference": part if name != "sinusoid" else PRESET.reference},
-        "bounds": {"bounds": ij.bounds.Bounds(PRESET.bounds.lower, part if name != "sinusoid" else PRESET.bounds.upper)},
-        "disturbances": {"disturbance": part},
-    }[family]
-    return dataclasses.replace(PRESET, **changes)
+    kept = {"two_link": PRESET.plant, "backstepping": PRESET.controller}
+    part = kept.get(name) or (PRESET.reference if (family, name) == ("references", "sinusoid") else example(name, cls))
+    if family == "bounds":
+        upper = PRESET.bounds.upper if name == "sinusoid" else part
+        return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(PRESET.bounds.lower, upper))
+    fields = {"robots": ("plant", "model")}.get(family, (family[:-1],))
+    return dataclasses.replace(PRESET, **dict.fromkeys(fields, part))
 
 
 FAMILIES = ("barriers", "bounds", "controllers", "disturbances", "observers", "references", "robots")

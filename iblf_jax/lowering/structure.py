@@ -81,22 +81,20 @@ def _now(eqn, *operands):
         return np.asarray(eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params), np.int64)
 
 
-def _chosen(b: Builder, index: Ids, size: int, at: Callable) -> Ids:
-    """`at(values of the index)`, where at most one entry of the index is known only in the run."""
-    flat = index.ravel().tolist()
-    open_nodes = {i for i in flat if b.value(i) is None}
-    if not open_nodes:
-        return at(np.asarray([b.value(i) for i in flat], np.int32).reshape(index.shape))
-    if len(open_nodes) > 1 or size > MOST_CHOICES:
-        raise UnsupportedError(f"an index that only the run knows chooses among too many entries ({len(open_nodes)} indices of {size})")
-    (node,) = open_nodes
-
-    def with_value(v: int) -> Ids:
-        return at(np.asarray([v if i == node else b.value(i) for i in flat], np.int32).reshape(index.shape))
-
-    result = with_value(size - 1)
+def _chosen(b: Builder, index: Ids, size: int, at: Callable, known: dict[int, int] | None = None) -> Ids:
+    """`at(values of the index)`; where the run alone knows an entry, a choice among its values 0 ... size - 1."""
+    known = known or {}
+    flat = [known.get(i, b.value(i)) for i in index.ravel().tolist()]
+    unknown = [i for i, v in zip(index.ravel().tolist(), flat, strict=True) if v is None]
+    if not unknown:
+        return at(np.asarray(flat, np.int32).reshape(index.shape))
+    if size ** len({*unknown, *known}) > MOST_CHOICES:
+        raise UnsupportedError(f"indices that only the run knows choose among more than {MOST_CHOICES} entries")
+    node = unknown[0]
+    cases = [_chosen(b, index, size, at, known | {node: v}) for v in range(size)]
+    result = cases[-1]
     for v in reversed(range(size - 1)):
-        result = choose(b, b.emit("le", node, b.constant(v, "i"), kind="b"), with_value(v), result)
+        result = choose(b, b.emit("le", node, b.constant(v, "i"), kind="b"), cases[v], result)
     return result
 
 

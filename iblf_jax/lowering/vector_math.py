@@ -1,7 +1,7 @@
 """sin and cos as polynomials, for XLA on CPU, whose own are scalar calls there.
 
 Range reduction after W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980: pi/2 in parts so short that their
-products with the quadrant are exact.  Coefficients: S. Moshier, Cephes.  Errors, measured by the tests: below 1.5 ulp, or 1e-7
+products with the quadrant are exact.  Coefficients: S. Moshier, Cephes.  Errors, measured by the tests: below 2 ulp, or 1e-7
 (float32) and 1e-16 (float64) absolute, for |x| up to LIMIT; beyond it the result is NaN, never a wrong number.
 """
 

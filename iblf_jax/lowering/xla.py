@@ -108,9 +108,9 @@ def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, ste
         padded = jnp.pad(rows, ((0, 0), (0, streams * blocks * BLOCK - runs)), mode="edge")
         return jnp.moveaxis(padded.reshape(-1, streams, blocks, BLOCK), 0, 2)
 
-    def together(*streams):
-        rows = jnp.concatenate(streams)
-        return jnp.moveaxis(rows, 0, -2).reshape(*rows.shape[1:-1], -1)[..., :runs]
+    def together(*parts):
+        rows = jnp.concatenate(parts)
+        return jnp.moveaxis(rows, 0, -2).reshape(*rows.shape[1:-1], streams * blocks * BLOCK)[..., :runs]
 
     def one(part):
         return _block(program, shared, part[0], part[1], steps, every)
