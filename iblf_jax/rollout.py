@@ -120,20 +120,37 @@ def start(scenario: Scenario, folds, dt) -> Carry:
 
 def finish(scenario: Scenario, folds, method: str, dt, steps: int, carry: Carry) -> tuple[Carry, Sample, Outcome]:
     """The last sample, the folds' results and the verdict on the step."""
-    first, end = initial_state(scenario), dt * steps
-    _, sample, carry = _observe(scenario, folds, end, jnp.zeros_like(dt), carry)
+    carry, sample = observe_end(scenario, folds, dt, steps, carry)
+    modes = jax.vmap(partial(fastest_mode, scenario))(*critical_instants(scenario, dt, steps, carry))
+    return carry, sample, verdict(folds, method, dt, carry, modes)
+
+
+def observe_end(scenario: Scenario, folds, dt, steps: int, carry: Carry) -> tuple[Carry, Sample]:
+    """The carry and the sample after the last step."""
+    _, sample, carry = _observe(scenario, folds, dt * steps, jnp.zeros_like(dt), carry)
+    return carry, sample
+
+
+def critical_instants(scenario: Scenario, dt, steps: int, carry: Carry) -> tuple[jax.Array, LoopState]:
+    """Times and states, stacked, at which the loop's modes are measured: the start, where a joint was nearest to its bound, the end."""
+    end = dt * steps
     times = jnp.stack([jnp.zeros_like(end), carry.nearest.t, end])
-    states = jax.tree.map(lambda *xs: jnp.stack(xs), first, carry.nearest.state, carry.state)
-    modes = jax.vmap(partial(fastest_mode, scenario))(*jax.lax.stop_gradient((times, states)))
+    states = jax.tree.map(lambda *xs: jnp.stack(xs), initial_state(scenario), carry.nearest.state, carry.state)
+    return jax.lax.stop_gradient((times, states))
+
+
+def verdict(folds, method: str, dt, carry: Carry, modes: jax.Array) -> Outcome:
+    """The folds' results, and the status with the verdict on the step, given the measured modes [1/s]."""
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     status = carry.status | flag(dt * mode > tableau(method).stability, Status.STEP_TOO_LARGE)
     metrics: dict[str, jax.Array] = {}
     for fold, acc in zip(folds, carry.accumulators, strict=True):
         metrics |= fold.finish(acc)
-    return carry, sample, Outcome(None, metrics, status, mode)
+    return Outcome(None, metrics, status, mode)
 
 
-def _recorded(sample: Sample, state: LoopState):
+def record_of(sample: Sample, state: LoopState):
+    """What is kept of a sample, and the states of law and observer."""
     return {name: getattr(sample, name) for name in RECORDED}, state.controller, state.observer
 
 
@@ -147,7 +164,7 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
     def recorded(carry, index):
         state = carry.state
         carry, sample = advance_one(carry, index)
-        return carry, _recorded(sample, state)
+        return carry, record_of(sample, state)
 
     def unrecorded(carry, index):
         return advance_one(carry, index)[0], None
@@ -163,11 +180,11 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
     blocks, rest = divmod(steps, record_every)
     carry, records = jax.lax.scan(recorded if record_every == 1 else block, carry, record_every * jnp.arange(blocks))
     if rest:
-        last = _recorded(evaluate(scenario, dt * (blocks * record_every), carry.state, dt)[1], carry.state)
+        last = record_of(evaluate(scenario, dt * (blocks * record_every), carry.state, dt)[1], carry.state)
         carry, _ = jax.lax.scan(unrecorded, carry, blocks * record_every + jnp.arange(rest))
     carry, sample, outcome = finish(scenario, folds, method, dt, steps, carry)
     if not rest:
-        last = _recorded(sample, carry.state)
+        last = record_of(sample, carry.state)
     records = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), records, last)
     return outcome._replace(records=records)
 

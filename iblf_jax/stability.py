@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,24 +31,44 @@ SLOWEST = 1.0
 """1/s.  A loop slower than this still follows a reference, so a step is never advised beyond that."""
 
 
+class Growth(NamedTuple):
+    """State of the power iteration: a direction of length one, and the sum of the last logarithms of its growth."""
+
+    direction: jax.Array
+    total: jax.Array
+
+
+def growth_start(state: LoopState) -> Growth:
+    """A direction that no mode is orthogonal to."""
+    flat, _ = ravel_pytree(state)
+    start = jnp.cos(jnp.arange(1, flat.size + 1, dtype=flat.dtype))
+    return Growth(start / jnp.sqrt(jnp.sum(start**2)), jnp.zeros((), flat.dtype))
+
+
+def growth_step(scenario: Scenario, t: jax.Array, state: LoopState, growth: Growth, index: jax.Array) -> Growth:
+    """One of POWER_ITERATIONS steps: the direction, pushed by the closed loop's Jacobian at (t, state)."""
+    flat, unravel = ravel_pytree(state)
+    w = jax.jvp(lambda x: ravel_pytree(rate(scenario, t, unravel(x)))[0], (flat,), (growth.direction,))[1]
+    size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(flat.dtype).tiny)
+    counted = index >= POWER_ITERATIONS - AVERAGED
+    return Growth(w / size, growth.total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size)))
+
+
+def growth_rate(growth: Growth) -> jax.Array:
+    """The mode that was found, () [1/s]."""
+    return jnp.exp(growth.total / AVERAGED)
+
+
 def fastest_mode(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     """Spectral radius of the closed loop's Jacobian at (t, state), () [1/s], by power iteration on jvp.
 
     The growth is averaged over the last iterations, so that a pair of complex modes is measured too.
     """
-    flat, unravel = ravel_pytree(state)
 
-    def push(v):
-        return jax.jvp(lambda x: ravel_pytree(rate(scenario, t, unravel(x)))[0], (flat,), (v,))[1]
+    def iterate(growth, index):
+        return growth_step(scenario, t, state, growth, index), None
 
-    def iterate(v, _):
-        w = push(v)
-        size = jnp.sqrt(jnp.sum(w * w))
-        return w / jnp.maximum(size, jnp.finfo(flat.dtype).tiny), jnp.log(jnp.maximum(size, jnp.finfo(flat.dtype).tiny))
-
-    start = jnp.cos(jnp.arange(1, flat.size + 1, dtype=flat.dtype))
-    _, growth = jax.lax.scan(iterate, start / jnp.sqrt(jnp.sum(start**2)), length=POWER_ITERATIONS)
-    return jnp.exp(jnp.mean(growth[-AVERAGED:]))
+    return growth_rate(jax.lax.scan(iterate, growth_start(state), jnp.arange(POWER_ITERATIONS))[0])
 
 
 def stable_dt(mode: float, method: str) -> float:

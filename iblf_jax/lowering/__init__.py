@@ -1,25 +1,81 @@
 """How a batch of runs is executed.  The physics is written once, for one run; a backend decides how many are stepped at a time.
 
 `run_batch` is the one entry: studies call it with the leaves that differ between runs, and all backends give the same results.
+
+    vmap     plain `jax.vmap` of a run: any scenario, any device, reverse-mode derivatives
+    xla      the step's scalar program, one (batch,) array a number, in `lax.scan`: any device, nothing needed but jax
+    native   the same program as C, built by the system's compiler, SIMD over runs and threads: CPU
+
+What a scalar program cannot express runs on `vmap`, and what has no compiler on `xla`; a `BackendWarning` says why, once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 
 from iblf_jax import checks
+from iblf_jax.lowering import batch, native, sensitivities, xla
+from iblf_jax.lowering.program import UnsupportedError
+from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.one_function import as_one_function
 from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
 
-BACKENDS = ("auto", "vmap")
-"""How a batch can be executed."""
+BACKENDS = ("auto", "vmap", "xla", "native")
+"""How a batch can be executed; "auto" is native on CPU, else xla."""
 
 _SMALL = 64
-"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
+"""Runs up to which a batch on vmap gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
+
+
+class BackendWarning(UserWarning):
+    """A batch runs on another backend than was asked for, and why."""
+
+
+_told: set[str] = set()
+
+
+def _tell(text: str) -> None:
+    if text not in _told:
+        _told.add(text)
+        warnings.warn(text, BackendWarning, stacklevel=4)
+
+
+def with_fallback(backend: str, run_on: Callable, plain: Callable):
+    """`run_on(executor)` on the backend that was asked for, or the next one that can; `plain()` is vmap.
+
+    Args:
+      backend: one of BACKENDS.
+      run_on: function of an executor (`native.run`, `xla.run`).
+      plain: function without arguments.
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    checks.one_of("backend", backend, BACKENDS)
+    on_cpu = jax.default_backend() == "cpu"
+    if backend == "auto":
+        backend = "native" if on_cpu else "xla"
+    if backend == "native" and not on_cpu:
+        _tell(f"The native backend is for CPU, the default device is {jax.default_backend()}: running on xla.")
+        backend = "xla"
+    try:
+        if backend == "native":
+            try:
+                return run_on(native.run)
+            except ToolchainError as error:
+                _tell(f"The native backend is not available ({error}): running on xla.")
+                backend = "xla"
+        if backend == "xla":
+            return run_on(xla.run)
+    except UnsupportedError as reason:
+        _tell(f"This scenario runs on plain vmap, several times slower: {reason}.")
+    return plain()
 
 
 def run_batch(
@@ -47,13 +103,52 @@ def run_batch(
 
     Returns:
       An `Outcome` with a leading batch axis on every array.
+
+    Raises:
+      ValueError: an unknown backend.
     """
 
     def one(varied):
         return run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
 
-    checks.one_of("backend", backend, BACKENDS)
-    batched = jax.vmap(one)
-    if min(len(values) for values in varied.values()) <= _SMALL:
-        batched = as_one_function(batched)
-    return batched(dict(varied))
+    def run_on(executor):
+        return batch.run(executor, scenario, varied, folds, dt, steps=steps, method=method, record_every=record_every)
+
+    def plain():
+        batched = jax.vmap(one)
+        return (as_one_function(batched) if min(map(len, varied.values())) <= _SMALL else batched)(dict(varied))
+
+    return with_fallback(backend, run_on, plain)
+
+
+def run_batch_jvp(
+    scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    directions: Mapping[str, Any],
+    folds,
+    dt: jax.Array,
+    *,
+    steps: int,
+    method: str,
+    backend: str = "auto",
+) -> tuple[Outcome, dict[str, jax.Array]]:
+    """Values of a batch and their derivatives along P directions in the space of leaves, in one pass; call it inside `jit`.
+
+    Args:
+      scenario, varied, folds, dt, steps, method, backend: as `run_batch`.
+      directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run: direction p moves each of these
+        leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
+
+    Returns:
+      The outcome, and name -> (batch, P, *shape) for every metric that is a float.
+
+    Raises:
+      ValueError: an unknown backend or path.
+    """
+    along = sensitivities.Directions.of(directions)
+    options: dict[str, Any] = {"steps": steps, "method": method}
+
+    def run_on(executor):
+        return sensitivities.lowered_jvp(executor, scenario, varied, along, folds, dt, **options)
+
+    return with_fallback(backend, run_on, lambda: sensitivities.plain_jvp(scenario, varied, along, folds, dt, **options))

@@ -1,0 +1,237 @@
+"""Throughput of many runs at once: the paper's loop, RK4 at 1 ms, steps per second, everything side by side in one run.
+
+    python benchmarks/throughput.py [--quick] [--json FILE] [--dtype float32|float64] [--batches 1,64,4096,65536] [--chain]
+
+Rows: SciPy LSODA and diffrax (of the same motion, in steps of 1 ms), the textbook `jit(vmap(scan))` with `jnp.linalg.solve`, this
+package's backends with the standard metrics, `native` without metrics, `native` with 6 forward sensitivities, and the limit: a rollout
+written by hand in C++ (`limit/paper_loop.cc`), which carries the state alone.  `a core` is steps per second of processor time: on a
+shared machine it is the number to compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import math
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", "float64" in sys.argv)
+
+import jax.numpy as jnp
+import numpy as np
+from _timing import compile_seconds, report
+
+import iblf_jax as ij
+from iblf_jax import lowering
+from iblf_jax.lowering import toolchain
+from iblf_jax.metrics import standard
+from iblf_jax.scenario import canonical
+
+FOLDER = Path(__file__).parent
+GAINS = {name: np.eye(6)[:, 2 * i : 2 * i + 2] for i, name in enumerate(("controller.k1", "controller.K2", "observer.kf"))}
+
+
+def chain(n: int):
+    """A planar chain of n links in the paper's setting."""
+    plant = ij.robots.PlanarChain(mass=np.full(n, 0.5), length=0.25, centre=0.125, inertia=0.01)
+    side = ij.bounds.Constant(np.full(n, 0.2)), ij.bounds.Constant(np.full(n, 0.9))
+    return ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.14, frequency=1.0, phase=np.arange(n) * 1.0),
+        bounds=ij.bounds.Bounds(*side),
+        controller=ij.controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
+        observer=ij.observers.Momentum(kf=20.0),
+        initial=ij.Initial(q=0.55),
+    )
+
+
+def draws(scenario, runs: int, dtype):
+    """A mass of the plant and the start, one each a run."""
+    rng = np.random.default_rng(0)
+    start = np.asarray(scenario.initial.q) + 0.01 * rng.standard_normal((runs, scenario.n))
+    nominal = float(np.asarray(scenario.plant.mass)[1])
+    return {"plant.mass[1]": jnp.asarray(nominal * rng.uniform(0.7, 1.3, runs), dtype), "initial.q": jnp.asarray(start, dtype)}
+
+
+def textbook_slope(mass, t, x):
+    """The paper's loop as one writes it in JAX: arrays of two joints, derivatives by jvp, `jnp.linalg.solve`."""
+    q, dq, eta = x
+
+    def lumped(m2):
+        return 0.1225 + m2 * 0.1225, m2 * 0.024025 + 0.02042125, m2 * 0.05425, 0.35 + m2 * 0.35, m2 * 0.155
+
+    def matrices(p, q, dq):
+        c, s = p[2] * jnp.cos(q[1]), p[2] * jnp.sin(q[1])
+        M = jnp.array([[p[0] + p[1] + 2 * c, p[1] + c], [p[1] + c, p[1]]])
+        C = jnp.array([[-s * dq[1], -s * (dq[0] + dq[1])], [s * dq[0], 0.0]])
+        outer = p[4] * 9.81 * jnp.cos(q[0] + q[1])
+        return M, C, jnp.array([p[3] * 9.81 * jnp.cos(q[0]) + outer, outer])
+
+    def tube(t):
+        wave, swapped = 0.14 * jnp.array([jnp.sin(t), jnp.cos(t)]), 0.14 * jnp.array([jnp.cos(t), jnp.sin(t)])
+        return 0.5 + wave, 0.3 + wave - swapped, 0.4 - wave + swapped
+
+    def alpha(t, q):
+        (q_d, k_l, k_u), (dq_d, dk_l, dk_u) = jax.jvp(tube, (t,), (jnp.ones_like(t),))
+        return dq_d - (2.0 + jnp.sqrt((dk_u / k_u) ** 2 + (dk_l / k_l) ** 2 + 0.1)) * (q - q_d)
+
+    M, C, G = matrices(lumped(mass), q, dq)
+    M0, C0, G0 = matrices(lumped(0.85), q, dq)
+    a, da = jax.jvp(alpha, (t, q), (jnp.ones_like(t), dq))
+    q_d, k_l, k_u = tube(t)
+    e = q - q_d
+    k = jnp.where(e > 0, k_u, k_l)
+    f_hat = eta + 20.0 * (M0 @ dq)
+    tau = C0 @ dq + G0 + M0 @ da - f_hat - 20.0 * (dq - a) - 2.0 * e / (k**2 - e**2)
+    push = M0 @ (0.3 * jnp.array([jnp.sin(t), jnp.cos(t)])) + C0 @ (0.3 * jnp.array([jnp.cos(0.5 * t), jnp.sin(0.5 * t)]))
+    ddq = jnp.linalg.solve(M, tau + push - C @ dq - G)
+    return dq, ddq, -20.0 * (f_hat + tau - C0 @ dq - G0)
+
+
+def textbook(values, dt, *, steps: int):
+    """`vmap` over runs of a `scan` over time."""
+
+    def one(mass, q0):
+        def step(x, i):
+            t = i * dt
+            add = lambda x, h, k: jax.tree.map(lambda a, b: a + h * b, x, k)  # noqa: E731
+            k1 = textbook_slope(mass, t, x)
+            k2 = textbook_slope(mass, t + dt / 2, add(x, dt / 2, k1))
+            k3 = textbook_slope(mass, t + dt / 2, add(x, dt / 2, k2))
+            k4 = textbook_slope(mass, t + dt, add(x, dt, k3))
+            return jax.tree.map(lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4), None
+
+        return jax.lax.scan(step, (q0, 0 * q0, 0 * q0), jnp.arange(steps, dtype=dt.dtype))[0]
+
+    return jax.vmap(one)(values["plant.mass[1]"], values["initial.q"])
+
+
+def with_diffrax(values, dt, *, steps: int):
+    """The same loop by diffrax: Tsit5 with a constant step, vmapped."""
+    import diffrax
+
+    def one(mass, q0):
+        term = diffrax.ODETerm(lambda t, x, _: textbook_slope(mass, t, x))
+        t1 = steps * dt
+        return diffrax.diffeqsolve(term, diffrax.Tsit5(), 0 * t1, t1, dt, (q0, 0 * q0, 0 * q0), max_steps=steps + 1).ys
+
+    return jax.vmap(one)(values["plant.mass[1]"], values["initial.q"])
+
+
+def with_scipy(steps: int) -> float:
+    """Seconds of SciPy's LSODA for the motion of so many steps."""
+    from latency import numpy_loop
+    from scipy.integrate import solve_ivp
+
+    start = time.perf_counter()
+    solve_ivp(numpy_loop, (0.0, steps * 1e-3), np.array([0.8, 0.8, 0, 0, 0, 0]), method="LSODA", rtol=1e-6, atol=1e-8)
+    return time.perf_counter() - start
+
+
+def limit(dtype):
+    """The rollout written by hand as a function of (values, steps), or None without a compiler."""
+    try:
+        text = (FOLDER / "limit" / "paper_loop.cc").read_text()
+        for name in ("vector.h", "mathlib.h"):
+            text = text.replace(f'#include "{name}"', (Path(lowering.__file__).parent / "c" / name).read_text())
+        library = toolchain.loaded(toolchain.built(f"#define DOUBLE {int(dtype == 'float64')}\n" + text)[0])
+    except toolchain.ToolchainError as error:
+        print(f"no limit: {error}")
+        return None
+
+    def run(values, steps):
+        mass, q = np.asarray(values["plant.mass[1]"]), np.asarray(values["initial.q"])
+        runs = -(-len(mass) // 64) * 64
+        x = np.zeros((6, runs), dtype)
+        x[:2, : len(mass)] = q.T
+        mass = np.concatenate([mass, np.full(runs - len(mass), 0.85, dtype)])
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (mass, x)]
+        library.paper_loop(*pointers, *map(ctypes.c_long, (runs, steps)), ctypes.c_double(1e-3), ctypes.c_long(toolchain.threads()))
+        return x[:, : len(q)]
+
+    return run
+
+
+def measured(call, repeats: int) -> tuple[float, float]:
+    """The smallest wall and processor seconds of a call."""
+    wall, used = math.inf, math.inf
+    for _ in range(repeats):
+        start, cpu = time.perf_counter(), time.process_time()
+        jax.block_until_ready(call())
+        wall, used = min(wall, time.perf_counter() - start), min(used, time.process_time() - cpu)
+    return wall, used
+
+
+def candidates(scenario, dtype: str, is_paper: bool):
+    """Name -> function of (values, dt, steps), to be compiled."""
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+
+    def on(backend, folds=folds):
+        return lambda v, dt, steps: lowering.run_batch(scenario, v, folds, dt, steps=steps, method="rk4", backend=backend)
+
+    def sensitivities(v, dt, steps):
+        return lowering.run_batch_jvp(scenario, v, GAINS, folds, dt, steps=steps, method="rk4", backend="native")
+
+    rows = {"vmap": on("vmap"), "xla": on("xla"), "native": on("native"), "native, no metrics": on("native", ())}
+    if is_paper:
+        simple = {"diffrax": with_diffrax, "textbook": textbook}
+        rows = {name: lambda v, dt, steps, f=f: f(v, dt, steps=steps) for name, f in simple.items()} | rows
+        rows["native + 6 tangents"] = sensitivities
+    return rows
+
+
+def steps_for(name: str, runs: int, quick: bool) -> int:
+    """So many steps that a row takes about a second."""
+    rate = {"textbook": 5e5, "diffrax": 3e5, "vmap": 2e6, "xla": 1e7, "native + 6 tangents": 3e7}.get(name, 1e8)
+    rate = min(rate, 2e5 * runs)
+    return 20 if quick else int(min(max(rate / runs, 40), 10_000)) // 20 * 20
+
+
+def table(dtype: str, batches, which: str, quick: bool) -> list[list]:
+    """The rows of one scenario and type."""
+    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024() if which == "paper" else chain(4), dtype))
+    dt, rows, by_hand = jnp.asarray(1e-3, dtype), [], limit(dtype) if which == "paper" else None
+    for runs in batches:
+        values = draws(scenario, runs, dtype)
+        found = []
+        for name, function in candidates(scenario, dtype, which == "paper").items():
+            steps = steps_for(name, runs, quick)
+            seconds, compiled = compile_seconds(partial(function, steps=steps), values, dt)
+            jax.block_until_ready(compiled(values, dt))
+            found.append((name, steps, seconds, *measured(partial(compiled, values, dt), 1 if quick else 3)))
+        if by_hand:
+            steps = steps_for("limit", runs, quick)
+            found.append(("limit, by hand", steps, 0.0, *measured(partial(by_hand, values, steps), 1 if quick else 3)))
+        base = next((runs * s / w for n, s, _, w, _ in found if n == "textbook"), math.nan)
+        top = next((runs * s / w for n, s, _, w, _ in found if n == "limit, by hand"), math.nan)
+        for name, steps, seconds, wall, cpu in found:
+            speed = runs * steps / wall
+            rows.append([which, dtype, runs, name, steps, seconds, speed, runs * steps / cpu, speed / base, speed / top])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json")
+    parser.add_argument("--dtype", default="float32", choices=["float32", "float64"])
+    parser.add_argument("--batches", default="1,64,4096,65536")
+    parser.add_argument("--chain", action="store_true", help="a planar chain of four joints, too")
+    options = parser.parse_args()
+    batches = [2] if options.quick else [int(x) for x in options.batches.split(",")]
+    rows = (
+        [] if options.quick else [["paper", "float64", 1, "SciPy LSODA", 10_000, 0.0, *[1e4 / with_scipy(10_000)] * 2, math.nan, math.nan]]
+    )
+    for which in ["paper", "chain of 4"] if options.chain else ["paper"]:
+        rows += table(options.dtype, batches, which, options.quick)
+    columns = ["loop", "type", "runs", "row", "steps", "compile s", "steps/s", "steps/s a core", "x textbook", "of limit"]
+    report("Throughput, RK4 at 1 ms", columns, rows, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+/* Vectors of runs: F holds one float of each of W runs, I one whole number, and a comparison gives an I of 0 or -1.
+   GCC's vector extension, which Clang has too: every operator works lane by lane, on any processor. */
+#include <math.h>
+#include <pthread.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if DOUBLE
+typedef double real;
+typedef int64_t integer;
+#define REAL(x) x
+#define FN(name) name
+#define MANTISSA 52
+#define EXPONENT_BIAS 1023
+#define SIGN_BIT ((integer)1 << 63)
+#define SMALLEST_NORMAL 0x1p-1022
+#define SCALE_UP 0x1p54
+#define SCALE_UP_BITS 54
+#else
+typedef float real;
+typedef int32_t integer;
+#define REAL(x) x##f
+#define FN(name) name##f
+#define MANTISSA 23
+#define EXPONENT_BIAS 127
+#define SIGN_BIT ((integer)1 << 31)
+#define SMALLEST_NORMAL 0x1p-126f
+#define SCALE_UP 0x1p25f
+#define SCALE_UP_BITS 25
+#endif
+
+#ifndef VECTOR_BYTES
+#if defined(__AVX512F__)
+#define VECTOR_BYTES 64
+#elif defined(__AVX__)
+#define VECTOR_BYTES 32
+#else
+#define VECTOR_BYTES 16
+#endif
+#endif
+#define W ((int)(VECTOR_BYTES / sizeof(real)))
+
+typedef real F __attribute__((vector_size(VECTOR_BYTES)));
+typedef integer I __attribute__((vector_size(VECTOR_BYTES)));
+typedef union { real f; integer i; } word;
+
+#define INLINE static inline __attribute__((always_inline))
+INLINE F splat(real x) { return x - (F){}; }
+INLINE I splat_i(integer x) { return x - (I){}; }
+INLINE F load(const real *p) { F x; memcpy(&x, p, sizeof x); return x; }
+INLINE void store(real *p, F x) { memcpy(p, &x, sizeof x); }
+INLINE F to_float(I x) { return __builtin_convertvector(x, F); }
+INLINE I to_int(F x) { return __builtin_convertvector(x, I); }
+
+/* A function of the C library, lane by lane; the compiler makes a vector instruction of it where there is one. */
+#define LANEWISE(name, call) INLINE F name(F x) { \
+  real a[W]; memcpy(a, &x, sizeof a); for (int l = 0; l < W; l++) a[l] = FN(call)(a[l]); memcpy(&x, a, sizeof a); return x; }
+#define LANEWISE2(name, call) INLINE F name(F x, F y) { \
+  real a[W], b[W]; memcpy(a, &x, sizeof a); memcpy(b, &y, sizeof b); \
+  for (int l = 0; l < W; l++) a[l] = FN(call)(a[l], b[l]); memcpy(&x, a, sizeof a); return x; }

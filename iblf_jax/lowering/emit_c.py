@@ -1,0 +1,184 @@
+"""C from a scalar program: one function for what only shared leaves decide, one for what time decides, one for a block of runs.
+
+The text is plain statements, one a node; `c/vector.h` says what a vector of runs is, `c/mathlib.h` has the elementary functions
+and `c/driver.h` the loops and threads around it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from importlib.resources import files
+
+import numpy as np
+
+from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, UnsupportedError, frontier
+
+INFIX = {
+    "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
+    "and": "&", "or": "|", "xor": "^",
+}  # fmt: skip
+CALLS = (
+    "max", "min", "abs", "sign", "floor", "ceil", "round_even", "sqrt", "rsqrt", "cbrt", "sin", "cos", "tan", "asin", "acos", "atan",
+    "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "pow", "atan2", "erf", "erfc", "logistic",
+    "rem", "is_finite",
+)  # fmt: skip
+
+
+def literal(node: Node, dtype: np.dtype) -> str:
+    """A constant as a vector of runs."""
+    if node.kind == "b":
+        return f"splat_i({-1 if node.value else 0})"
+    if node.kind == "i":
+        return f"splat_i({node.value})"
+    if math.isnan(node.value):
+        return 'splat(__builtin_nanf(""))'
+    if math.isinf(node.value):
+        return f"splat({'-' if node.value < 0 else ''}(real)__builtin_inf())"
+    return f"splat({node.value.hex()}{'f' if dtype == np.float32 else ''})"
+
+
+def expression(node: Node, args: list[str], kinds: list[str]) -> str:
+    """One operation in C; `args` are expressions of vectors."""
+    op = node.op
+    if op in ("eq", "ne") and kinds[0] == "b":
+        return f"{'~' if op == 'eq' else ''}({args[0]} ^ {args[1]})"
+    if (op in INFIX and kinds[0] != "b") or op in ("and", "or", "xor"):
+        return f"{args[0]} {INFIX[op]} {args[1]}"
+    if op in ("neg", "not"):
+        return f"{'-' if op == 'neg' else '~'}{args[0]}"
+    if op == "select":
+        return f"{args[0]} ? {args[1]} : {args[2]}"
+    if op == "convert":
+        return _conversion(kinds[0], node.kind, args[0])
+    if kinds[0] == "i" and op in ("max", "min"):
+        return f"i_{op}({args[0]}, {args[1]})"
+    if op in CALLS and kinds[0] == "f":
+        return f"f_{op}({', '.join(args)})"
+    raise UnsupportedError(f"the native backend has no {op} of kind {kinds}")
+
+
+def _conversion(source: str, target: str, arg: str) -> str:
+    if source == "b":
+        return f"{arg} ? splat(1) : splat(0)" if target == "f" else f"{arg} & 1"
+    return f"to_float({arg})" if target == "f" else f"to_int({arg})"
+
+
+class _Emitter:
+    """Statements for nodes; `names` are the C expressions of nodes that were read or computed already."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.classes = program.classes()
+        self.lines: list[str] = []
+
+    def statements(self, names: dict[int, str], wanted: Iterable[int]) -> None:
+        """Adds statements for `wanted` and what it needs."""
+        nodes = self.program.nodes
+        stack, needed = list(wanted), set()
+        while stack:
+            i = stack.pop()
+            if i not in names and i not in needed:
+                needed.add(i)
+                stack.extend(nodes[i].args)
+        for i in sorted(needed):
+            node = nodes[i]
+            if node.op == "const":
+                names[i] = literal(node, self.program.dtype)
+                continue
+            text = expression(node, [names[a] for a in node.args], [nodes[a].kind for a in node.args])
+            self.lines.append(f"  {'F' if node.kind == 'f' else 'I'} v{i} = {text};")
+            names[i] = f"v{i}"
+
+    def function(self, head: str) -> str:
+        """The C function of the statements so far."""
+        body, self.lines = "\n".join(self.lines), []
+        return f"{head} {{\n{body}\n}}\n"
+
+
+def _unpacked(node: Node, place: str) -> str:
+    return f"splat({place}.f)" if node.kind == "f" else f"splat_i({place}.i)"
+
+
+def source(program: Program, shared_leaves: int, lane_leaves: int) -> str:
+    """The whole C source of a program's kernel."""
+    e = _Emitter(program)
+    constants = frontier(program, e.classes, SHARED, lambda c: c != SHARED)
+    columns = frontier(program, e.classes, TIME, lambda c: bool(c & LANE))
+    floats = [i for i, kind in enumerate(program.kinds) if kind == "f"]
+    ints = [i for i, kind in enumerate(program.kinds) if kind != "f"]
+    sizes = {
+        "SHARED_LEAVES": shared_leaves, "LEAVES": lane_leaves, "FLOATS": len(floats), "INTS": len(ints), "CONSTANTS": len(constants),
+        "COLUMNS": len(columns), "SAMPLES": len(program.samples), "DOUBLE": int(program.dtype == np.float64),
+    }  # fmt: skip
+    parts = [f"#define {name} {value}\n" for name, value in sizes.items()]
+    parts += [_text("vector.h"), _text("mathlib.h")]
+    parts += [_constants(e, constants), _signals(e, constants, columns), _advance(e, constants, columns, floats, ints), _text("driver.h")]
+    return "\n".join(parts)
+
+
+def _text(name: str) -> str:
+    return (files("iblf_jax.lowering") / "c" / name).read_text()
+
+
+def _constants(e: _Emitter, constants: list[int]) -> str:
+    nodes = e.program.nodes
+    names = {i: f"splat(shared[{n.value}])" for i, n in enumerate(nodes) if n.op == "shared"}
+    e.statements(names, constants)
+    e.lines += [f"  out[{k}].{_part(nodes[i])} = ({names[i]})[0];" for k, i in enumerate(constants)]
+    return e.function("static void shared_constants(const real *shared, word *out)")
+
+
+def _part(node: Node) -> str:
+    return "f" if node.kind == "f" else "i"
+
+
+def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
+    nodes = e.program.nodes
+    names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
+    names |= {i: "index" for i, n in enumerate(nodes) if n.op == "index"}
+    e.lines.append("  I index;\n  for (int l = 0; l < W; l++) index[l] = first + l;")
+    e.statements(names, columns)
+    e.lines += [
+        f"  for (int l = 0; l < W; l++) table[l * COLUMNS + {k}].{_part(nodes[i])} = ({names[i]})[l];" for k, i in enumerate(columns)
+    ]
+    return e.function("static void shared_signals(const word *constants, integer first, word *table)")
+
+
+def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
+    program, nodes, classes = e.program, e.program.nodes, e.classes
+    names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
+    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
+    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
+    for c in [*floats, *ints]:
+        kind = program.kinds[c]
+        e.lines.append(f"  {'F' if kind == 'f' else 'I'} c{c} = {'-' if kind == 'b' else ''}{places[c]};")
+        if program.carry[c][0] >= 0:
+            names[program.carry[c][0]] = f"c{c}"
+    e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
+    e.lines.append("  for (int s = 0; s < count; s++, row += COLUMNS) {")
+    names |= {i: _unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
+    e.statements(names, [o for _, o in program.carry])
+    if program.samples:
+        _record(e, names)
+    moved = [(c, names[o]) for c, (a, o) in enumerate(program.carry) if a != o]
+    e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
+    e.lines += [f"  c{c} = n{c};" for c, _ in moved]
+    e.lines.append("  }")
+    e.lines += [f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]]
+    return e.function(
+        "static void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
+        "                    int64_t first, int64_t every, real *records, int64_t runs, int64_t run)"
+    )
+
+
+def _record(e: _Emitter, names: dict[int, str]) -> None:
+    """The samples of a step that is recorded, written for the runs that exist."""
+    e.lines.append("  if (every > 0 && (first + s) % every == 0) {")
+    e.lines.append("  real *out = records + (first + s) / every * SAMPLES * runs + run;")
+    e.lines.append("  int live = run + W <= runs ? W : (int)(runs - run);")
+    inner = dict(names)
+    e.statements(inner, e.program.samples)
+    for k, i in enumerate(e.program.samples):
+        e.lines.append(f"  {{ F x = {inner[i]}; memcpy(out + {k} * runs, &x, live * sizeof(real)); }}")
+    e.lines.append("  }")

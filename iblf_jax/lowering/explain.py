@@ -1,0 +1,100 @@
+"""What one step of a scenario costs, counted on its scalar program: the roofline in plain sight."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.lowering import batch, native
+from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
+from iblf_jax.lowering.toolchain import threads
+from iblf_jax.metrics import standard
+from iblf_jax.paths import get
+from iblf_jax.scenario import Scenario, canonical
+
+SLOTS = {
+    "div": 8, "sqrt": 8, "rsqrt": 16, "sin": 18, "cos": 18, "tan": 40, "exp": 20, "expm1": 22, "log": 24, "log1p": 32, "tanh": 32,
+    "logistic": 30, "atan": 26, "atan2": 40, "convert": 1, "max": 3, "min": 3, "sign": 4, "is_finite": 2,
+}  # fmt: skip
+"""Vector instructions of an operation, roughly, where it is not one; a function of the C library takes LIBRARY a run."""
+LIBRARY = 40
+LIBRARY_CALLS = ("asin", "acos", "sinh", "cosh", "asinh", "acosh", "atanh", "exp2", "erf", "erfc", "cbrt", "pow", "rem")
+NAMES = {SHARED: "once", SHARED | TIME: "a step, shared", LANE: "a run", LANE | TIME: "a step and run"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """Operations of one step by how often they are done; prints as a table."""
+
+    counts: dict[str, Counter]
+    """How often -> operation -> number."""
+    slots: float
+    """Vector instructions for a step of a register full of runs, a product and the sum that it goes into counted as one."""
+    width: int
+    """Runs in a register of 64 bytes."""
+    limit: float
+    """Estimated limit of this machine [steps/s]: two vector instructions a cycle on every core."""
+
+    def __repr__(self) -> str:
+        lines = ["operations done        number  which"]
+        for name, counter in self.counts.items():
+            which = ", ".join(f"{op} {n}" for op, n in counter.most_common(8))
+            lines.append(f"{name:22s} {sum(counter.values()):6d}  {which}")
+        lines.append(f"about {self.slots:.0f} vector instructions a step for {self.width} runs")
+        lines.append(f"two a cycle on every core would be {self.limit:.3g} steps/s")
+        return "\n".join(lines)
+
+
+def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk4", metrics=None) -> Explanation:
+    """What one step of a scenario costs on a compiled backend.
+
+    Args:
+      scenario: what runs; its floating-point type decides the width of a register of runs.
+      varied: paths of leaves that differ between runs; the start always does.
+      method: the integrator.
+      metrics: the folds, the standard ones if None.
+
+    Returns:
+      An `Explanation`, which prints as a table.
+
+    Raises:
+      ValueError: bad scenario or path.
+      UnsupportedError: the step does not lower; the message says why.
+    """
+    scenario = canonical(scenario)
+    dtype = scenario.initial.q.dtype
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard() if metrics is None else tuple(metrics))
+    leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
+    one = batch.batch_of(native.run, scenario, leaves, folds, jnp.asarray(1e-3, dtype))
+    program, _, _ = one.program(batch.step_function, one.start(), method, False)
+    width = 64 // np.dtype(dtype).itemsize
+    slots = instructions(program, width)
+    counts = {NAMES[c]: counter for c, counter in program.counts().items()}
+    return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots)
+
+
+def instructions(program: Program, width: int) -> float:
+    """Vector instructions of a step for a register of runs (class LANE | TIME)."""
+    classes, uses = program.classes(), Counter(a for node in program.nodes for a in node.args)
+    fused = {
+        next((a for a in node.args if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == LANE | TIME), None)
+        for node in program.nodes
+        if node.op in ("add", "sub")
+    }
+    counted = program.counts()[LANE | TIME]
+    total = sum(n * (LIBRARY * width if op in LIBRARY_CALLS else SLOTS.get(op, 1)) for op, n in counted.items())
+    return total - len(fused - {None})
+
+
+def _clock() -> float:
+    """Cycles a second: the highest of the first core where it is known, else 3e9."""
+    try:
+        return 1e3 * float(Path("/sys/devices/system/cpu/cpu0/cpufreq/cpuinfo_max_freq").read_text())
+    except (OSError, ValueError):
+        return 3e9

@@ -1,0 +1,134 @@
+"""A jaxpr taken apart into scalars: every array becomes a NumPy array of node numbers.
+
+So what only moves numbers about (reshape, slice, gather) is done here and now on the node numbers, and what computes becomes one
+node a number.  Nested functions are inlined, short scans unrolled; a primitive that has no rule raises `UnsupportedError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend import core
+
+from iblf_jax.lowering.program import Builder, UnsupportedError
+
+Ids = np.ndarray
+"""An array of node numbers, int64, of the shape of the array that it stands for."""
+
+LONGEST_SCAN = 64
+"""Steps up to which an inner scan is unrolled."""
+INLINED = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr",
+}  # fmt: skip
+
+
+def kind_of(dtype) -> str:
+    """The kind "f", "i" or "b" of an array's type; UnsupportedError for others."""
+    if np.issubdtype(dtype, np.floating):
+        return "f"
+    if np.issubdtype(dtype, np.signedinteger):
+        return "i"
+    if dtype == np.bool_:
+        return "b"
+    raise UnsupportedError(f"arrays of type {dtype} are not lowered")
+
+
+def constants(b: Builder, array) -> Ids:
+    """The node numbers of a concrete array."""
+    array = np.asarray(array)
+    kind = kind_of(array.dtype)
+    flat = [b.constant(x, kind) for x in array.ravel().tolist()]
+    return np.asarray(flat, np.int64).reshape(array.shape)
+
+
+def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Ids]) -> list[Ids]:
+    """The outputs of a jaxpr, given its constants and inputs as node numbers."""
+    from iblf_jax.lowering.rules import RULES
+
+    known: dict[Any, Ids] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
+
+    def read(atom):
+        return constants(b, atom.val) if isinstance(atom, core.Literal) else known[atom]
+
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        operands = [read(v) for v in eqn.invars]
+        if name in INLINED:
+            results = closed(b, eqn.params[INLINED[name]], operands)
+        elif name in CONTROL:
+            results = CONTROL[name](b, eqn, operands)
+        elif name in RULES:
+            for v in eqn.outvars:
+                _check_float(b, v.aval.dtype, eqn)
+            out = RULES[name](b, eqn, *operands)
+            results = list(out) if isinstance(out, (list, tuple)) else [out]
+        else:
+            raise UnsupportedError(f"the primitive {name!r} is not lowered")
+        for v, ids in zip(eqn.outvars, results, strict=True):
+            if ids.shape != v.aval.shape:
+                raise UnsupportedError(f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}")
+            known[v] = ids
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _check_float(b: Builder, dtype, eqn) -> None:
+    """Refuses floats of another type than the program's (constants, which are rounded once, aside)."""
+    if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
+        raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
+
+
+def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
+    """The outputs of a closed or plain inner jaxpr."""
+    inner = getattr(function, "jaxpr", function)
+    consts = [constants(b, c) for c in getattr(function, "consts", ())]
+    return interpret(b, inner, consts, operands)
+
+
+def _scan(b: Builder, eqn, operands):
+    params = eqn.params
+    length, n_const, n_carry = params["length"], params["num_consts"], params["num_carry"]
+    if length > LONGEST_SCAN:
+        raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {LONGEST_SCAN})")
+    const, carry, xs = operands[:n_const], operands[n_const : n_const + n_carry], operands[n_const + n_carry :]
+    stacked: list[list[Ids]] = []
+    for i in reversed(range(length)) if params["reverse"] else range(length):
+        out = closed(b, params["jaxpr"], [*const, *carry, *(x[i] for x in xs)])
+        carry = out[:n_carry]
+        stacked.append(out[n_carry:])
+    if params["reverse"]:
+        stacked.reverse()
+    ys = [np.stack(column) for column in zip(*stacked, strict=True)]
+    if not stacked:
+        ys = [np.zeros(v.aval.shape, np.int64) for v in eqn.outvars[n_carry:]]
+    return [*carry, *ys]
+
+
+def _cond(b: Builder, eqn, operands):
+    index, *rest = operands
+    branches = eqn.params["branches"]
+    which = int(index)
+    value = b.value(which)
+    if value is not None:
+        return closed(b, branches[min(max(int(value), 0), len(branches) - 1)], rest)
+    results = closed(b, branches[-1], rest)
+    for i in reversed(range(len(branches) - 1)):
+        is_flag = b.nodes[which].kind == "b"
+        condition = b.emit("not", which, kind="b") if is_flag else b.emit("le", which, b.constant(i, "i"), kind="b")
+        results = [choose(b, condition, yes, no) for yes, no in zip(closed(b, branches[i], rest), results, strict=True)]
+    return results
+
+
+def _while(b: Builder, eqn, operands):
+    raise UnsupportedError("a while loop inside a step has no fixed length")
+
+
+def choose(b: Builder, condition: int, yes: Ids, no: Ids) -> Ids:
+    """`yes` where one scalar condition holds, else `no`, entry by entry."""
+    flat = [b.emit("select", condition, int(x), int(y), kind=b.nodes[int(x)].kind) for x, y in zip(yes.ravel(), no.ravel(), strict=True)]
+    return np.asarray(flat, np.int64).reshape(yes.shape)
+
+
+CONTROL = {"scan": _scan, "cond": _cond, "while": _while}

@@ -1,0 +1,156 @@
+"""Constant folding, and identities that hold for every floating-point number, NaN and infinities included.
+
+x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN, and a run that is not finite must
+be seen to be so.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.special
+
+if TYPE_CHECKING:
+    from iblf_jax.lowering.program import Builder
+
+
+def _reciprocal_root(x):
+    return 1 / np.sqrt(x)
+
+
+FUNCTIONS = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "abs": np.abs, "max": np.maximum,
+    "min": np.minimum, "sqrt": np.sqrt, "rsqrt": _reciprocal_root, "cbrt": np.cbrt, "sign": np.sign, "floor": np.floor, "ceil": np.ceil,
+    "round_even": np.rint, "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
+    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh,
+    "exp": np.exp, "exp2": np.exp2, "expm1": np.expm1, "log": np.log, "log1p": np.log1p, "pow": np.power, "atan2": np.arctan2,
+    "erf": scipy.special.erf, "erfc": scipy.special.erfc, "logistic": scipy.special.expit, "is_finite": np.isfinite,
+    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "rem": np.fmod,
+}  # fmt: skip
+"""NumPy's function for every operation; these and a few more are what a program may hold."""
+
+
+def fold(op: str, values: list, kinds: list[str], kind: str, dtype: np.dtype):
+    """The value of an operation on constants, or None if it is not known here."""
+    if op == "select":
+        return values[1] if values[0] else values[2]
+    if op == "convert":
+        return {"f": float, "i": int, "b": bool}[kind](values[0])
+    if op == "not":
+        return not values[0] if kind == "b" else ~values[0]
+    if op not in FUNCTIONS:
+        return None
+    if op == "div" and kind == "i":
+        return None if values[1] == 0 else int(values[0] / values[1])
+    types = {"f": dtype.type, "i": np.int64, "b": np.bool_}
+    with np.errstate(all="ignore"):
+        return FUNCTIONS[op](*(types[k](v) for k, v in zip(kinds, values, strict=True))).item()
+
+
+def simplify(b: Builder, op: str, args: tuple[int, ...], kind: str) -> int | None:
+    """A node that equals op(*args) and costs less, or None."""
+    rule = _RULES.get(op)
+    return rule(b, args, kind) if rule else None
+
+
+def _add(b: Builder, args, kind):
+    x, y = args
+    for one, other in ((x, y), (y, x)):
+        if kind != "b" and b.value(one) == 0:
+            return other
+        if b.nodes[one].op == "neg":
+            return b.emit("sub", other, b.nodes[one].args[0], kind=kind)
+    return None
+
+
+def _sub(b: Builder, args, kind):
+    x, y = args
+    if b.value(y) == 0:
+        return x
+    if b.value(x) == 0 and kind == "f":
+        return b.emit("neg", y, kind=kind)
+    if b.nodes[y].op == "neg":
+        return b.emit("add", x, b.nodes[y].args[0], kind=kind)
+    return None
+
+
+def _mul(b: Builder, args, kind):
+    for one, other in (args, args[::-1]):
+        if b.value(one) == 1:
+            return other
+        if b.value(one) == -1:
+            return b.emit("neg", other, kind=kind)
+        if b.nodes[one].op == "neg":
+            return b.emit("neg", b.emit("mul", b.nodes[one].args[0], other, kind=kind), kind=kind)
+    return None
+
+
+def _div(b: Builder, args, kind):
+    x, y = args
+    value = b.value(y)
+    if value == 1:
+        return x
+    if kind == "f" and value and math.isfinite(value) and abs(math.frexp(value)[0]) == 0.5 and abs(math.frexp(value)[1]) < 100:
+        return b.emit("mul", x, b.constant(1 / value, "f"), kind=kind)
+    if kind == "f" and b.nodes[x].op == "neg":
+        return b.emit("neg", b.emit("div", b.nodes[x].args[0], y))
+    return None
+
+
+def _neg(b: Builder, args, kind):
+    node = b.nodes[args[0]]
+    if node.op == "neg":
+        return node.args[0]
+    if node.op == "sub" and kind == "f":
+        return b.emit("sub", node.args[1], node.args[0])
+    return None
+
+
+def _abs(b: Builder, args, kind):
+    node = b.nodes[args[0]]
+    return b.emit("abs", node.args[0], kind=kind) if node.op == "neg" else args[0] if node.op == "abs" else None
+
+
+def _select(b: Builder, args, kind):
+    condition, yes, no = args
+    if yes == no:
+        return yes
+    if b.value(condition) is not None:
+        return yes if b.value(condition) else no
+    if b.nodes[condition].op == "not" and b.nodes[condition].kind == "b":
+        return b.emit("select", b.nodes[condition].args[0], no, yes, kind=kind)
+    return None
+
+
+def _logic(neutral: bool):
+    def rule(b: Builder, args, kind):
+        x, y = args
+        if x == y:
+            return x
+        for one, other in ((x, y), (y, x)):
+            value = b.value(one)
+            if kind == "b" and value is not None:
+                return other if value == neutral else one
+            if kind == "i" and value is not None and value == (-1 if neutral else 0):
+                return other
+        return None
+
+    return rule
+
+
+def _not(b: Builder, args, kind):
+    node = b.nodes[args[0]]
+    return node.args[0] if node.op == "not" else None
+
+
+def _extreme(b: Builder, args, kind):
+    return args[0] if args[0] == args[1] else None
+
+
+_RULES = {
+    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "abs": _abs, "select": _select,
+    "and": _logic(True), "or": _logic(False), "not": _not, "max": _extreme, "min": _extreme,
+}  # fmt: skip

@@ -1,0 +1,69 @@
+"""The native backend: a program's C, built by the system's compiler and called from within jit.
+
+A kernel is registered with XLA under a name that holds the hash of its content, so a program that JAX keeps in its persistent
+cache finds the same kernel in another process.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.lowering.emit_c import source
+from iblf_jax.lowering.program import Program
+from iblf_jax.lowering.step import Packed
+from iblf_jax.lowering.toolchain import built, loaded, threads
+
+_registered: set[str] = set()
+
+
+@lru_cache(maxsize=64)
+def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
+    """The name under which the kernel of a program is registered; builds it if need be.
+
+    Args:
+      program: what a step does.
+      shared, lane: how many numbers of each kind of leaf go in.
+      narrow: for one or two runs, vectors of 16 bytes.
+
+    Raises:
+      ToolchainError: no compiler, or an error from it.
+      UnsupportedError: an operation that C has no word for.
+    """
+    library, key = built(source(program, shared, lane), ("-DVECTOR_BYTES=16",) if narrow else ())
+    name = f"iblf_jax_{key}"
+    if name not in _registered:
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library).iblf_jax_kernel), platform="cpu")
+        _registered.add(name)
+    return name
+
+
+def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
+    """All steps of all runs.
+
+    Args:
+      program: what a step does.
+      shared: (S,) numbers of the shared leaves.
+      lane: (P, runs) numbers of the leaves that differ.
+      carry: rows before the first step.
+      steps: how many.
+      every: sample every so-many-th step, or None.
+
+    Returns:
+      The rows after the last step, and the samples, (rows, samples, runs).
+    """
+    runs = carry.floats.shape[1]
+    narrow = runs * program.dtype.itemsize <= 16
+    name = kernel(program, shared.size, lane.shape[0], narrow)
+    rows = -(-steps // every) if every else 0
+    outputs = (
+        jax.ShapeDtypeStruct(carry.floats.shape, carry.floats.dtype),
+        jax.ShapeDtypeStruct(carry.ints.shape, carry.ints.dtype),
+        jax.ShapeDtypeStruct((rows, len(program.samples) * runs), carry.floats.dtype),
+    )
+    settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
+    floats, ints, samples = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, carry.floats, carry.ints, jnp.asarray(settings))
+    return Packed(floats, ints), samples.reshape(rows, len(program.samples), runs)

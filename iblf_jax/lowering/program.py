@@ -1,0 +1,159 @@
+"""Scalar programs: what one step of a run does, number by number.
+
+A jaxpr works on small arrays; a processor that steps many runs at once wants to see single numbers, each of which is a register
+full of runs.  So arrays are taken apart (`from_jaxpr`): a `Program` is a list of nodes in an order in which each uses only earlier
+ones.  Equal nodes are one node (hash-consing), constants are folded, and what no output needs is dropped.
+
+Every node has one of four classes, by what it depends on; each is computed as seldom as that allows:
+
+    SHARED        the shared leaves alone                   once
+    SHARED|TIME   shared leaves and time                    once a step, for all runs
+    LANE          the leaves of a run                       once a run
+    LANE|TIME     the state of a run                        once a step and run
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.lowering.identities import fold, simplify
+
+SHARED, LANE, TIME = 0, 1, 2
+INPUTS = ("shared", "lane", "carry", "index")
+"""Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step to step, number of the step."""
+
+
+class UnsupportedError(Exception):
+    """What a scalar program cannot express; the message is one line for the user."""
+
+
+class Node(NamedTuple):
+    """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a constant or an input's index."""
+
+    op: str
+    args: tuple[int, ...]
+    kind: str
+    value: Any = None
+
+
+class Builder:
+    """Makes nodes; equal ones are made once."""
+
+    def __init__(self, dtype) -> None:
+        self.dtype = np.dtype(dtype)
+        self.nodes: list[Node] = []
+        self._known: dict[tuple, int] = {}
+
+    def constant(self, value, kind: str) -> int:
+        """The node of a constant."""
+        value = float(self.dtype.type(value)) if kind == "f" else int(value) if kind == "i" else bool(value)
+        return self._add(Node("const", (), kind, value), value.hex() if kind == "f" else value)
+
+    def input(self, op: str, index: int, kind: str) -> int:
+        """The node of an input (`INPUTS`)."""
+        return self._add(Node(op, (), kind, index), index)
+
+    def emit(self, op: str, *args: int, kind: str = "f") -> int:
+        """The node of op(*args): folded, simplified, or new."""
+        nodes = [self.nodes[a] for a in args]
+        if all(n.op == "const" for n in nodes):
+            folded = fold(op, [n.value for n in nodes], [n.kind for n in nodes], kind, self.dtype)
+            if folded is not None:
+                return self.constant(folded, kind)
+        simpler = simplify(self, op, args, kind)
+        if simpler is not None:
+            return simpler
+        if op in ("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"):
+            args = tuple(sorted(args)) if op not in ("max", "min") else args
+        return self._add(Node(op, args, kind), None)
+
+    def value(self, node: int):
+        """The value of a constant node, else None."""
+        return self.nodes[node].value if self.nodes[node].op == "const" else None
+
+    def _add(self, node: Node, tag) -> int:
+        key = (node.op, node.args, node.kind, tag)
+        found = self._known.get(key)
+        if found is None:
+            found = self._known[key] = len(self.nodes)
+            self.nodes.append(node)
+        return found
+
+
+class Program(NamedTuple):
+    """One step as a list of nodes.
+
+    Args:
+      dtype: floating-point type of every "f".
+      nodes: in an order in which each uses earlier ones only.
+      carry: (input node, output node) of every number that goes from step to step; input -1 where the step does not read it.
+      samples: output nodes that a record may ask for.
+      kinds: kind of every carried number.
+    """
+
+    dtype: np.dtype
+    nodes: tuple[Node, ...]
+    carry: tuple[tuple[int, int], ...]
+    samples: tuple[int, ...]
+    kinds: tuple[str, ...]
+
+    def classes(self) -> list[int]:
+        """The class of every node (head of this module); a carried number that a step leaves alone is of class LANE."""
+        fixed = {a for a, b in self.carry if a == b}
+        result: list[int] = []
+        for i, node in enumerate(self.nodes):
+            if node.op in ("shared", "const"):
+                result.append(SHARED)
+            elif node.op == "index":
+                result.append(TIME)
+            elif node.op in ("lane", "carry"):
+                result.append(LANE if node.op == "lane" or i in fixed else LANE | TIME)
+            else:
+                result.append(int(np.bitwise_or.reduce([result[a] for a in node.args], initial=0)))
+        return result
+
+    def counts(self) -> dict[int, Counter]:
+        """Class -> how many of each operation; constants and inputs are not operations."""
+        result: dict[int, Counter] = {c: Counter() for c in range(4)}
+        for node, c in zip(self.nodes, self.classes(), strict=True):
+            if node.op not in INPUTS and node.op != "const":
+                result[c][node.op] += 1
+        return result
+
+
+def finished(builder: Builder, carry_in: list[int], carry_out: list[int], samples: list[int]) -> Program:
+    """The program of the given outputs, without what they do not need, in depth-first order.
+
+    The order matters to a compiler with few registers: a number is computed shortly before its first use.
+    """
+    order: list[int] = []
+    place: dict[int, int] = {}
+    for root in [*carry_out, *samples]:
+        stack = [root]
+        while stack:
+            node = stack[-1]
+            if node in place:
+                stack.pop()
+                continue
+            missing = [a for a in builder.nodes[node].args if a not in place]
+            if missing:
+                stack.extend(reversed(missing))
+                continue
+            place[node] = len(order)
+            order.append(node)
+            stack.pop()
+    nodes = tuple(builder.nodes[i]._replace(args=tuple(place[a] for a in builder.nodes[i].args)) for i in order)
+    carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
+    kinds = tuple(builder.nodes[b].kind for b in carry_out)
+    return Program(builder.dtype, nodes, carry, tuple(place[s] for s in samples), kinds)
+
+
+def frontier(program: Program, classes: list[int], of: int, used_by: Callable[[int], bool]) -> list[int]:
+    """The operations and inputs of class `of` that a node of a class accepted by `used_by` reads, and no constants."""
+    found = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
+    found |= {i for i in [*(o for _, o in program.carry), *program.samples] if used_by(LANE | TIME)}
+    return sorted(a for a in found if classes[a] == of and program.nodes[a].op != "const")

@@ -1,0 +1,159 @@
+"""Values and forward sensitivities of a batch, in one pass: the lowered jvp of the step, several tangents a run.
+
+Gains are few, so forward mode beats reverse mode and needs no memory along time; the numbers that all tangents share are computed
+once, because equal nodes of a scalar program are one node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import rollout
+from iblf_jax.lowering.batch import Executor, batch_of, critical_modes, verdicts
+from iblf_jax.lowering.step import Leaves
+from iblf_jax.paths import get, with_parameters
+
+
+class Directions(NamedTuple):
+    """Tangents of leaves by path; hashable, the numbers are part of what is compiled."""
+
+    items: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]
+
+    @staticmethod
+    def of(directions: Mapping[str, Any]) -> Directions:
+        """From path -> (P, *shape of the leaf)."""
+        arrays = {path: np.asarray(x, float) for path, x in directions.items()}
+        return Directions(tuple((path, x.shape, tuple(x.ravel().tolist())) for path, x in arrays.items()))
+
+    @property
+    def tangents(self) -> int:
+        """P."""
+        return self.items[0][1][0]
+
+    def moved(self, scenario, eps: jax.Array):
+        """The scenario, its leaves moved by eps (P,) along the directions."""
+        values = {}
+        for path, shape, numbers in self.items:
+            change = np.asarray(numbers, eps.dtype).reshape(shape)
+            values[path] = get(scenario, path) + jnp.tensordot(eps, change, 1)
+        return with_parameters(scenario, values)
+
+
+class Differentiated(NamedTuple):
+    """What goes from step to step: the carry, and P tangents of state and accumulators."""
+
+    carry: rollout.Carry
+    tangents: list[jax.Array]
+
+
+def _floats(carry: rollout.Carry) -> tuple[list[jax.Array], Callable]:
+    """The numbers of a carry that have tangents, and the function that puts others in their place."""
+    leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
+    places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+    def replaced(floats):
+        new = list(leaves)
+        for i, x in zip(places, floats, strict=True):
+            new[i] = x
+        state, accumulators = jax.tree.unflatten(treedef, new)
+        return carry._replace(state=state, accumulators=accumulators)
+
+    return [leaves[i] for i in places], replaced
+
+
+def pushed(function: Callable, directions: Directions, scenario, before: Differentiated | None, dtype):
+    """function(scenario, carry) and its derivative along every direction.
+
+    Args:
+      function: gives a list of floats and anything else.
+      directions: P of them.
+      scenario: where.
+      before: carry and tangents, or None where the function takes no carry.
+      dtype: of the tangents.
+    """
+    floats, replaced = _floats(before.carry) if before else ([], lambda _: None)
+
+    def of(eps, floats):
+        return function(directions.moved(scenario, eps), replaced(floats))
+
+    def along(unit, tangents):
+        value, tangent, rest = jax.jvp(of, (jnp.zeros_like(unit), floats), (unit, tangents), has_aux=True)
+        return value, tangent, rest
+
+    units = np.eye(directions.tangents, dtype=dtype)
+    return jax.vmap(along, out_axes=(None, 0, None))(units, before.tangents if before else [])
+
+
+def _floats_and_rest(carry: rollout.Carry):
+    return _floats(carry)[0], carry
+
+
+@lru_cache(maxsize=64)
+def derivative_function(treedef, is_lane: tuple[bool, ...], carry_treedef, method: str, directions: Directions) -> Callable:
+    """One step of value and tangents as a function of lists of leaves, for `lowered`."""
+
+    def step(shared, lane, carry, index):
+        scenario, folds, dt = Leaves(treedef, is_lane, [], []).together(shared, lane)
+
+        def one(scenario, carry):
+            return _floats_and_rest(rollout.advance(scenario, folds, method, dt, carry, index)[0])
+
+        before = jax.tree.unflatten(carry_treedef, carry)
+        _, tangents, carry = pushed(one, directions, scenario, before, dt.dtype)
+        return jax.tree.leaves(Differentiated(carry, tangents)), []
+
+    return step
+
+
+def _floats_of(metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    return {name: x for name, x in metrics.items() if jnp.issubdtype(x.dtype, jnp.floating)}
+
+
+def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str):
+    """`run_batch_jvp` by a lowered step; raises as `batch.run`."""
+    batch = batch_of(executor, scenario, varied, folds, dt)
+
+    def begin(lane):
+        scenario, folds, dt = batch.whole(lane)
+        _, tangents, carry = pushed(lambda s, _: _floats_and_rest(rollout.start(s, folds, dt)), directions, scenario, None, dt.dtype)
+        return Differentiated(carry, tangents)
+
+    before = jax.vmap(begin, axis_size=batch.runs)(batch.leaves.lane)
+    before, _ = batch.advance(derivative_function, before, steps, None, method, directions)
+
+    def end(lane, before):
+        scenario, folds, dt = batch.whole(lane)
+
+        def metrics(scenario, carry):
+            carry, _ = rollout.observe_end(scenario, folds, dt, steps, carry)
+            outcome = rollout.verdict(folds, method, dt, carry, jnp.zeros((1,), dt.dtype))
+            return _floats_of(outcome.metrics), carry
+
+        _, tangents, carry = pushed(metrics, directions, scenario, before, dt.dtype)
+        return carry, tangents
+
+    carry, tangents = jax.vmap(end)(batch.leaves.lane, before)
+    return verdicts(batch, method, carry, critical_modes(batch, steps, carry)), tangents
+
+
+def plain_jvp(scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str):
+    """`run_batch_jvp` on plain vmap."""
+
+    def one(varied):
+        def metrics(eps):
+            moved = directions.moved(with_parameters(scenario, varied), eps)
+            outcome = rollout.run(moved, folds, dt, steps=steps, record_every=None, method=method)
+            return _floats_of(outcome.metrics), outcome
+
+        zero = jnp.zeros((directions.tangents,), dt.dtype)
+        along = jax.vmap(lambda unit: jax.jvp(metrics, (zero,), (unit,), has_aux=True), out_axes=(None, 0, None))
+        _, tangents, outcome = along(np.eye(directions.tangents, dtype=dt.dtype))
+        return outcome, tangents
+
+    return jax.vmap(one)(dict(varied))

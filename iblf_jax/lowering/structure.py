@@ -1,0 +1,158 @@
+"""Rules for the primitives that only move numbers about: they run here and now, on node numbers.
+
+An index that is known only in the run (the piece of a spline at time t) becomes a choice among the entries that it can mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from iblf_jax.lowering.from_jaxpr import Ids, choose, constants
+from iblf_jax.lowering.program import Builder, UnsupportedError
+
+MOST_CHOICES = 64
+"""Entries among which an index of the run may choose."""
+
+
+def _reshape(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
+    return x.reshape(eqn.outvars[0].aval.shape)
+
+
+def _broadcast_in_dim(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
+    shape, dimensions = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    spread = [1] * len(shape)
+    for axis, place in enumerate(dimensions):
+        spread[place] = x.shape[axis]
+    return np.broadcast_to(x.reshape(spread), shape)
+
+
+def _transpose(b: Builder, eqn, x: Ids) -> Ids:
+    return np.transpose(x, eqn.params["permutation"])
+
+
+def _slice(b: Builder, eqn, x: Ids) -> Ids:
+    p = eqn.params
+    strides = p["strides"] or (1,) * x.ndim
+    return x[tuple(slice(lo, hi, s) for lo, hi, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
+
+
+def _concatenate(b: Builder, eqn, *operands: Ids) -> Ids:
+    return np.concatenate(operands, axis=eqn.params["dimension"])
+
+
+def _stack(b: Builder, eqn, *operands: Ids) -> Ids:
+    return np.stack(operands, axis=eqn.params.get("axis", eqn.params.get("dimension", 0)))
+
+
+def _split(b: Builder, eqn, x: Ids):
+    return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"])
+
+
+def _rev(b: Builder, eqn, x: Ids) -> Ids:
+    return np.flip(x, eqn.params["dimensions"])
+
+
+def _pad(b: Builder, eqn, x: Ids, filler: Ids) -> Ids:
+    for axis, (low, high, interior) in enumerate(eqn.params["padding_config"]):
+        size = x.shape[axis] + max(x.shape[axis] - 1, 0) * interior
+        shape = list(x.shape)
+        shape[axis] = size + max(low, 0) + max(high, 0)
+        padded = np.full(shape, int(filler))
+        where = [slice(None)] * x.ndim
+        where[axis] = slice(max(low, 0), max(low, 0) + size, interior + 1)
+        padded[tuple(where)] = x
+        where[axis] = slice(max(-low, 0), shape[axis] - max(-high, 0))
+        x = padded[tuple(where)]
+    return x
+
+
+def _iota(b: Builder, eqn, *_: Ids) -> Ids:
+    shape, axis = eqn.params["shape"], eqn.params["dimension"]
+    line = np.arange(shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(shape))])
+    return constants(b, np.broadcast_to(line, shape).astype(eqn.outvars[0].aval.dtype))
+
+
+def _now(eqn, *operands):
+    """The primitive itself, run on node numbers."""
+    with jax.ensure_compile_time_eval():
+        return np.asarray(eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params), np.int64)
+
+
+def _chosen(b: Builder, index: Ids, size: int, at: Callable, known: dict[int, int] | None = None) -> Ids:
+    """`at(values of the index)`; where the run alone knows an entry, a choice among its values 0 ... size - 1."""
+    known = known or {}
+    flat = [known.get(i, b.value(i)) for i in index.ravel().tolist()]
+    unknown = [i for i, v in zip(index.ravel().tolist(), flat, strict=True) if v is None]
+    if not unknown:
+        return at(np.asarray(flat, np.int32).reshape(index.shape))
+    if size ** len({*unknown, *known}) > MOST_CHOICES:
+        raise UnsupportedError(f"indices that only the run knows choose among more than {MOST_CHOICES} entries")
+    node = unknown[0]
+    cases = [_chosen(b, index, size, at, known | {node: v}) for v in range(size)]
+    result = cases[-1]
+    for v in reversed(range(size - 1)):
+        result = choose(b, b.emit("le", node, b.constant(v, "i"), kind="b"), cases[v], result)
+    return result
+
+
+def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
+    def at(values):
+        params = dict(eqn.params, fill_value=None, mode=jax.lax.GatherScatterMode.CLIP)
+        with jax.ensure_compile_time_eval():
+            return np.asarray(eqn.primitive.bind(jax.numpy.asarray(x, np.int32), jax.numpy.asarray(values), **params), np.int64)
+
+    return _chosen(b, index, max(x.shape, default=1), at)
+
+
+def _dynamic_slice(b: Builder, eqn, x: Ids, *starts: Ids) -> Ids:
+    def at(values):
+        corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, eqn.params["slice_sizes"], strict=True)]
+        return x[tuple(slice(c, c + s) for c, s in zip(corner, eqn.params["slice_sizes"], strict=True))]
+
+    return _chosen(b, np.asarray(starts), max(x.shape, default=1), at)
+
+
+def _dynamic_update_slice(b: Builder, eqn, x: Ids, new: Ids, *starts: Ids) -> Ids:
+    def at(values):
+        corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, new.shape, strict=True)]
+        result = x.copy()
+        result[tuple(slice(c, c + s) for c, s in zip(corner, new.shape, strict=True))] = new
+        return result
+
+    return _chosen(b, np.asarray(starts), max(x.shape, default=1), at)
+
+
+def _scatter(op: str | None) -> Callable:
+    """Scatter at known places: which update lands where is found by scattering their numbers."""
+
+    def rule(b: Builder, eqn, x: Ids, index: Ids, new: Ids) -> Ids:
+        values = [b.value(i) for i in index.ravel().tolist()]
+        if any(v is None for v in values):
+            raise UnsupportedError(f"{eqn.primitive.name} at an index that only the run knows")
+        places = np.asarray(values, np.int32).reshape(index.shape)
+        with jax.ensure_compile_time_eval():
+            numbers = jax.numpy.arange(new.size, dtype=np.int32).reshape(new.shape)
+            params = {k: eqn.params[k] for k in eqn.params if k not in ("update_jaxpr", "update_consts")}
+            landed = jax.lax.scatter(jax.numpy.full(x.shape, -1, np.int32), places, numbers, **params)
+        source = np.asarray(landed)
+        if np.sum(source >= 0) != new.size:
+            raise UnsupportedError(f"{eqn.primitive.name} with repeated or outlying places")
+        result, flat = x.copy().ravel(), new.ravel()
+        for place, which in enumerate(source.ravel().tolist()):
+            if which >= 0:
+                old, update = int(result[place]), int(flat[which])
+                result[place] = update if op is None else b.emit(op, old, update, kind=b.nodes[old].kind)
+        return result.reshape(x.shape)
+
+    return rule
+
+
+STRUCTURE: dict[str, Callable] = {
+    "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "broadcast_in_dim": _broadcast_in_dim, "transpose": _transpose,
+    "slice": _slice, "concatenate": _concatenate, "stack": _stack, "split": _split, "rev": _rev, "pad": _pad, "iota": _iota,
+    "gather": _gather, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "scatter": _scatter(None),
+    "scatter-add": _scatter("add"), "scatter_add": _scatter("add"), "scatter_mul": _scatter("mul"), "scatter-mul": _scatter("mul"),
+}  # fmt: skip

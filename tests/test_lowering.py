@@ -1,0 +1,217 @@
+"""Scalar programs: every member of every family lowers, and a program does what the step that it came from does."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import lowering, rollout
+from iblf_jax.lowering import batch, native, program
+from iblf_jax.lowering.from_jaxpr import closed
+from iblf_jax.lowering.identities import FUNCTIONS
+from iblf_jax.lowering.step import Shapes, pack
+from iblf_jax.metrics import standard
+from iblf_jax.scenario import canonical
+
+PRESET = ij.presets.zhang_yan_2024()
+DT = 1e-3
+STANDARD = standard()
+SPECIAL = {
+    "planar_chain": lambda cls: cls(mass=[2.0, 0.85], length=[0.35, 0.31], centre=0.16, inertia=0.03),
+    "waypoint_spline": lambda cls: cls(times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]),
+    "quintic": lambda cls: cls(start=0.5, end=0.6, duration=2.0),
+    "sum": lambda cls: cls((ij.disturbances.Friction(viscous=0.1, coulomb=0.2), ij.disturbances.Step(1.0, 0.0))),
+    "tip_force": lambda cls: cls(amplitude=[1.0, 2.0], frequency=2.0),
+    "funnel": lambda cls: cls(initial=0.4, final=0.2, rate=1.0),
+    "constant": lambda cls: cls(0.95),
+}
+"""Members whose fields do not fit together when each holds a small positive number."""
+
+
+def example(name: str, cls):
+    """A member with plausible numbers."""
+    if name in SPECIAL:
+        return SPECIAL[name](cls)
+    needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING]
+    return cls(**{f.name: 0.3 + 0.1 * i for i, f in enumerate(needed)})
+
+
+def with_member(family: str, name: str, cls):
+    """The paper's scenario with one part exchanged."""
+    if family == "barriers":
+        law = PRESET.controller
+        barrier = cls()
+        o = law.o if getattr(barrier, "uses_o", True) else None
+        return dataclasses.replace(PRESET, controller=ij.controllers.Backstepping(law.k1, law.K2, o, barrier))
+    kept = {"two_link": PRESET.plant, "backstepping": PRESET.controller}
+    part = kept.get(name) or (PRESET.reference if (family, name) == ("references", "sinusoid") else example(name, cls))
+    if family == "bounds":
+        upper = PRESET.bounds.upper if name == "sinusoid" else part
+        return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(PRESET.bounds.lower, upper))
+    fields = {"robots": ("plant", "model")}.get(family, (family[:-1],))
+    return dataclasses.replace(PRESET, **dict.fromkeys(fields, part))
+
+
+FAMILIES = ("barriers", "bounds", "controllers", "disturbances", "observers", "references", "robots")
+MEMBERS = [(f, n) for f in FAMILIES for n in sorted(getattr(getattr(ij, f), "MEMBERS", {}))]
+
+
+def evaluate(p: program.Program, shared, lane, carry, index):
+    """The outputs of a program by NumPy, node by node."""
+    known = []
+    inputs = {"shared": shared, "lane": lane, "carry": carry}
+    with np.errstate(all="ignore"):
+        for node in p.nodes:
+            args = [known[a] for a in node.args]
+            if node.op == "const":
+                known.append(np.asarray(node.value, p.dtype if node.kind == "f" else None))
+            elif node.op == "index":
+                known.append(np.asarray(index))
+            elif node.op in inputs:
+                known.append(inputs[node.op][node.value])
+            elif node.op == "select":
+                known.append(np.where(*args))
+            elif node.op == "convert":
+                known.append(np.asarray(args[0]).astype({"f": p.dtype, "i": int, "b": bool}[node.kind]))
+            elif node.op == "not":
+                known.append(~args[0])
+            else:
+                known.append(FUNCTIONS[node.op](*args))
+    return [known[o] for _, o in p.carry]
+
+
+def numbers(leaves) -> list:
+    return [x for leaf in leaves for x in np.asarray(leaf).ravel()]
+
+
+@pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
+def test_every_member_lowers_and_its_program_is_its_step(family, name):
+    scenario = canonical(with_member(family, name, getattr(ij, family).MEMBERS[name]))
+    dt, index = jnp.asarray(DT), jnp.int32(3)
+    varied = {"initial.q": jnp.asarray([[0.8, 0.8]]), "plant.mass[1]": jnp.asarray([0.9])}
+    run = batch.batch_of(native.run, scenario, varied, STANDARD, dt)
+    carry = jax.tree.map(lambda x: x[0], run.start())
+    changed, _, dt = run.whole([x[0] for x in run.leaves.lane])
+    p, _, _ = run.program(batch.step_function, jax.tree.map(lambda x: x[None], carry), "heun", False)
+    expected = numbers(jax.tree.leaves(jax.jit(lambda c: rollout.advance(changed, STANDARD, "heun", dt, c, index)[0])(carry)))
+    found = evaluate(p, numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index)
+    np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
+
+
+def lowered_function(f, *arrays):
+    """The outputs of `f` by its scalar program, with constants for inputs."""
+    b = program.Builder(np.float64)
+    jaxpr = jax.make_jaxpr(f)(*arrays)
+    operands, values = [], []
+    for x in arrays:
+        kind = "f" if np.issubdtype(x.dtype, np.floating) else "i"
+        operands.append(np.asarray([b.input("carry", len(values) + i, kind) for i in range(x.size)]).reshape(x.shape))
+        values += x.ravel().tolist()
+    (out,) = closed(b, jaxpr, operands)
+    p = program.finished(b, [], [], [])._replace(nodes=tuple(b.nodes), carry=tuple((-1, int(i)) for i in out.ravel()))
+    return np.asarray(evaluate(p, [], [], [np.asarray(v) for v in values], 0)).reshape(out.shape)
+
+
+X, Y, K = np.linspace(-1.4, 1.3, 6).reshape(2, 3), np.linspace(0.2, 0.9, 6).reshape(3, 2), np.arange(3)
+CASES = {
+    "matmul": (lambda x, y: x @ y, X, Y),
+    "einsum": (lambda x, y: jnp.einsum("ij,jk->ki", x, y), X, Y),
+    "cumsum": (lambda x: jnp.cumsum(x[:, ::-1], axis=1), X),
+    "reductions": (lambda x: jnp.stack([x.sum(), x.max(), x.min(), x.prod(), jnp.abs(x).mean()]), X),
+    "argmin": (lambda x: jnp.argmin(x, axis=0) + jnp.argmax(x, axis=0), X),
+    "argmin of nan": (lambda x: jnp.argmin(x.at[1, 1].set(jnp.nan), axis=1), X),
+    "updates": (lambda x: x.at[1, 0].set(7.0).at[0, 1:].add(2.0).at[1].mul(3.0), X),
+    "powers": (lambda x: x**7 + x**-2 + jnp.abs(x) ** 1.5 + jnp.float_power(2.0, x), X),
+    "elementary": (lambda y: jnp.tanh(y) + jnp.arctan2(y, 1 - y) + jnp.log1p(y) + jax.scipy.special.erf(y) + jax.nn.sigmoid(y), Y),
+    "pad and stack": (lambda x: jnp.stack([jnp.pad(x, 1), jnp.pad(x, ((0, 2), (1, 1)))]), X),
+    "own index": (lambda x, k: x[:, k[1]] + jax.lax.dynamic_slice(x, (k[0], k[1]), (1, 1))[0, 0], X, K),
+    "scan": (lambda x: jax.lax.scan(lambda c, r: (c + r, c * r), jnp.zeros(3), x, reverse=True)[1], X),
+    "cond": (lambda x: jax.lax.cond(x[0, 0] > 0, jnp.sin, jnp.cos, x), X),
+    "switch": (lambda x, k: jax.lax.switch(k[2], [jnp.sin, jnp.cos, jnp.exp], x), X, K),
+    "where and round": (lambda x: jnp.where(x > 0, jnp.round(x * 3), jnp.floor(x)) + jnp.sign(x) * jnp.clip(x, -0.5, 0.5), X),
+    "gradient": (lambda x: jax.grad(lambda x: jnp.sum(jnp.sin(x) @ jnp.cos(x).T))(x), X),
+    "gradient of a gather": (lambda x: jax.grad(lambda x: jnp.sum(x[0, :2] * x[1, 1:]))(x), X),
+    "determinant": (lambda x: jnp.linalg.norm(x, axis=1), X),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_primitives(name):
+    f, *arrays = CASES[name]
+    np.testing.assert_allclose(lowered_function(f, *arrays), f(*map(jnp.asarray, arrays)), rtol=1e-12, atol=1e-14)
+
+
+REFUSED = {
+    "while": lambda x: jax.lax.while_loop(lambda c: c < 3, lambda c: c + 1, x[0, 0]),
+    "too long": lambda x: jax.lax.scan(lambda c, _: (c * 2, None), x[0, 0], length=1000)[0],
+    "sort": lambda x: jnp.sort(x)[0],
+    "float32": lambda x: x.astype(jnp.float32)[0, 0] * 2,
+    "uint32": lambda x: jnp.sum(x).astype(jnp.uint32) * jnp.uint32(2),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_lower_says_why_in_one_line(name):
+    with pytest.raises(program.UnsupportedError) as error:
+        lowered_function(REFUSED[name], X)
+    assert str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_identities_keep_nan_and_infinity():
+    b = program.Builder(np.float64)
+    x = b.input("carry", 0, "f")
+    zero, one = b.constant(0.0, "f"), b.constant(1.0, "f")
+    assert b.emit("mul", x, one) == b.emit("add", x, zero) == b.emit("sub", x, zero) == b.emit("div", x, one) == x
+    assert b.emit("mul", x, zero) != zero
+    assert b.emit("sub", x, x) != zero
+    assert b.emit("div", x, x) != one
+    assert b.emit("eq", x, x, kind="b") != b.constant(True, "b")
+    assert b.emit("add", one, x) == b.emit("add", x, one)
+
+
+def test_classes_of_a_program():
+    scenario = canonical(PRESET)
+    varied = {"plant.mass[1]": jnp.asarray([0.9])}
+    run = batch.batch_of(native.run, scenario, varied, STANDARD, jnp.asarray(DT))
+    p, shapes, _ = run.program(batch.step_function, run.start(), "rk4", False)
+    classes = p.classes()
+    sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
+    assert sines.count(program.LANE | program.TIME) <= 4 < sines.count(program.TIME), "signals of time belong to no run"
+    assert len(p.carry) == shapes.size
+    packed = pack(jax.tree.leaves(run.start()), shapes, jnp.float64, 1)
+    assert len(packed.floats) + len(packed.ints) == shapes.size
+    assert Shapes.of(jax.tree.leaves(run.start()), 1) == shapes
+
+
+@ij.component
+class _Odd(ij.observers.NoObserver):
+    def estimate(self, t, q, dq, model, state):
+        return jnp.sort(q) * 0
+
+
+def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
+    scenario = canonical(dataclasses.replace(PRESET, observer=_Odd()))
+    varied = {"plant.mass[1]": jnp.asarray([0.8, 0.9])}
+    lowering._told.clear()
+
+    def run():
+        return jax.jit(lambda: lowering.run_batch(scenario, varied, STANDARD, jnp.asarray(DT), steps=3, method="euler"))()
+
+    with pytest.warns(lowering.BackendWarning, match="vmap.*'sort'"):
+        outcome = run()
+    assert outcome.status.shape == (2,)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run()
+
+
+def test_an_unknown_backend_is_refused():
+    with pytest.raises(ValueError, match="backend"):
+        lowering.run_batch(PRESET, {"initial.q": jnp.ones((2, 2))}, (), jnp.asarray(DT), steps=1, method="rk4", backend="fpga")

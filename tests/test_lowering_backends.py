@@ -1,0 +1,214 @@
+"""Backends: they agree with the reference run, runs do not touch each other, and what goes wrong falls back."""
+
+from __future__ import annotations
+
+import os
+import stat
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import lowering
+from iblf_jax.lowering import native, toolchain
+from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.metrics import standard
+from iblf_jax.scenario import canonical
+
+
+def _has_compiler() -> bool:
+    try:
+        toolchain.compiler()
+    except ToolchainError:
+        return False
+    return True
+
+
+needs_compiler = pytest.mark.skipif(not _has_compiler(), reason="no C++ compiler")
+TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
+COMPILED = {}
+
+
+def batch(dtype="float64", backend="native", steps=400, values=None, record_every=None, dt=1e-3):
+    """The outcome of some runs of the paper's scenario; one compilation for each set of options."""
+    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    varied = {k: jnp.asarray(v, dtype) for k, v in (values or draws(5)).items()}
+    key = (dtype, backend, steps, record_every)
+    if key not in COMPILED:
+        options = {"steps": steps, "method": "rk4", "record_every": record_every, "backend": backend}
+        COMPILED[key] = jax.jit(lambda s, v, f, dt: lowering.run_batch(s, v, f, dt, **options))
+    return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, folds, jnp.asarray(dt, dtype)))
+
+
+def draws(runs, seed=0):
+    rng = np.random.default_rng(seed)
+    return {"plant.mass[1]": rng.uniform(0.6, 1.1, runs), "initial.q": 0.8 + 0.02 * rng.standard_normal((runs, 2))}
+
+
+def assert_same(found, expected, tolerance):
+    """Equal up to a tolerance relative to the size of each array; infinities in the same places."""
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+        finite = np.isfinite(y)
+        scale = 1 + np.max(np.abs(y[finite]), initial=0)
+        np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * scale)
+
+
+@needs_compiler
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_native_agrees_with_the_reference(dtype):
+    found, expected = batch(dtype), batch(dtype, "vmap")
+    assert_same(found, expected, TOLERANCE[dtype])
+    np.testing.assert_array_equal(found.status, expected.status)
+
+
+def test_xla_agrees_with_the_reference():
+    found, expected = batch(backend="xla"), batch(backend="vmap")
+    assert_same(found, expected, TOLERANCE["float64"])
+    np.testing.assert_array_equal(found.status, expected.status)
+
+
+def test_xla_in_blocks_and_streams_agrees(monkeypatch):
+    monkeypatch.setattr(lowering.xla, "BLOCK", 2)
+    monkeypatch.setenv("IBLF_JAX_THREADS", "2")
+    scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
+    options = {"steps": 3, "method": "euler", "record_every": 2}
+    varied = {k: jnp.asarray(v) for k, v in draws(7).items()}
+    found, expected = (
+        jax.jit(lambda s, v, b=b: lowering.run_batch(s, v, (), dt, backend=b, **options))(scenario, varied) for b in ("xla", "vmap")
+    )
+    assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
+
+
+@needs_compiler
+def test_native_records_what_simulate_records():
+    steps, every = 50, 7
+    found = batch(steps=steps, record_every=every)
+    arrays, controller, observer = found.records
+    scenario = ij.presets.zhang_yan_2024()
+    for i in range(2):
+        changed = ij.with_parameters(scenario, {k: v[i] for k, v in draws(5).items()})
+        run = ij.simulate(changed, duration=steps * 1e-3, dt=1e-3, record_every=every)
+        for name, values in arrays.items():
+            np.testing.assert_allclose(values[i], getattr(run, name), rtol=1e-9, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(observer[i], run.observer_state, rtol=1e-9, atol=1e-9)
+    assert controller == ()
+
+
+@needs_compiler
+def test_results_do_not_depend_on_place_or_number_of_runs():
+    values = draws(83)
+    together = batch("float32", values=values)
+    for few in (slice(0, 5), slice(40, 45), slice(78, 83)):
+        alone = batch("float32", values={k: v[few] for k, v in values.items()})
+        for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_array_equal(x[few], y)
+
+
+@needs_compiler
+def test_a_run_that_fails_does_not_touch_the_others():
+    values = draws(20)
+    good = batch(values=values)
+    broken = {k: v.copy() for k, v in values.items()}
+    broken["plant.mass[1]"][3] = np.nan
+    broken["initial.q"][7] = 40.0
+    found = batch(values=broken)
+    others = [i for i in range(20) if i not in (3, 7)]
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
+        np.testing.assert_array_equal(x[others], y[others])
+    assert ij.Status.NOT_FINITE in ij.Status(int(found.status[3]))
+    assert ij.Status.BOUND_VIOLATED in ij.Status(int(found.status[7]))
+    np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
+
+
+@needs_compiler
+def test_a_step_that_is_too_large_is_seen_by_every_backend():
+    values = {"plant.mass[1]": np.asarray([0.85, 0.05, 0.02, 0.85, 0.9]), "initial.q": np.full((5, 2), 0.8)}
+    found, expected = batch(values=values, dt=4e-3), batch(values=values, dt=4e-3, backend="vmap")
+    np.testing.assert_array_equal(found.status, expected.status)
+    assert np.any(found.status & ij.Status.STEP_TOO_LARGE)
+
+
+@needs_compiler
+def test_one_run_and_threads():
+    one = batch(values=draws(1))
+    os.environ["IBLF_JAX_THREADS"] = "3"
+    try:
+        assert native.threads() == 3
+    finally:
+        del os.environ["IBLF_JAX_THREADS"]
+    assert one.status.shape == (1,)
+    assert_same(one, jax.tree.map(lambda x: x[:1], batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()})), 1e-12)
+
+
+@needs_compiler
+def test_forward_sensitivities():
+    scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
+    directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
+    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
+
+    def pushed(backend):
+        return jax.jit(lambda s, v: lowering.run_batch_jvp(s, v, directions, standard(), dt, steps=60, method="rk4", backend=backend))(
+            scenario, varied
+        )
+
+    outcome, tangents = pushed("native")
+    reference, expected = pushed("vmap")
+    assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
+    assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
+    assert tangents["rmse"].shape == (3, 3, 2)
+
+
+def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(lowering, "_told", set())
+    native.kernel.cache_clear()
+    called = []
+    with pytest.warns(lowering.BackendWarning, match="no-such-compiler.*xla"):
+        lowering.with_fallback("auto", lambda executor: called.append(executor) or fail_if_native(executor), lambda: None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lowering.with_fallback("auto", fail_if_native, lambda: None)
+    assert called == [native.run, lowering.xla.run]
+
+
+def fail_if_native(executor):
+    if executor is native.run:
+        toolchain.compiler()
+    return executor
+
+
+@needs_compiler
+def test_a_compiler_that_fails_is_reported_in_one_line():
+    with pytest.raises(ToolchainError, match=r"failed: .*error") as error:
+        toolchain.built("this is not C;")
+    assert "\n" not in str(error.value)
+
+
+@needs_compiler
+def test_the_cache_is_private_and_found_again(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    library, key = toolchain.built('extern "C" int one(void) { return 1; }')
+    folder = tmp_path / "iblf_jax"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert library.name == f"{key}.so"
+    assert [p.name for p in folder.iterdir()] == [library.name], "nothing temporary stays"
+    made = library.stat().st_mtime_ns
+    assert toolchain.built('extern "C" int one(void) { return 1; }')[0].stat().st_mtime_ns == made
+    library.chmod(0o777)
+    toolchain.built('extern "C" int one(void) { return 1; }')
+    assert stat.S_IMODE(library.stat().st_mode) & 0o022 == 0, "what others could have written is built anew"
+
+
+def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
+    target = tmp_path / "elsewhere"
+    target.mkdir()
+    (tmp_path / "iblf_jax").symlink_to(target)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(ToolchainError, match="not a directory of this user"):
+        toolchain.cache_directory()
