@@ -13,6 +13,14 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
+from iblf_jax._monte_carlo import monte_carlo as monte_carlo
+from iblf_jax.distributions import choice as choice
+from iblf_jax.distributions import factor as factor
+from iblf_jax.distributions import log_uniform as log_uniform
+from iblf_jax.distributions import normal as normal
+from iblf_jax.distributions import offset as offset
+from iblf_jax.distributions import uniform as uniform
+from iblf_jax.distributions import value as value
 from iblf_jax.io import load_rollouts as load_rollouts
 from iblf_jax.io import save_rollouts as save_rollouts
 from iblf_jax.paths import parameters as parameters
@@ -32,6 +40,7 @@ from iblf_jax.scenario_file import load_scenario as load_scenario
 from iblf_jax.scenario_file import save_scenario as save_scenario
 from iblf_jax.stability import recommended_dt as recommended_dt
 from iblf_jax.status import Status as Status
+from iblf_jax.study import Study as Study
 
 __version__ = _version("iblf_jax")
 

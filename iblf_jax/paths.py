@@ -141,6 +141,18 @@ def _entry(part: Any, index: int) -> Any:
     return part[index]
 
 
+def sign_at(scenario: Scenario, path: str) -> str | None:
+    """The sign that the leaf at a path must have: None, "positive" or "nonnegative"."""
+    part, sign = scenario, None
+    for token in parse(expand(path)[0]):
+        if isinstance(token, int):
+            part = _entry(part, token)
+        else:
+            sign = next(f.metadata.get("sign") for f in dataclasses.fields(part) if f.name == token)
+            part = getattr(part, token)
+    return sign
+
+
 def _field(part: Any, name: str) -> Any:
     """A non-static field of a component, by name."""
     if not dataclasses.is_dataclass(part):

@@ -232,23 +232,28 @@ def simulate(
     scenario = canonical(scenario)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype)
-    outcome = _run_compiled(scenario, folds, jnp.asarray(dt, dtype), steps=steps, record_every=record_every, method=method)
+    result = trajectory(scenario, folds, jnp.asarray(dt, dtype), steps=steps, method=method, record_every=record_every)
+    if checks.is_concrete(result.status) and result.status.ndim == 0:
+        _report(result, steps, throw)
+    return result
+
+
+def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int) -> Rollout:
+    """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
+    outcome = _run_compiled(scenario, folds, dt, steps=steps, record_every=record_every, method=method)
     arrays, controller_state, observer_state = outcome.records
     units = tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
-    result = Rollout(
+    return Rollout(
         scenario=scenario,
         controller_state=controller_state,
         observer_state=observer_state,
         metrics=Metrics(outcome.metrics, units),
         status=outcome.status,
         fastest_mode=outcome.fastest_mode,
-        dt=jnp.asarray(dt, dtype),
+        dt=dt,
         method=method,
         **arrays,
     )
-    if checks.is_concrete(outcome.status) and outcome.status.ndim == 0:
-        _report(result, steps, throw)
-    return result
 
 
 def _report(result: Rollout, steps: int, throw: bool) -> None:

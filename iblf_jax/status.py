@@ -27,9 +27,13 @@ class Status(enum.IntFlag):
     """The torque that the law asked for was cut to the actuator's limit."""
     GUARD_ACTIVE = 32
     """A joint came so near its bound that the barrier's slope was held at its greatest finite value."""
+    INADMISSIBLE_DRAW = 64
+    """A study drew a value that its leaf does not admit (a negative mass, say): the run was not made, its metrics are NaN."""
 
 
-FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE
+FAILED = (
+    Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
+)
 """The flags that make a run one that did not do its job."""
 
 VELOCITY_LIMIT = 1e4
@@ -43,6 +47,7 @@ _WORDS = {
     Status.INFEASIBLE_REFERENCE: "the reference leaves the bounds",
     Status.TORQUE_SATURATED: "the torque was saturated",
     Status.GUARD_ACTIVE: "the guard at the wall was active",
+    Status.INADMISSIBLE_DRAW: "a drawn parameter was inadmissible, so the run was not made",
 }
 
 

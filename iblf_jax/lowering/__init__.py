@@ -9,13 +9,29 @@ from collections.abc import Mapping
 
 import jax
 
+from iblf_jax import checks
 from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, as_one_function, run
 from iblf_jax.scenario import Scenario
 
 
+BACKENDS = ("auto", "vmap")
+"""How a batch can be executed."""
+
+_SMALL = 64
+"""Batches up to this size gain from being one machine function; from 128 on XLA refuses some of its fusions there."""
+
+
 def run_batch(
-    scenario: Scenario, varied: Mapping[str, jax.Array], folds, dt: jax.Array, *, steps: int, method: str, record_every: int | None = None
+    scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    folds,
+    dt: jax.Array,
+    *,
+    steps: int,
+    method: str,
+    record_every: int | None = None,
+    backend: str = "auto",
 ) -> Outcome:
     """Runs a scenario once for every entry of `varied`; call it inside `jit`.
 
@@ -27,6 +43,7 @@ def run_batch(
       steps: number of steps, static.
       method: integrator, static.
       record_every: record every so-many-th step, or None for metrics only, static.
+      backend: one of BACKENDS, static.
 
     Returns:
       An `Outcome` with a leading batch axis on every array.
@@ -35,4 +52,7 @@ def run_batch(
     def one(varied):
         return run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
 
-    return as_one_function(jax.vmap(one))(dict(varied))
+    checks.one_of("backend", backend, BACKENDS)
+    batch = min(len(x) for x in varied.values())
+    batched = jax.vmap(one)
+    return (as_one_function(batched) if batch <= _SMALL else batched)(dict(varied))

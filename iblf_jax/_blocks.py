@@ -1,0 +1,188 @@
+"""Blocks: the one compiled shape in which studies run, whatever their size.
+
+XLA rounds differently at different batch sizes, so every device always runs a block of the same number of runs: run i sits in block
+i // B at place i % B, whether a study has ten runs or a million, one device or eight, one process or many, and however many blocks are
+in flight.  The last block is filled up with repetitions, which are cut off.  Blocks are dealt to the devices of this process in turn,
+each with its own copy of the same program: runs are independent, so devices never talk to each other.  (`shard_map` would do the same
+with one program for all, but XLA compiles that one otherwise for one device than for two, and the last digits differ.)
+
+Memory does not grow with time: a block returns its folds' results, its status and its draws.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax._draws import Cases, Lanes, Target, draw, merge
+from iblf_jax.lowering import BACKENDS, run_batch
+from iblf_jax.status import Status, flag
+
+BLOCK = {"cpu": 256}
+"""Runs in a block, by platform."""
+BLOCK_ELSEWHERE = 16384
+MEMORY = 256 * 2**20
+"""Bytes that runs in flight may take, unless the caller says otherwise."""
+MOST_IN_FLIGHT = 4
+"""Blocks that are queued on a device at once: enough to keep it busy."""
+
+
+class Program(NamedTuple):
+    """What is compiled; static."""
+
+    targets: tuple[Target, ...]
+    steps: int
+    method: str
+    backend: str
+
+
+class Shared(NamedTuple):
+    """What all runs share; traced."""
+
+    cases: Cases
+    folds: Any
+    dt: jax.Array
+
+
+class Results(NamedTuple):
+    """What a run leaves, run axis first."""
+
+    metrics: dict[str, Any]
+    status: Any
+    fastest_mode: Any
+    samples: dict[str, Any]
+
+
+def block_size() -> int:
+    """Runs in a block on the devices of this process."""
+    return BLOCK.get(jax.default_backend(), BLOCK_ELSEWHERE)
+
+
+def check_backend(backend: str) -> str:
+    """The backend's name; ValueError for another."""
+    checks.one_of("backend", backend, BACKENDS)
+    return backend
+
+
+def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
+    """`x` where the draws were admissible, else NaN (-1 for whole numbers)."""
+    mark = jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else -1
+    return jnp.where(admissible.reshape(admissible.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(mark, x.dtype))
+
+
+def _draws(program: Program, shared: Shared, lanes: Lanes):
+    """The leaves that a block's runs replace, the draws, and whether they were admissible."""
+
+    def one(lane: Lanes):
+        made, drawn, admissible = draw(shared.cases, program.targets, lane.index, lane.points, lane.u)
+        return merge(shared.cases.scenario, lane.points, made), drawn, admissible
+
+    # Without the barrier XLA works the random numbers into every operation of the run: 18 s to compile instead of 5.
+    return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
+
+
+def _block(program: Program, shared: Shared, lanes: Lanes) -> Results:
+    """Draws and runs one block."""
+    varied, drawn, admissible = _draws(program, shared, lanes)
+    outcome = run_batch(
+        shared.cases.scenario, varied, shared.folds, shared.dt, steps=program.steps, method=program.method, backend=program.backend
+    )
+    metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
+    status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
+    return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
+
+
+def _record_block(program: Program, shared: Shared, lanes: Lanes, record_every: int):
+    """Positions of a block's runs, (B, T, n), and their status."""
+    varied, _, admissible = _draws(program, shared, lanes)
+    outcome = run_batch(
+        shared.cases.scenario,
+        varied,
+        shared.folds,
+        shared.dt,
+        steps=program.steps,
+        method=program.method,
+        backend=program.backend,
+        record_every=record_every,
+    )
+    arrays = outcome.records[0]
+    return {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}, arrays["t"], outcome.status, admissible
+
+
+@partial(jax.jit, static_argnames=("program", "record_every"))
+def _execute(shared: Shared, lanes: Lanes, *, program: Program, record_every: int | None = None):
+    if record_every is None:
+        return _block(program, shared, lanes)
+    return _record_block(program, shared, lanes, record_every)
+
+
+def run_blocks(
+    program: Program,
+    shared: Shared,
+    lanes_of: Callable[[np.ndarray], Lanes],
+    blocks: Sequence[int],
+    *,
+    chunk: int | None = None,
+    memory: float = MEMORY,
+    devices: Sequence[jax.Device] | None = None,
+    record_every: int | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Runs blocks and yields (block, its results on the host), in order.
+
+    Args:
+      program, shared: what to run.
+      lanes_of: cases (m,) -> what differs between them; it must accept cases past the last one and repeat there.
+      blocks: numbers of the blocks to run.
+      chunk: runs in flight; from `memory` if not given.
+      memory: bytes that runs in flight may take.
+      devices: the devices; all of this process if not given.
+      record_every: record trajectories instead of metrics.
+    """
+    size = block_size()
+    places = list(jax.local_devices() if devices is None else devices)[: max(1, len(blocks))]
+    call = partial(_execute, program=program, record_every=record_every)
+    copies = [jax.device_put(shared, place) for place in places]
+    _compile(program, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
+    waiting: deque = deque()
+    for k, block in enumerate(blocks):
+        place = k % len(places)
+        lanes = jax.device_put(lanes_of(np.arange(block * size, (block + 1) * size)), places[place])
+        out = call(copies[place], lanes)
+        waiting.append((block, out))
+        allowed = _in_flight(chunk, memory, size, (lanes, out), len(places))
+        while len(waiting) >= allowed:
+            yield _harvest(*waiting.popleft())
+    while waiting:
+        yield _harvest(*waiting.popleft())
+
+
+def _compile(program: Program, record_every: int | None, copies: list[Shared], lanes: list[Lanes]) -> None:
+    """Compiles the block for several devices at the same time; tracing is done once and shared."""
+    if len(copies) < 2:
+        return
+    _execute.trace(copies[0], lanes[0], program=program, record_every=record_every)
+
+    def one(shared, lane):
+        _execute.lower(shared, lane, program=program, record_every=record_every).compile()
+
+    with ThreadPoolExecutor(len(copies)) as pool:
+        list(pool.map(one, copies, lanes))
+
+
+def _in_flight(chunk: int | None, memory: float, size: int, arrays: Any, devices: int) -> int:
+    """How many blocks may be in flight."""
+    each = sum(x.nbytes for x in jax.tree.leaves(arrays))
+    allowed = memory // max(each, 1) if chunk is None else chunk // size
+    return int(np.clip(allowed, 1, MOST_IN_FLIGHT * devices))
+
+
+def _harvest(block: int, out: Any) -> tuple[int, Any]:
+    return block, jax.tree.map(np.asarray, out)

@@ -1,0 +1,65 @@
+"""Where the uniform numbers of a study come from: independent draws, a Latin hypercube or Sobol points.
+
+Independent draws are made run by run inside the compiled block (`_draws`).  A design covers the unit cube more evenly, so means
+converge faster, but its points are not independent: no Clopper-Pearson interval holds.  So a designed study is made of
+`replicates` designs, scrambled independently, and its intervals come from the spread between them.
+
+Source: A. B. Owen, Monte Carlo theory, methods and examples, chapters 10 and 17; SciPy's `stats.qmc` makes the points.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from iblf_jax import checks
+
+SAMPLERS = ("independent", "latin_hypercube", "sobol")
+
+
+def check_seed(seed: Any) -> int:
+    """A seed as a Python int in [0, 2^32), or a ValueError."""
+    if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+        raise checks.fail("seed", seed, "a whole number from 0 to 2**32 - 1")
+    return int(seed)
+
+
+def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
+    """The number of replicates; ValueError for a sampler, a number of runs and replicates that do not fit together."""
+    checks.one_of("sampler", sampler, SAMPLERS)
+    replicates = checks.positive_integer("replicates", replicates)
+    if sampler == "independent" and replicates != 1:
+        raise checks.fail("replicates", replicates, "1 with independent draws", 'Replicates belong to sampler="latin_hypercube" or "sobol".')
+    if runs % replicates:
+        raise checks.fail("runs", runs, f"a multiple of replicates = {replicates}", f"Take runs={replicates * max(1, runs // replicates)}.")
+    each = runs // replicates
+    if sampler == "sobol" and each & (each - 1):
+        near = 1 << max(0, round(np.log2(each)))
+        raise checks.fail("runs", runs, "a power of two for each replicate of Sobol points", f"Take runs={near * replicates}.")
+    return replicates
+
+
+def unit_points(sampler: str, dimension: int, runs: int, replicates: int, seed: int, salt: int = 0) -> np.ndarray:
+    """Points in the open unit cube, (runs, dimension): `replicates` independent designs, one after another."""
+    designs = []
+    for replicate in range(replicates):
+        rng = np.random.default_rng([seed, replicate, salt])
+        if sampler == "sobol":
+            designs.append(qmc.Sobol(dimension, scramble=True, rng=rng).random(runs // replicates))
+        else:
+            designs.append(qmc.LatinHypercube(dimension, rng=rng).random(runs // replicates))
+    return np.concatenate(designs)
+
+
+def split(points: np.ndarray, shapes: dict[str, tuple[int, ...]], dtype: Any) -> dict[str, np.ndarray]:
+    """The columns of `points` by path, each with its leaf's shape, kept off 0 and 1 in `dtype`."""
+    edge = np.finfo(dtype).eps / 2
+    inside = np.clip(points.astype(dtype), edge, 1 - edge)
+    parts, start = {}, 0
+    for path, shape in shapes.items():
+        width = int(np.prod(shape, dtype=int))
+        parts[path] = inside[:, start : start + width].reshape((-1, *shape))
+        start += width
+    return parts

@@ -1,0 +1,103 @@
+"""Monte-Carlo studies: many runs of one scenario with parameters drawn at random.
+
+Only the results of the metrics are kept of each run, so memory does not grow with the length of a run; any run can be looked
+at again in full with `study.replay(i)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import jax
+import numpy as np
+
+from iblf_jax import checks, distributed
+from iblf_jax._blocks import MEMORY, Results, block_size, run_blocks
+from iblf_jax._designs import check_sampler
+from iblf_jax._progress import bar
+from iblf_jax._setup import prepare
+from iblf_jax.distributions import Perturbation
+from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.scenario import Scenario
+from iblf_jax.study import Study
+
+
+def monte_carlo(
+    scenario: Scenario,
+    perturbations: Mapping[str, Perturbation],
+    *,
+    runs: int,
+    duration: float,
+    dt: float = 1e-3,
+    seed: int = 0,
+    method: str = "rk4",
+    metrics: Sequence[Fold] = STANDARD,
+    sampler: str = "independent",
+    replicates: int = 1,
+    backend: str = "auto",
+    chunk: int | None = None,
+    memory: float = MEMORY,
+    devices: Sequence[jax.Device] | None = None,
+    progress: bool | None = None,
+) -> Study:
+    """Runs a scenario many times with parameters drawn at random.
+
+        run i:  u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),   leaf = perturbation(nominal, F^-1(u))
+
+    The results of run i depend on the seed and on i only: not on `runs`, `chunk`, the devices or the processes.  They are
+    bit-identical on one backend and one version of JAX.  A perturbed run whose start or reference lies outside its bounds is no
+    error: its status says so.  In a job of several processes (`iblf_jax.distributed`) each computes its share and all get the study.
+
+    Args:
+      scenario: what to run, of n joints.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution.  A vector leaf gets an independent draw for each entry;
+        `robot.` paths change plant and model alike.
+      runs: number of runs N.
+      duration: length of a run [s], a whole number of steps.
+      dt: time step [s].
+      seed: whole number that fixes all draws.
+      method: "rk4", "heun" or "euler".
+      metrics: the folds to run (`iblf_jax.metrics`).
+      sampler: "independent", "latin_hypercube" or "sobol".
+      replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
+      backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
+      chunk: runs in flight on the devices at a time; from `memory` if not given.  It changes no result.
+      memory: bytes that runs in flight may take.
+      devices: devices to use; all of this process if not given.
+      progress: a progress bar; shown where somebody watches if not given.
+
+    Returns:
+      A `Study`: metrics, status and samples of every run, run axis first.
+
+    Raises:
+      ValueError: bad arguments; the message names the field, the value and the mend.
+
+    Source: design of this package.
+    """
+    runs, chunk = checks.positive_integer("runs", runs), chunk and checks.positive_integer("chunk", chunk)
+    replicates = check_sampler(sampler, runs, replicates)
+    if isinstance(perturbations, Mapping) and not perturbations:
+        raise checks.fail("perturbations", perturbations, "at least one perturbation", "Without any all runs are the same: use ij.simulate.")
+    timing = {"duration": duration, "dt": dt, "method": method}
+    setup = prepare(scenario, perturbations, runs, seed, metrics=metrics, backend=backend, sampler=sampler, replicates=replicates, **timing)
+    mine = distributed.share(np.arange(-(-runs // block_size())))
+    results = None
+    with bar(progress, min(runs, len(mine) * block_size())) as shown:
+        for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, chunk=chunk, memory=memory, devices=devices):
+            results = _stored(results, part, block, runs)
+            shown.update(min(block_size(), runs - block * block_size()))
+    results = distributed.gather_blocks(results, mine, block_size(), runs)
+    return Study.of(setup, results)
+
+
+def _stored(results: Results | None, part: Results, block: int, runs: int) -> Results:
+    """`results`, made at the first call, with the runs of a block written in."""
+    if results is None:
+        results = jax.tree.map(lambda x: np.zeros((runs, *x.shape[1:]), x.dtype), part)
+    first, size = block * block_size(), block_size()
+    size = min(size, runs - first)
+
+    def write(whole, piece):
+        whole[first : first + size] = piece[:size]
+        return whole
+
+    return jax.tree.map(write, results, part)

@@ -1,0 +1,35 @@
+"""The progress bar of studies: runs done, runs a second, time left; in terminals and in notebooks."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from typing import Any
+
+DELAY = 1.0
+"""Seconds before a bar appears that was not asked for."""
+
+
+def _has_reader() -> bool:
+    """Whether somebody watches: a terminal or a notebook."""
+    if "ipykernel" in sys.modules and "IPython" in sys.modules:
+        shell = sys.modules["IPython"].get_ipython()
+        if shell is not None and hasattr(shell, "kernel"):
+            return True
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+def bar(progress: bool | None, total: int, done: int = 0) -> Any:
+    """A tqdm bar over runs, a context manager with `update(runs)`.
+
+    Args:
+      progress: True or False, or None: shown where somebody watches and it takes more than DELAY seconds.
+      total: number of runs.
+      done: runs that were there before.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tqdm warns where a notebook lacks ipywidgets and then falls back to text by itself
+        from tqdm.auto import tqdm
+    shown = _has_reader() if progress is None else bool(progress)
+    delay = DELAY if progress is None else 0.0
+    return tqdm(total=total, initial=done, unit="runs", unit_scale=True, disable=not shown, delay=delay, dynamic_ncols=True)

@@ -1,0 +1,82 @@
+"""What a study was asked for, checked once and ready to run in blocks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax._blocks import Program, Shared, check_backend
+from iblf_jax._designs import check_seed, split, unit_points
+from iblf_jax._draws import Cases, Lanes, plan, sample_size
+from iblf_jax.distributions import Perturbation
+from iblf_jax.integrators import tableau
+from iblf_jax.metrics import Fold
+from iblf_jax.scenario import Scenario, canonical
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Setup:
+    """A study's arguments.  Cases are numbered: case = point * runs + run, with one point unless it is a sweep."""
+
+    program: Program
+    shared: Shared
+    perturbations: dict[str, Perturbation]
+    """As the user gave them."""
+    seed: int
+    runs: int
+    """Runs at each point."""
+    sampler: str = "independent"
+    replicates: int = 1
+    designed: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Path -> uniform numbers of every run, for samplers with a design."""
+    points: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Path -> value at every point of a sweep."""
+
+    @property
+    def cases(self) -> int:
+        """Number of cases: points times runs."""
+        return self.runs * (len(next(iter(self.points.values()))) if self.points else 1)
+
+    def lanes(self, cases: np.ndarray) -> Lanes:
+        """What differs between these cases; cases past the last one repeat it."""
+        point, run = np.divmod(np.minimum(cases, self.cases - 1), self.runs)
+        points = {path: values[point] for path, values in self.points.items()}
+        return Lanes(run.astype(np.uint32), points, {path: u[run] for path, u in self.designed.items()})
+
+
+def prepare(
+    scenario: Scenario,
+    perturbations: Mapping[str, Perturbation],
+    runs: int,
+    seed: int,
+    *,
+    duration: float,
+    dt: float,
+    method: str,
+    metrics: Sequence[Fold],
+    backend: str,
+    sampler: str = "independent",
+    replicates: int = 1,
+    points: Mapping[str, np.ndarray] | None = None,
+) -> Setup:
+    """Checks the arguments that studies share and puts together what their blocks need."""
+    tableau(method)
+    steps = checks.whole_steps(duration, dt)
+    seed, scenario = check_seed(seed), canonical(scenario)
+    targets, by_path = plan(scenario, perturbations)
+    dtype = scenario.initial.q.dtype
+    folds, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (tuple(metrics), by_path, dt))
+    designed: dict[str, Any] = {}
+    if sampler != "independent":
+        shapes = sample_size(targets, by_path)
+        dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
+        designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
+    program = Program(targets, steps, method, check_backend(backend))
+    shared = Shared(Cases(scenario, by_path, jax.random.key(seed)), folds, step)
+    return Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))

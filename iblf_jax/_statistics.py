@@ -1,0 +1,108 @@
+"""Statistics of runs: probabilities with intervals, one number a run, rank correlations.
+
+Clopper-Pearson: with k events in N independent runs, the interval of the probability p that holds for every p with at least
+the confidence asked for is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)], B the quantile of the beta distribution.
+
+Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from iblf_jax import checks
+
+SMALLER_IS_WORSE = ("margin", "xi_margin", "first_violation_time")
+"""Metrics of which the smallest value, over joints and over runs, is the worst."""
+
+
+class Probability(NamedTuple):
+    """How often something happened, with an interval for how often it would."""
+
+    estimate: float
+    """count / runs."""
+    low: float | None
+    """Lower end of the interval; None where no interval is valid."""
+    high: float | None
+    confidence: float
+    count: int
+    runs: int
+    """Runs that count: those that were made."""
+    method: str
+    """How the interval was made, or why there is none."""
+
+    def __str__(self) -> str:
+        ends = f"no interval ({self.method})" if self.low is None else f"{self.confidence:.0%} interval {self.low:.3g} to {self.high:.3g}"
+        return f"{self.estimate:.4g} ({self.count} of {self.runs} runs; {ends})"
+
+
+def check_confidence(confidence: Any) -> float:
+    """A confidence in (0, 1), or a ValueError."""
+    number = checks.positive_number("confidence", confidence, "1")
+    if number >= 1:
+        raise checks.fail("confidence", confidence, "a number between 0 and 1", "0.95, for example.")
+    return number
+
+
+def probability(events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int) -> Probability:
+    """The probability of an event over the valid runs.
+
+    Args:
+      events, valid: (N,) bool.
+      confidence: of the interval.
+      sampler, replicates: how the runs were drawn; replicates follow each other.
+    """
+    count, runs = int(np.sum(events & valid)), int(np.sum(valid))
+    estimate = count / runs if runs else float("nan")
+    low, high, method = None, None, "no run was made"
+    if runs and sampler == "independent":
+        ends = stats.binomtest(count, runs).proportion_ci(confidence_level=confidence, method="exact")
+        low, high, method = float(ends.low), float(ends.high), "Clopper-Pearson"
+    elif runs:
+        low, high, method = _between_replicates(events & valid, valid, confidence, sampler, replicates)
+    return Probability(estimate, low, high, confidence, count, runs, method)
+
+
+def _between_replicates(events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int):
+    if replicates < 2:
+        return None, None, f"runs of one {sampler} design are not independent; ask for replicates"
+    counts, sizes = events.reshape(replicates, -1).sum(1), valid.reshape(replicates, -1).sum(1)
+    means = counts / np.maximum(sizes, 1)
+    spread = means.std(ddof=1) / np.sqrt(replicates)
+    if spread == 0:
+        return None, None, "all replicates agree, so their spread says nothing; ask for more runs or independent draws"
+    half = stats.t.ppf(0.5 + confidence / 2, replicates - 1) * spread
+    return float(max(0.0, means.mean() - half)), float(min(1.0, means.mean() + half)), f"Student t over {replicates} replicates"
+
+
+def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
+    """A metric as one number a run: the worst joint's, (N,)."""
+    if name not in metrics:
+        raise checks.fail("metric", name, "one of " + ", ".join(metrics))
+    values = np.asarray(metrics[name])
+    if values.ndim == 1:
+        return values
+    flat = values.reshape(len(values), -1)
+    return flat.min(1) if name in SMALLER_IS_WORSE else flat.max(1)
+
+
+def columns(samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The drawn parameters entry by entry, "plant.mass[0]" -> (N,)."""
+    out = {}
+    for path, values in samples.items():
+        values = np.asarray(values)
+        for place in np.ndindex(values.shape[1:]):
+            out[path + "".join(f"[{i}]" for i in place)] = values[(slice(None), *place)]
+    return out
+
+
+def rank_correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Spearman's rank correlation and its two-sided p-value; (nan, nan) where one of the two is constant."""
+    if len(x) < 3 or np.all(x == x[0]) or np.all(y == y[0]):
+        return float("nan"), float("nan")
+    result = stats.spearmanr(x, y)
+    return float(result.statistic), float(result.pvalue)

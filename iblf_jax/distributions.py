@@ -1,0 +1,307 @@
+"""What an uncertain parameter may be: distributions, and how a draw acts on a leaf.
+
+A distribution is known by its quantile function F^-1, which turns a uniform number u in (0, 1) into a draw:
+
+    uniform       low + u (high - low)
+    normal        mean + std Phi^-1(u)
+    log_uniform   low (high / low)^u
+    choice        the first value whose cumulative weight reaches u
+
+so that independent draws, Latin hypercubes and Sobol points differ in their u only.  A draw z changes a leaf that holds x0 to
+
+    factor   x0 z        offset   x0 + z        value   z
+
+`factor(uniform(0.7, 1.3))` is thirty per cent around nominal.  A vector leaf gets an independent draw for each entry, unless
+`shared=True`.  All of these are pytrees whose numbers are leaves: new numbers do not recompile a study.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.pytree import component, leaf, static
+
+KINDS = ("factor", "offset", "value")
+"""How a draw acts on the nominal value."""
+
+
+class Distribution(Protocol):
+    """What the package asks of a distribution: a component with these two methods."""
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """F^-1(u), elementwise, for u in (0, 1)."""
+        ...
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the greatest draw; infinite where there is none."""
+        ...
+
+
+@component
+class Uniform:
+    """Evenly between `low` and `high`."""
+
+    low: jax.Array = leaf("", shape="any")
+    high: jax.Array = leaf("", shape="any")
+
+    def check(self) -> None:
+        """Raises ValueError unless low < high."""
+        _increasing("uniform", self.low, self.high)
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """low + u (high - low)."""
+        return self.low + u * (self.high - self.low)
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """low and high."""
+        return np.asarray(self.low), np.asarray(self.high)
+
+
+@component
+class Normal:
+    """Gaussian, with mean `mean` and standard deviation `std`."""
+
+    mean: jax.Array = leaf("", shape="any")
+    std: jax.Array = leaf("", sign="positive", shape="any")
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """mean + std Phi^-1(u)."""
+        return self.mean + self.std * jax.scipy.special.ndtri(u)
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """The whole line."""
+        shape = np.broadcast_shapes(np.shape(self.mean), np.shape(self.std))
+        return np.full(shape, -np.inf), np.full(shape, np.inf)
+
+
+@component
+class LogUniform:
+    """Evenly between `low` and `high` on a logarithmic scale."""
+
+    low: jax.Array = leaf("", sign="positive", shape="any")
+    high: jax.Array = leaf("", sign="positive", shape="any")
+
+    def check(self) -> None:
+        """Raises ValueError unless low < high."""
+        _increasing("log_uniform", self.low, self.high)
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """low (high / low)^u."""
+        return self.low * jnp.exp(u * jnp.log(self.high / self.low))
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """low and high."""
+        return np.asarray(self.low), np.asarray(self.high)
+
+
+@component
+class Choice:
+    """One of a list of numbers, with weights."""
+
+    values: jax.Array = leaf("", shape="any")
+    weights: jax.Array = leaf("", sign="nonnegative", shape="any")
+
+    def check(self) -> None:
+        """Raises ValueError unless there is one weight a value and one that is not zero."""
+        if self.values.ndim != 1 or self.values.size == 0:
+            raise checks.fail("choice: values", self.values, "a list of numbers", "Give a vector leaf one choice for each entry's path.")
+        checks.shape_is("choice: weights", self.weights, self.values.shape)
+        if checks.is_concrete(self.weights) and not np.sum(np.asarray(self.weights)) > 0:
+            raise checks.fail("choice: weights", self.weights, "at least one weight > 0")
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """The first value whose cumulative weight reaches u."""
+        edges = jnp.cumsum(self.weights) / jnp.sum(self.weights)
+        index = jnp.sum(u[..., None] > edges, axis=-1)
+        return self.values[jnp.minimum(index, self.values.size - 1)]
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the greatest value of positive weight."""
+        values = np.asarray(self.values)[np.asarray(self.weights) > 0]
+        return values.min(), values.max()
+
+
+@component
+class Perturbation:
+    """A distribution and how its draw acts on a leaf; made by `factor`, `offset` and `value`."""
+
+    distribution: Distribution
+    kind: str = static(default="value")
+    shared: bool = static(default=False)
+    """One draw for all entries of a vector leaf."""
+
+    def check(self) -> None:
+        """Raises ValueError for something that is not a distribution."""
+        if not callable(getattr(self.distribution, "quantile", None)):
+            raise checks.fail(
+                f"{self.kind}(...)", self.distribution, "a distribution", f"Write ij.{self.kind}(ij.uniform(low, high)), for example."
+            )
+        checks.one_of("Perturbation.kind", self.kind, KINDS)
+
+    def apply(self, nominal: jax.Array, u: jax.Array) -> jax.Array:
+        """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the shape of `nominal`."""
+        draw = jnp.broadcast_to(self.distribution.quantile(u).astype(nominal.dtype), nominal.shape)
+        if self.kind == "factor":
+            return nominal * draw
+        return nominal + draw if self.kind == "offset" else draw
+
+    def range(self, nominal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the greatest value that the leaf can take."""
+        low, high = self.distribution.support()
+        if self.kind == "factor":
+            with np.errstate(invalid="ignore"):
+                ends = np.nan_to_num(np.stack([nominal * low, nominal * high]), nan=0.0, posinf=np.inf, neginf=-np.inf)
+            return ends.min(0), ends.max(0)
+        if self.kind == "offset":
+            return nominal + low, nominal + high
+        return np.broadcast_to(low, nominal.shape), np.broadcast_to(high, nominal.shape)
+
+
+def _increasing(name: str, low: jax.Array, high: jax.Array) -> None:
+    if checks.is_concrete((low, high)) and not np.all(np.asarray(low) < np.asarray(high)):
+        raise checks.fail(f"{name}(low, high)", (np.asarray(low).tolist(), np.asarray(high).tolist()), "low < high", "Exchange or widen them.")
+
+
+def uniform(low: Any, high: Any) -> Uniform:
+    """Evenly between two numbers.
+
+        z = low + u (high - low),   u uniform on (0, 1)
+
+    Args:
+      low, high: the ends, numbers or arrays that fit the perturbed leaf.
+
+    Returns:
+      A distribution for `factor`, `offset` or `value`.
+
+    Raises:
+      ValueError: unless low < high.
+
+    Source: textbook.
+    """
+    return Uniform(low, high)
+
+
+def normal(mean: Any = 0.0, std: Any = 1.0) -> Normal:
+    """Gaussian.
+
+        z = mean + std Phi^-1(u),   u uniform on (0, 1)
+
+    On a leaf that must be positive, a run that draws an inadmissible value is not made and is flagged
+    `Status.INADMISSIBLE_DRAW`; `log_uniform` and `uniform` avoid that.
+
+    Args:
+      mean, std: mean and standard deviation, numbers or arrays that fit the perturbed leaf.
+
+    Returns:
+      A distribution for `factor`, `offset` or `value`.
+
+    Raises:
+      ValueError: unless std > 0.
+
+    Source: textbook.
+    """
+    return Normal(mean, std)
+
+
+def log_uniform(low: Any, high: Any) -> LogUniform:
+    """Evenly between two positive numbers on a logarithmic scale.
+
+        z = low (high / low)^u,   u uniform on (0, 1)
+
+    Args:
+      low, high: the ends, numbers > 0 or arrays that fit the perturbed leaf.
+
+    Returns:
+      A distribution for `factor`, `offset` or `value`.
+
+    Raises:
+      ValueError: unless 0 < low < high.
+
+    Source: textbook.
+    """
+    return LogUniform(low, high)
+
+
+def choice(values: Any, weights: Any = None) -> Choice:
+    """One of a list of numbers.
+
+        z = values[min {j : w_0 + ... + w_j >= u sum w}],   u uniform on (0, 1)
+
+    Args:
+      values: (m,) numbers.
+      weights: (m,) numbers >= 0, not necessarily of sum 1; equal if not given.
+
+    Returns:
+      A distribution for `factor`, `offset` or `value`.
+
+    Raises:
+      ValueError: an empty list, or weights that do not fit it.
+
+    Source: textbook.
+    """
+    return Choice(values, np.ones(np.shape(values)) if weights is None else weights)
+
+
+def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:
+    """The leaf is its nominal value times a draw.
+
+        x = x0 z
+
+    Args:
+      distribution: of z [1].
+      shared: one draw for all entries of a vector leaf, rather than one each.
+
+    Returns:
+      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`.
+
+    Raises:
+      ValueError: not a distribution.
+
+    Source: design of this package.
+    """
+    return Perturbation(distribution, "factor", shared)
+
+
+def offset(distribution: Distribution, *, shared: bool = False) -> Perturbation:
+    """The leaf is its nominal value plus a draw.
+
+        x = x0 + z
+
+    Args:
+      distribution: of z, in the leaf's unit.
+      shared: one draw for all entries of a vector leaf, rather than one each.
+
+    Returns:
+      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`.
+
+    Raises:
+      ValueError: not a distribution.
+
+    Source: design of this package.
+    """
+    return Perturbation(distribution, "offset", shared)
+
+
+def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
+    """The leaf is a draw.
+
+        x = z
+
+    Args:
+      distribution: of z, in the leaf's unit.
+      shared: one draw for all entries of a vector leaf, rather than one each.
+
+    Returns:
+      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`.
+
+    Raises:
+      ValueError: not a distribution.
+
+    Source: design of this package.
+    """
+    return Perturbation(distribution, "value", shared)

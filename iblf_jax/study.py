@@ -1,0 +1,229 @@
+"""The result of a Monte-Carlo study: `Study`.
+
+Per run it holds the metrics, the status and what was drawn; never a trajectory.  `study.replay(i)` makes run i again in full.
+
+Failed runs are part of every count and of every statistic, unless they are left out on request, and then the answer says how many
+were.  Runs that could not be made (an inadmissible draw, `Status.INADMISSIBLE_DRAW`) have no numbers; they are left out of
+statistics always, are counted, and the answer says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax import _statistics, checks
+from iblf_jax._blocks import Results, block_size, run_blocks
+from iblf_jax._setup import Setup
+from iblf_jax._statistics import Probability
+from iblf_jax.distributions import Perturbation
+from iblf_jax.metrics import Fold
+from iblf_jax.paths import with_parameters
+from iblf_jax.results import Metrics, Rollout
+from iblf_jax.rollout import trajectory
+from iblf_jax.scenario import Scenario
+from iblf_jax.status import FAILED, Status, describe
+
+VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE
+"""What `violation_probability` counts: a run that left its bounds, or that ran away, after which it has no say."""
+
+
+class Run(NamedTuple):
+    """One run of a study."""
+
+    index: int
+    metrics: Metrics
+    status: int
+    samples: dict[str, Any]
+
+
+def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
+    """Name and unit of everything that some folds return."""
+    return tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Study:
+    """Many runs of one scenario with drawn parameters; arrays have N runs first.  `study[i]` is one run."""
+
+    scenario: Scenario
+    """The nominal scenario."""
+    metrics: Metrics
+    """Results of the folds, each (N,) or (N, n)."""
+    status: Any
+    """Bit flags of `Status`, (N,) int32; 0 is ok."""
+    fastest_mode: Any
+    """Largest measured mode of the closed loop, (N,) [1/s]."""
+    samples: dict[str, Any]
+    """Path -> the value of that leaf in each run, (N, ...), in the leaf's unit."""
+    setup: Setup = dataclasses.field(metadata={"static": True})
+
+    @classmethod
+    def of(cls, setup: Setup, results: Results) -> Study:
+        """The study with these results."""
+        metrics = Metrics(results.metrics, metric_units(setup.shared.folds))
+        return cls(setup.shared.cases.scenario, metrics, results.status, results.fastest_mode, results.samples, setup)
+
+    @property
+    def runs(self) -> int:
+        """Number of runs N."""
+        return self.setup.runs
+
+    @property
+    def perturbations(self) -> dict[str, Perturbation]:
+        """Path -> perturbation, as they were given."""
+        return self.setup.perturbations
+
+    @property
+    def seed(self) -> int:
+        """The seed."""
+        return self.setup.seed
+
+    @property
+    def dt(self) -> float:
+        """Time step [s]."""
+        return float(self.setup.shared.dt)
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return self.setup.program.steps * self.dt
+
+    def __len__(self) -> int:
+        return self.runs
+
+    def _index(self, index: Any) -> int:
+        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not -self.runs <= index < self.runs:
+            raise IndexError(f"run {index!r}: the study has runs 0 to {self.runs - 1}")
+        return int(index) % self.runs
+
+    def __getitem__(self, index: int) -> Run:
+        """One run: its metrics, status and drawn values."""
+        i = self._index(index)
+        return Run(i, jax.tree.map(lambda x: x[i], self.metrics), int(self.status[i]), {path: x[i] for path, x in self.samples.items()})
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Numbers of the runs that did not do their job (`status.FAILED`)."""
+        return np.flatnonzero(self.status & int(FAILED))
+
+    @property
+    def made(self) -> np.ndarray:
+        """Whether each run was made, (N,) bool; False where a draw was inadmissible."""
+        return self.status & int(Status.INADMISSIBLE_DRAW) == 0
+
+    @property
+    def status_counts(self) -> dict[str, int]:
+        """Runs that are ok, that failed, and with each flag; a run may have several."""
+        counts = {"OK": int(np.sum(self.status == 0)), "FAILED": len(self.failed)}
+        return counts | {flag.name or "": int(np.sum(self.status & int(flag) != 0)) for flag in Status}
+
+    @property
+    def violation_probability(self) -> Probability:
+        """How probable it is that a run leaves its bounds or runs away, with the 95 % Clopper-Pearson interval."""
+        return self.probability(VIOLATED)
+
+    def probability(self, event: Status | np.ndarray = VIOLATED, confidence: float = 0.95) -> Probability:
+        """The probability of an event over the runs that were made.
+
+            [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)],   a = 1 - confidence           (Clopper-Pearson)
+
+        Args:
+          event: flags of `Status`, any of which counts, or (N,) bool such as `study.metrics.rmse[:, 0] > 0.1`.
+          confidence: of the interval, in (0, 1).
+
+        Returns:
+          Estimate, interval, count and runs.  For designs the interval comes from the replicates (Student t), and is None without.
+
+        Raises:
+          ValueError: an event of another shape, a confidence outside (0, 1).
+
+        Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
+        """
+        happened = self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
+        if happened.shape != (self.runs,) or happened.dtype != bool:
+            raise checks.fail("event", event, f"flags of Status, or {self.runs} booleans")
+        confidence = _statistics.check_confidence(confidence)
+        return _statistics.probability(happened, self.made, confidence, self.setup.sampler, self.setup.replicates)
+
+    def worst(self, count: int = 10, metric: str = "margin") -> np.ndarray:
+        """Numbers of the worst runs, worst first: smallest margin, or largest of another metric, of the worst joint.
+
+        Args:
+          count: how many, at most N.
+          metric: name of a metric.
+
+        Returns:
+          Run numbers, of the runs that were made; give them to `replay`.
+
+        Raises:
+          ValueError: an unknown metric.
+
+        Source: design of this package.
+        """
+        count = checks.positive_integer("count", count)
+        values = _statistics.one_number(self.metrics, metric)
+        order = np.argsort(values if metric in _statistics.SMALLER_IS_WORSE else -values, kind="stable")
+        return order[self.made[order]][:count]
+
+    def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
+        """Which runs a statistic is over, (N,) bool, and what to say about it."""
+        used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
+        return used, {"runs": int(used.sum()), "excluded": int(self.runs - used.sum()), "failed_excluded": str(bool(exclude_failed))}
+
+    def replay(self, index: int, *, record_every: int = 1) -> Rollout:
+        """Makes one run again, with its whole trajectory.
+
+        Metrics, status and fastest mode are bit-identical to those of run `index`: its block is run again by the same compiled
+        program.  The trajectory comes from the program for a single run, where XLA rounds differently: it agrees with the metrics
+        to rounding, until a run that has left its bounds amplifies that.
+
+        Args:
+          index: run number.
+          record_every: record every so-many-th step.
+
+        Returns:
+          A `Rollout`, with the drawn parameters in its scenario.
+
+        Raises:
+          IndexError: no such run.
+          ValueError: the run was not made because a draw was inadmissible.
+
+        Source: design of this package.
+        """
+        i = self._index(index)
+        record_every = checks.positive_integer("record_every", record_every)
+        if not self.made[i]:
+            drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
+            raise checks.fail(f"run {i}", drawn, "admissible draws", "It was not made; see study.made.")
+        block, place = divmod(i, block_size())
+        ((_, again),) = run_blocks(self.setup.program, self.setup.shared, self.setup.lanes, [block])
+        again = jax.tree.map(lambda x: x[place], again)
+        if not all(np.array_equal(x, self.metrics[name][i], equal_nan=True) for name, x in again.metrics.items()):
+            warnings.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.", stacklevel=2)
+        program, shared = self.setup.program, self.setup.shared
+        run = trajectory(
+            with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
+            shared.folds,
+            shared.dt,
+            steps=program.steps,
+            method=program.method,
+            record_every=record_every,
+        )
+        metrics = Metrics(again.metrics, self.metrics.unit_pairs)
+        return dataclasses.replace(run, metrics=metrics, status=again.status, fastest_mode=again.fastest_mode)
+
+    def __repr__(self) -> str:
+        if not checks.is_concrete(self):
+            return "Study(being traced)"
+        lines = [f"Study({self.runs} runs of {self.duration:g} s, dt = {self.dt:g} s, seed {self.seed}, {self.setup.sampler})"]
+        lines += [f"  bound violated or run away: {self.violation_probability}"]
+        flags = [f"{count} {describe(flag)}" for flag in Status if (count := self.status_counts[flag.name or ""])]
+        lines += [f"  failed: {len(self.failed)}; ok: {self.status_counts['OK']}" + (" (" + "; ".join(flags) + ")" if flags else "")]
+        return "\n".join(lines)
