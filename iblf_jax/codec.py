@@ -128,9 +128,7 @@ def decode(value: Any, hint: Any, path: str) -> Any:
     Raises:
       ValueError: anything that does not fit; the message names the dotted key.
     """
-    hint, optional = without_none(hint)
-    if optional and value == NONE:
-        return None
+    hint, _ = without_none(hint)
     if hint not in FAMILIES and dataclasses.is_dataclass(hint):
         return decode_fields(hint, as_table(value, path), path)
     if isinstance(value, list) and hint not in FAMILIES:
@@ -178,8 +176,6 @@ def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> 
         return decode_static(value, hint, key)
     if not is_leaf_field(field):
         return decode(value, hint, key)
-    if value == NONE and without_none(hint)[1]:
-        return None
     return numbers(value, key, field.metadata["unit"])
 
 

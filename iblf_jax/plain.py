@@ -17,7 +17,7 @@ import numpy as np
 from iblf_jax import checks
 
 NONE = "none"
-"""What a file says for a field that is None though its default is something else; TOML has no null."""
+"""What a file says for a structural field that is None though its default is something else; TOML has no null."""
 
 
 class Words(str):

@@ -130,12 +130,19 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     tables = {**robots, **tables}
     if dtype != jnp.result_type(float):
         tables = {"dtype": str(dtype), **tables}
-    if not _equal(from_dict(tables).scenario, scenario):
-        shapes = ", ".join(f"{p.path} {p.shape}" for p in parameters(scenario)[:3])
-        raise checks.fail(
-            "scenario", Words(f"leaves {shapes}, ..."), "one scenario that its tables give back", "Save the runs of a batch one by one."
-        )
+    _check_round_trip(scenario, tables)
     return tables
+
+
+def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
+    """Raises ValueError if the tables do not give the scenario back."""
+    expected, mend = "one scenario that its tables give back", "Save the runs of a batch one by one."
+    try:
+        same = _equal(from_dict(tables).scenario, scenario)
+    except ValueError as error:
+        raise checks.fail("scenario", Words(f"leaves that a scenario cannot have ({error})"), expected, mend) from error
+    if not same:
+        raise checks.fail("scenario", Words("leaves that change on the way"), expected, mend)
 
 
 def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None) -> str:

@@ -45,7 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(stop.code or 0)
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
+        said = set[str]()
+        warnings.showwarning = lambda message, *_, **__: _warn_once(str(message), said)
         try:
             prepare_jax()
             code = args.run(args)
@@ -64,6 +65,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             complain("interrupted")
             return 130
     return 2
+
+
+def _warn_once(message: str, said: set[str]) -> None:
+    if message not in said:
+        said.add(message)
+        complain(message, kind="warning")
 
 
 def complain(message: str, kind: str = "error") -> None:

@@ -93,10 +93,10 @@ def faster(runs: Pair) -> Claim:
     times = _metric(runs, "settling_time")
     proposed, compared = times.values()
     held = bool(np.all(np.isfinite(proposed)) and np.all(proposed < compared))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = 100.0 * (1.0 - proposed / compared)
-    detail = f"settling times {_versus(times, 's')}: sooner by {each_joint(share, '%')}."
-    return Claim("The integral form converges faster.", held, detail, {"settling_time [s]": times})
+    detail = f"settling times {_versus(times, 's')}"
+    if held and np.all(np.isfinite(compared)):
+        detail += f": sooner by {each_joint(100.0 * (1.0 - proposed / compared), '%')}"
+    return Claim("The integral form converges faster.", held, f"{detail}.", {"settling_time [s]": times})
 
 
 def more_accurate(runs: Pair) -> Claim:
@@ -133,7 +133,7 @@ def estimate_follows(runs: Pair) -> Claim:
     share = {name: 100.0 * late[name] / peak[name] for name in runs}
     detail = (
         f"largest late |f - f_hat|: {_versus(late, 'N m')}; as a share of the peak of |f|: {_versus(share, '%')} "
-        f"(held if under {100 * ESTIMATE_SHARE:g} %). The rest is the observer's lag, about |f'|/kf."
+        f"(held if under {100 * ESTIMATE_SHARE:g} %; the observer lags by 1/kf, so about |f'|/kf remains)."
     )
     return Claim(
         "The observer's estimate tends to the uncertain term.", held, detail, {"late |f - f_hat| [N m]": late, "peak |f| [N m]": peak}

@@ -158,7 +158,8 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
     for name, unit in first.metrics.units.items():
         row = [name, unit]
         for run in runs.values():
-            cells = [number(x) for x in np.ravel(run.metrics[name])]
+            values = np.ravel(run.metrics[name])
+            cells = ["-" if name == "first_violation_joint" and x < 0 else number(x) for x in values]
             row += [*cells, *[""] * (run.n - len(cells))][: run.n]
         rows.append(row)
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]

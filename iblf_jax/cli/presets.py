@@ -38,5 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if args.toml:
         print(scenario_to_toml(scenario, run={"duration": 20.0, "dt": 1e-3}), end="")
     else:
-        print(f"{args.name}{inspect.signature(PRESETS[args.name])}\n\n{inspect.getdoc(PRESETS[args.name])}")
+        arguments = inspect.signature(PRESETS[args.name]).parameters.values()
+        taken = " ".join(f"--arg {argument.name}={argument.default}" for argument in arguments)
+        print(f"{args.name} {taken}\n\n{inspect.getdoc(PRESETS[args.name])}")
     return 0

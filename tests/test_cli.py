@@ -1,0 +1,257 @@
+"""The command line: what it prints and writes, and how it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+
+import jax
+import numpy as np
+import pytest
+import tomli_w
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax import cli, scenario_file
+from iblf_jax.cli import _claims, _common
+
+SHORT = ["--duration", "0.05", "--dt", "0.001", "--method", "heun"]
+
+
+@pytest.fixture
+def command(capsys, monkeypatch, tmp_path):
+    """Runs the CLI in a folder of its own; returns exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def call(*argv: str) -> tuple[int, str, str]:
+        code = cli.main(argv)
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def strict_json(path):
+    def refuse(word):
+        raise AssertionError(f"{word} in strict JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+# ------------------------------------------------------------------------------------------------------------- the main job
+
+
+def test_reproduce(command, tmp_path):
+    code, out, err = command("reproduce", "--out", "out")
+    assert code == 0, err
+    figures = [f"figure_{i}.{ending}" for i in range(1, 7) for ending in ("pdf", "png")]
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == sorted([*figures, "arm.gif", "metrics.json", "rollouts.nc"])
+    assert all((tmp_path / "out" / name).stat().st_size > 1000 for name in written)
+    for word in ("settling_time", "0.993", "0.713", "1.077", "0.837", "N m", "with compilation", "for the two runs alone", "Remark"):
+        assert word in out
+    assert out.count("HELD ") == 8
+    assert "DID NOT HOLD" not in out
+
+    report = strict_json(tmp_path / "out" / "metrics.json")
+    assert [claim["held"] for claim in report["claims"]] == [True] * 8
+    assert report["runs"]["integral BLF"]["metrics"]["first_violation_time"]["value"] is None
+    settling = report["runs"]["log-BLF"]["metrics"]["settling_time"]
+    np.testing.assert_allclose(settling["value"], [1.077, 0.837], atol=2e-3)
+    assert settling["unit"] == "s"
+    data = ij.load_rollouts(tmp_path / "out" / "rollouts.nc")
+    assert data["integral BLF"].sizes["time"] == 20_001
+
+
+def test_claims_can_fail(paper, short_run):
+    """The same run twice is neither faster nor more accurate; half a second is too short to settle."""
+    held = {claim.claim: claim.held for claim in _claims.paper_claims({"a": short_run, "b": short_run})}
+    assert held["Neither law violates its time-varying asymmetric bounds."]
+    assert not held["Both laws track the reference."]
+    assert not held["The integral form converges faster."]
+    assert not held["The integral form is slightly more accurate."]
+    assert not held["The integral form overshoots more in e2 at the start."]
+    assert not held["The error signals tend to a very small neighbourhood of zero."]
+    outside = jax.tree.map(lambda x: x, short_run)
+    object.__setattr__(outside, "xi", short_run.xi * 0.0)
+    assert not _claims.theorem_1({"a": outside}).held
+    object.__setattr__(outside, "status", short_run.status | int(ij.Status.BOUND_VIOLATED))
+    assert not _claims.bounds_kept({"a": outside}).held
+
+
+# ------------------------------------------------------------------------------------------------------------------ simulate
+
+
+def test_simulate_a_file(command, paper, tmp_path):
+    ij.save_scenario(paper, tmp_path / "mine.toml", run={"duration": 0.05, "method": "heun"})
+    code, out, err = command("simulate", "mine.toml", "--set", "controller.K2=30", "--set", "initial.q=[0.7, 0.6]", "--out", "out")
+    assert (code, err) == (0, "")
+    assert "status: ok" in out
+    assert "mine.toml: 0.05 s, dt = 0.001 s, heun" in out
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["metrics.json", "overview.png", "rollout.nc", "scenario.toml"]
+
+    again = scenario_file.load_scenario_file(tmp_path / "out" / "scenario.toml")
+    assert again.run == {"duration": 0.05, "dt": 1e-3, "method": "heun", "record_every": 1}
+    np.testing.assert_array_equal(again.scenario.controller.K2, [30.0, 30.0])
+    run = ij.simulate(again.scenario, **again.run)
+    report = strict_json(tmp_path / "out" / "metrics.json")
+    assert report["status"] == "ok"
+    assert report["metrics"]["rmse"]["value"] == np.asarray(run.metrics.rmse).tolist()
+    np.testing.assert_array_equal(ij.load_rollouts(tmp_path / "out" / "rollout.nc")["run"].q, run.q)
+
+
+def test_simulate_a_preset(command):
+    code, out, _ = command("simulate", "zhang_yan_2024", *SHORT, "--arg", "law=log", "--arg", "reading=corrected", "--record-every", "7")
+    assert code == 0
+    assert "peak_torque" in out
+
+
+def test_a_failed_run_exits_with_one(command, tmp_path):
+    code, out, err = command("simulate", "zhang_yan_2024", *SHORT, "--set", "controller.K2=500", "--out", "out")
+    assert code == 1
+    assert "the time step is too large for the closed loop" in out
+    assert err.startswith("iblf-jax: warning: The run failed")
+    assert err.count("\n") == 1
+    assert "Take dt=" in err
+    report = strict_json(tmp_path / "out" / "metrics.json")
+    assert "STEP_TOO_LARGE" in report["flags"]
+
+
+def test_a_preset_file_with_its_own_run(command, tmp_path):
+    (tmp_path / "a.toml").write_text('preset = "zhang_yan_2024"\n[run]\nduration = 0.05\nmethod = "heun"\n')
+    code, out, _ = command("simulate", "a.toml")
+    assert code == 0
+    assert "0.05 s, dt = 0.001 s, heun" in out
+
+
+# ------------------------------------------------------------------------------------------------------------- what there is
+
+
+def test_presets(command, paper):
+    code, out, _ = command("presets")
+    assert code == 0
+    assert out.startswith("zhang_yan_2024  The paper's simulation")
+    code, out, _ = command("presets", "zhang_yan_2024")
+    assert code == 0
+    assert "--arg law=integral" in out
+    code, out, _ = command("presets", "zhang_yan_2024", "--toml", "--arg", "law=log")
+    assert code == 0
+    assert isinstance(scenario_file.from_dict(tomllib.loads(out)).scenario.controller.barrier, ij.barriers.Log)
+
+
+def test_parameters(command, paper):
+    code, out, _ = command("parameters", "zhang_yan_2024", "--set", "robot.mass[1]=1.25")
+    assert code == 0
+    for parameter in ij.parameters(paper):
+        assert f"\n{parameter.path} " in out
+    assert out.count("1.25") == 2
+
+
+def test_help_and_version(command):
+    code, out, _ = command("--version")
+    assert code == 0
+    assert ij.__version__ in out
+    for words in (["--help"], *([name, "--help"] for name in cli.COMMANDS)):
+        code, out, _ = command(*words)
+        assert code == 0
+        assert "usage: iblf-jax" in out
+
+
+# ------------------------------------------------------------------------------------------------------------------ refusals
+
+
+REFUSALS = [
+    ([], "required: COMMAND"),
+    (["bogus"], "invalid choice: 'bogus'"),
+    (["reproduce"], "required: --out"),
+    (["reproduce", "--out", "out", "--reading", "x"], "invalid choice: 'x'"),
+    (["reproduce", "--out", "out", "--dt", "0"], "dt: got 0.0, expected a positive number [s]"),
+    (["reproduce", "--out", "file.toml"], "--out: got 'file.toml', expected a folder that can be written"),
+    (["simulate"], "required: SCENARIO.toml|PRESET"),
+    (["simulate", "none.toml"], "none.toml: no such file"),
+    (["simulate", "zhang_yan"], "Did you mean zhang_yan_2024?"),
+    (["simulate", "."], ".: no such file"),
+    (["simulate", "file.toml"], "file.toml: contrller: got an unknown key"),
+    (["simulate", "binary.toml"], "binary.toml: not a TOML file"),
+    (["simulate", "zhang_yan_2024", "--duration", "long"], "argument --duration: invalid float value: 'long'"),
+    (["simulate", "zhang_yan_2024", "--duration", "nan"], "duration: got nan"),
+    (["simulate", "zhang_yan_2024", "--duration", "1e300"], "duration: got 1e+300"),
+    (["simulate", "zhang_yan_2024", "--duration", "1", "--dt", "0.3"], "Take duration=0.9"),
+    (["simulate", "zhang_yan_2024", "--method", "rk5"], "method: got 'rk5'"),
+    (["simulate", "zhang_yan_2024", "--record-every", "0"], "record_every: got 0"),
+    (["simulate", "zhang_yan_2024", "--record-every", "1.5"], "invalid int value: '1.5'"),
+    (["simulate", "zhang_yan_2024", "--set", "controller.K2"], "--set: got 'controller.K2', expected NAME=VALUE"),
+    (["simulate", "zhang_yan_2024", "--set", "controller.K2="], "--set: got 'controller.K2='"),
+    (["simulate", "zhang_yan_2024", "--set", "controller.K3=1"], "Did you mean controller.K2"),
+    (["simulate", "zhang_yan_2024", "--set", "controller.K2=fast"], "controller.K2: got 'fast'"),
+    (["simulate", "zhang_yan_2024", "--set", "controller.K2=-1"], "controller.K2: got -1"),
+    (["simulate", "zhang_yan_2024", "--set", "controller.K2=[1,2,3]"], "Its shape is (3,)"),
+    (["simulate", "zhang_yan_2024", "--arg", "lw=log"], "Did you mean law?"),
+    (["simulate", "zhang_yan_2024", "--arg", "p=two"], "arguments.p: got 'two'"),
+    (["simulate", "good.toml", "--arg", "law=log"], "only presets take arguments"),
+    (["simulate", "zhang_yan_2024", "--set", "initial.q=2"], "initial.q[0]: got 2.0, expected a start inside the bounds"),
+    (["presets", "zhang"], "preset: got 'zhang'"),
+    (["presets", "--toml"], "expected the name of a preset"),
+    (["parameters", "none"], "none: no such file"),
+]
+
+
+@pytest.mark.parametrize(("argv", "message"), REFUSALS, ids=[" ".join(argv) for argv, _ in REFUSALS])
+def test_refusals_are_one_line_and_exit_with_two(argv, message, command, paper, tmp_path):
+    tables = scenario_file.scenario_to_dict(paper)
+    (tmp_path / "good.toml").write_text(tomli_w.dumps(tables))
+    (tmp_path / "file.toml").write_text(tomli_w.dumps({**tables, "contrller": {}}))
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    code, out, err = command(*argv)
+    assert code == 2
+    assert out == ""
+    assert err.startswith("iblf-jax: error: ")
+    assert err.count("\n") == 1
+    assert message in err
+
+
+@pytest.mark.skipif(os.geteuid() == 0 if hasattr(os, "geteuid") else True, reason="the superuser may write everywhere")
+def test_a_folder_without_permission(command, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    code, _, err = command("simulate", "zhang_yan_2024", *SHORT, "--out", "locked/out")
+    assert code == 2
+    assert "expected a folder that can be written" in err
+
+
+# ------------------------------------------------------------------------------------------------------------------ the process
+
+
+def test_as_a_process_with_its_own_cache(tmp_path):
+    env = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    env |= {"XDG_CACHE_HOME": str(tmp_path), "MPLBACKEND": "Agg"}
+    argv = [sys.executable, "-m", "iblf_jax", "simulate", "zhang_yan_2024", "--duration", "0.01", "--method", "euler"]
+    done = subprocess.run(argv, env=env, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "status: ok" in done.stdout
+    assert any((tmp_path / "iblf_jax").iterdir())
+
+
+@pytest.mark.parametrize("cache", ["file", "missing"])
+def test_the_cache_is_only_a_help(cache, tmp_path, monkeypatch):
+    """A cache that the user chose is kept; one that cannot be written is left alone."""
+    seen = {}
+    monkeypatch.setattr(jax.config, "update", seen.__setitem__)
+    monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
+    cli.prepare_jax()
+    assert seen["jax_enable_x64"] is True
+    assert ("jax_compilation_cache_dir" in seen) == (cache == "missing")
+
+
+def test_numbers_as_text():
+    assert _common.number(float("inf")) == "-"
+    assert _common.strict({"a": np.array([1.0, np.nan]), "b": np.float32(2.0), "c": (np.inf, True, None)}) == {
+        "a": [1.0, None],
+        "b": 2.0,
+        "c": [None, True, None],
+    }
+    assert _common.assignments("--set", ["a=1", "b = [1, 2]", "c=x y", 'd="q"']) == {"a": 1, "b": [1, 2], "c": "x y", "d": "q"}

@@ -1,0 +1,165 @@
+"""Runs as xarray Datasets, and the files that hold them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+from conftest import SHORT
+
+import iblf_jax as ij
+from iblf_jax import io, scenario_file
+from iblf_jax.rollout import RECORDED
+
+
+@pytest.fixture(scope="module")
+def batch(paper) -> ij.Rollout:
+    def one(gain):
+        return ij.simulate(ij.with_parameters(paper, {"controller.K2": gain}), duration=0.1, record_every=5, method="euler")
+
+    return jax.vmap(one)(jnp.array([10.0, 20.0, 30.0]))
+
+
+def test_one_run(short_run):
+    data = short_run.to_xarray()
+    assert data.sizes == {"time": short_run.t.size, "joint": 2}
+    assert set(io.FIELDS) == set(RECORDED) - {"t"}
+    for name in io.FIELDS:
+        np.testing.assert_array_equal(data[name], getattr(short_run, name))
+    for name in short_run.metrics:
+        np.testing.assert_array_equal(data[name], short_run.metrics[name])
+        assert data[name].attrs["units"] == short_run.metrics.units[name]
+    for variable in data.variables.values():
+        assert variable.attrs["units"]
+        assert variable.attrs["description"]
+    np.testing.assert_array_equal(data.observer_state, short_run.observer_state)
+    assert data.sel(joint=1, time=0.1, method="nearest").q.item() == pytest.approx(float(short_run.q[100, 1]))
+
+
+def test_the_run_can_be_done_again_from_its_attributes(short_run):
+    attributes = short_run.to_xarray().attrs
+    again = scenario_file.from_dict(tomllib.loads(attributes["scenario"])).scenario
+    np.testing.assert_array_equal(ij.simulate(again, **SHORT).q, short_run.q)
+    assert json.loads(attributes["parameters"])["plant.mass"] == [2.0, 0.85]
+    assert attributes["iblf_jax_version"] == ij.__version__
+    assert attributes["jax_version"] == jax.__version__
+    assert attributes["status"] == "ok"
+
+
+def test_a_batch(batch):
+    data = batch.to_xarray()
+    assert data.q.dims == ("run", "time", "joint")
+    assert data.rmse.dims == ("run", "joint")
+    assert data.status.dims == ("run",)
+    assert list(data.status_words.values) == ["ok"] * 3
+    np.testing.assert_array_equal(data["controller.K2"], [[10.0, 10.0], [20.0, 20.0], [30.0, 30.0]])
+    assert "controller.K2" not in json.loads(data.attrs["parameters"])
+    assert json.loads(data.attrs["parameters"])["plant.mass"] == [2.0, 0.85]
+    xarray.testing.assert_equal(data.q.isel(run=1, drop=True), batch[1].to_xarray().q)
+
+
+def test_batches_of_batches_and_of_different_steps(paper):
+    def one(gain, dt):
+        run = ij.simulate(ij.with_parameters(paper, {"controller.K2": gain}), duration=0.01, method="euler")
+        return run, run.t * dt
+
+    runs, t = jax.vmap(jax.vmap(one, (0, None)), (None, 0))(jnp.array([10.0, 20.0]), jnp.array([1.0, 2.0, 3.0]))
+    assert runs.to_xarray().q.dims == ("run_0", "run_1", "time", "joint")
+    data = dataclasses.replace(runs, t=t).to_xarray()
+    assert data.t.dims == ("run_0", "run_1", "time")
+    np.testing.assert_array_equal(data.t, t)
+
+
+@pytest.mark.parametrize("ending", [".nc", ".npz", ".NC"])
+def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
+    runs = {"integral BLF": short_run, "b-2": batch}
+    ij.save_rollouts(tmp_path / f"runs{ending}", runs)
+    found = ij.load_rollouts(tmp_path / f"runs{ending}")
+    assert list(found) == list(runs)
+    for name, run in runs.items():
+        xarray.testing.assert_identical(found[name], run.to_xarray())
+
+
+def test_a_single_run_is_called_run(short_run, tmp_path):
+    ij.save_rollouts(tmp_path / "a.nc", short_run)
+    assert list(ij.load_rollouts(str(tmp_path / "a.nc"))) == ["run"]
+
+
+def test_states_of_any_structure(short_run, tmp_path):
+    T = short_run.t.size
+    state = {"weights": jnp.zeros((T, 3, 4)), "rest": (jnp.ones((T, 2)), jnp.ones(T))}
+    run = dataclasses.replace(short_run, controller_state=state)
+    data = run.to_xarray()
+    assert data.controller_state_weights.shape == (T, 3, 4)
+    assert data.controller_state_rest_0.dims == ("time", "joint")
+    assert data.controller_state_rest_1.dims == ("time",)
+    ij.save_rollouts(tmp_path / "a.nc", run)
+    xarray.testing.assert_identical(ij.load_rollouts(tmp_path / "a.nc")["run"], data)
+
+
+def test_metrics_with_the_name_of_a_field(short_run):
+    metrics = ij.Metrics({"V": jnp.array(3.0), "own": jnp.zeros(5)}, (("V", "J"), ("own", "s")))
+    data = dataclasses.replace(short_run, metrics=metrics).to_xarray()
+    assert data.V.dims == ("time",)
+    assert data.metric_V == 3.0
+    assert data.metric_V.attrs["units"] == "J"
+    assert data.own.dims == ("own_axis_0",)
+
+
+def test_a_users_law_is_kept_by_its_parameters(short_run):
+    @ij.component
+    class Mine:
+        gain: jax.Array = ij.leaf("1")
+
+        def init(self, q, dq, setting):
+            return ()
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            raise NotImplementedError
+
+    run = dataclasses.replace(short_run, scenario=dataclasses.replace(short_run.scenario, controller=Mine(2.0)))
+    attributes = run.to_xarray().attrs
+    assert "scenario" not in attributes
+    assert "Mine" in attributes["scenario_not_saved"]
+    assert json.loads(attributes["parameters"])["controller.gain"] == [2.0, 2.0]
+
+
+def test_bad_arguments(short_run, tmp_path):
+    with pytest.raises(ValueError, match=r"ends in \.nc"):
+        ij.save_rollouts(tmp_path / "a.csv", short_run)
+    with pytest.raises(ValueError, match=r"ends in \.nc"):
+        ij.load_rollouts(tmp_path / "a")
+    for runs in ({}, [short_run], None):
+        with pytest.raises(ValueError, match="dict of at least one Rollout"):
+            ij.save_rollouts(tmp_path / "a.nc", runs)  # type: ignore[arg-type]
+    for name in ("a.b", "", "a/b", 3, "attributes"):
+        with pytest.raises(ValueError, match="name of a run"):
+            ij.save_rollouts(tmp_path / "a.nc", {name: short_run})  # type: ignore[dict-item]
+    with pytest.raises(ValueError, match="expected a Rollout"):
+        ij.save_rollouts(tmp_path / "a.nc", {"a": 3})  # type: ignore[dict-item]
+    with pytest.raises(ValueError, match="jit"):
+        jax.jit(lambda run: io.rollout_to_xarray(run) and 0)(short_run)
+
+
+@pytest.mark.parametrize("ending", ["nc", "npz"])
+def test_bad_files(ending, tmp_path):
+    path = tmp_path / f"a.{ending}"
+    with pytest.raises(FileNotFoundError):
+        ij.load_rollouts(path)
+    for content in (b"", b"hello", b"CDF\x01" + bytes(40), b"PK\x03\x04"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="expected a file written by save_rollouts"):
+            ij.load_rollouts(path)
+
+
+def test_the_package_imports_no_labels_and_no_figures():
+    code = "import iblf_jax, sys; assert not {'xarray', 'matplotlib', 'optax', 'pandas', 'tomli_w'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
