@@ -47,8 +47,18 @@ __version__ = _version("iblf_jax")
 if TYPE_CHECKING:
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
+    from iblf_jax.tuning import TuneResult as TuneResult
+    from iblf_jax.tuning import cvar as cvar
+    from iblf_jax.tuning import objectives as objectives
+    from iblf_jax.tuning import tunable as tunable
+    from iblf_jax.tuning import tune as tune
 
 _ON_FIRST_USE = {
+    "TuneResult": ("iblf_jax.tuning", "TuneResult"),
+    "cvar": ("iblf_jax.tuning", "cvar"),
+    "objectives": ("iblf_jax.tuning.objectives", None),
+    "tunable": ("iblf_jax.tuning", "tunable"),
+    "tune": ("iblf_jax.tuning", "tune"),
     "plotting": ("iblf_jax.plotting", None),
     "testing": ("iblf_jax.testing", None),
 }

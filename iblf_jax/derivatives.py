@@ -1,7 +1,8 @@
 """The time loop with its derivatives: forward for few directions, checkpointed reverse for many.
 
 **Forward.**  Every direction u of the parameters has a tangent x_u of the state, which is integrated beside the state; memory does
-not grow with time.  A fold may offer `curvature(acc, sample)`, a tuple of `Outer`: vectors y, with weights w, whose Gauss-Newton matrices
+not grow with time.  A fold may offer `curvature(acc, sample)`, a tuple of `curvatures` many `Outer`: vectors y with weights w, whose
+Gauss-Newton matrices
 
     N_uv = sum_k w(t_k) y_u(t_k) . y_v(t_k),      y_u = tangent of y,
 
@@ -65,20 +66,20 @@ def _split(tree: Any) -> tuple[list, list, Any]:
 
 def _joined(reals: list, others: list, how: Any) -> Any:
     structure, real = how
-    reals, others = iter(reals), iter(others)
-    return jax.tree.unflatten(structure, [next(reals) if r else next(others) for r in real])
+    from_reals, from_others = iter(reals), iter(others)
+    return jax.tree.unflatten(structure, [next(from_reals) if r else next(from_others) for r in real])
 
 
 def _outer(folds, accumulators, sample) -> tuple[Outer, ...]:
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
-        if hasattr(fold, "curvature"):
+        if hasattr(fold, "curvatures"):
             found += tuple(fold.curvature(acc, sample))
     return found
 
 
 def _pushed(f, directions, primals: tuple, tangents: tuple):
-    """f's value and its tangent along each direction, for functions of (varied, real leaves)."""
+    """Value of f and its tangent along each direction, for functions of (varied, real leaves)."""
 
     def along(direction, tangent):
         return jax.jvp(f, primals, (direction, *tangent), has_aux=True)
@@ -132,15 +133,21 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
         return real, outcome
 
     reals, tangents, rest = _pushed(begin, directions, (varied,), ())
-    sizes = jax.eval_shape(lambda v, x: one(rest, jnp.int32(0), v, x)[0][1], varied, reals)
-    products = tuple(jnp.zeros((count, count), dt.dtype) for _ in sizes)
+    products = tuple(jnp.zeros((count, count), dt.dtype) for fold in folds for _ in range(getattr(fold, "curvatures", 0)))
     (reals, tangents, rest, products), _ = jax.lax.scan(body, (reals, tangents, rest, products), jnp.arange(steps))
     _, pushed, outcome = _pushed(partial(end, rest), directions, (varied, reals), (tangents,))
     return Tangents(outcome, pushed, products)
 
 
 def value_and_tangents(
-    scenario: Scenario, varied: Mapping[str, jax.Array], directions: Mapping[str, jax.Array], folds, dt: jax.Array, *, steps: int, method: str
+    scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    directions: Mapping[str, jax.Array],
+    folds,
+    dt: jax.Array,
+    *,
+    steps: int,
+    method: str,
 ) -> Tangents:
     """Runs a scenario once for every entry of `varied`, with its tangents along every direction; call it inside `jit`.
 
