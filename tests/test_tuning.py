@@ -15,6 +15,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.metrics import STANDARD
 from iblf_jax.rollout import run as plain_run
+from iblf_jax.rollout import start
 from iblf_jax.scenario import canonical
 from iblf_jax.tuning import _tune, problem
 from iblf_jax.tuning.newton import box_step
@@ -25,14 +26,14 @@ from iblf_jax.tuning.robust import Risk, combine
 
 jax.config.update("jax_enable_x64", True)
 
-O = ij.objectives
+objectives = ij.objectives
 SHORT = {"duration": 0.3, "dt": 1e-3, "method": "euler"}
 GAINS = ["controller.k1", "controller.K2", "observer.kf"]
 DRAWS = {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)), "initial.q": ij.offset(ij.uniform(-0.03, 0.03))}
 
 
 def objective():
-    return O.tracking() + 0.5 * O.effort() + 10 * O.peak_torque()
+    return objectives.tracking() + 0.5 * objectives.effort() + 10 * objectives.peak_torque()
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,7 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
 def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v, with e1_u by finite differences of recorded runs."""
     lanes = nominal.lanes(nominal.box.z[None])
-    found = problem.slope(nominal.shared, lanes, plan=nominal.plan._replace())
+    found = problem.slope(nominal.shared, lanes, plan=nominal.plan)
 
     def errors(z):
         values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.plan.blocks}
@@ -87,17 +88,17 @@ def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     assert np.all(np.isfinite(found.hessian))
 
 
+@pytest.mark.slow
 def test_reverse_mode_remembers_few_states(paper):
     """Temporary memory of the gradient grows like the cube root of the number of steps, and stays below 2 sqrt(T) states."""
-    scenario = canonical(paper)
     sizes = {}
     for steps in (500, 4000):
         plan = _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3})
         compiled = problem.gradient.lower(plan.shared, plan.lanes(plan.box.z[None]), plan=plan.plan).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
-    from iblf_jax.rollout import start
-
-    state = sum(x.nbytes for x in jax.tree.leaves(start(scenario, problem.fold_of(plan.shared.objective, jnp.float64), plan.shared.dt)))
+    state = sum(
+        x.nbytes for x in jax.tree.leaves(start(canonical(paper), problem.fold_of(plan.shared.objective, jnp.float64), plan.shared.dt))
+    )
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
@@ -135,14 +136,17 @@ def test_quantities_are_what_numpy_makes_of_the_records(paper):
 
 
 def test_objectives_compose_and_messages_name_the_mend():
-    both = 2 * (O.tracking(scale=1.0) + 3 * O.effort(scale=2.0)) + O.margin_above(0.05)
+    both = 2 * (objectives.tracking(scale=1.0) + 3 * objectives.effort(scale=2.0)) + objectives.margin_above(0.05)
     assert [t.name for t in both.terms] == ["tracking", "effort"]
     assert [float(t.weight) for t in both.terms] == [2.0, 6.0]
-    assert [r.name for r in (O.error_below(0.01, after=1.0) + both).requirements] == ["|e1| < 0.01 rad after 1 s", "margin > 0.05 rad"]
+    assert [r.name for r in (objectives.error_below(0.01, after=1.0) + both).requirements] == [
+        "|e1| < 0.01 rad after 1 s",
+        "margin > 0.05 rad",
+    ]
     np.testing.assert_allclose(both.values(jnp.array([1.0, 4.0, 0.0])), [2.0, 12.0])
     assert float(both.excesses(jnp.array([1.0, 4.0, -0.06]))[0]) == pytest.approx(-0.2)
     with pytest.raises(ValueError, match="an objective or a requirement"):
-        O.tracking() + 3
+        objectives.tracking() + 3
 
 
 def test_risks():
@@ -208,13 +212,21 @@ def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
 
 
 def test_an_infeasible_start_finds_its_way_in(paper):
-    weak = ij.with_parameters(paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [2.5, 2.5]})
+    weak = ij.with_parameters(paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]})
     assert int(plain_status(weak)) & ij.Status.BOUND_VIOLATED
-    wanted = O.effort() + O.margin_above(0.02) + O.violation_probability_below(0.01)
+    wanted = objectives.effort() + objectives.margin_above(0.06) + objectives.violation_probability_below(0.01)
     best = ij.tune(weak, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
     assert int(plain_status(best.scenario)) & ij.Status.BOUND_VIOLATED == 0
     assert best.report.passed, best.report
-    assert best.report.margin[0] < 0 < 0.02 < best.report.margin[1]
+    assert best.report.margin[0] < 0 < 0.06 < best.report.margin[1]
+
+
+def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
+    """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just so."""
+    wanted = objectives.tracking() + objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
+    assert 11.0 < float(np.max(ij.simulate(best.scenario, metrics=STANDARD, **SHORT).metrics.peak_torque)) < 12.0
 
 
 def plain_status(scenario):
@@ -243,9 +255,11 @@ def test_steps_that_are_not_finite_are_rejected(name):
     assert 0.9 < reached <= 1.0
 
 
-def test_a_start_that_cannot_be_integrated_is_refused(paper):
+def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
+    stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
+    assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["sound"].all()
     with pytest.raises(ValueError, match="Take a smaller dt"):
-        ij.tune(ij.with_parameters(paper, {"controller.K2": 60.0}), GAINS, objective(), iterations=3, **SHORT)
+        ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
 
 
 # ---------------------------------------------------------------------------------------------------------------- robust
@@ -253,7 +267,9 @@ def test_a_start_that_cannot_be_integrated_is_refused(paper):
 
 @pytest.fixture(scope="module")
 def robust(paper):
-    return ij.tune(paper, GAINS, O.tracking(), perturbations=DRAWS, runs=8, risk=ij.cvar(0.75), iterations=8, report_runs=256, **SHORT)
+    return ij.tune(
+        paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=8, risk=ij.cvar(0.75), iterations=8, report_runs=256, **SHORT
+    )
 
 
 def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
@@ -269,26 +285,21 @@ def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
 def test_a_change_that_is_not_significant_is_called_so(robust, paper):
     from iblf_jax.tuning.report import make_report
 
-    same = ij.with_parameters(paper, {"observer.kf": 20.0001})
-    timing = SHORT
-    report = make_report(
-        paper, paper, robust.setup.objective, DRAWS, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=timing
-    )
+    report = make_report(paper, paper, robust.setup.objective, DRAWS, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=SHORT)
     assert report.changes[0].significant is False and "NOT significant" in str(report)
     assert "do not show that tuning helped" in str(report) and not report.improved
-    assert same is not None
 
 
 def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
-    best = ij.tune(paper, GAINS, O.tracking(), perturbations=DRAWS, runs=4, starts=2, resample=True, iterations=3, **SHORT)
+    best = ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, starts=2, resample=True, iterations=3, **SHORT)
     assert best.optimiser == "adam" and best.history["loss"].shape == (3, 2)
     with pytest.raises(ValueError, match="adam"):
-        ij.tune(paper, GAINS, O.tracking(), perturbations=DRAWS, runs=4, resample=True, optimiser="newton", **SHORT)
+        ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, resample=True, optimiser="newton", **SHORT)
 
 
 def test_common_random_numbers(paper):
     """The same draws for every start and every step; other seeds give others."""
-    built = [_tune.build(paper, GAINS, O.tracking(), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
+    built = [_tune.build(paper, GAINS, objectives.tracking(), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
     z = np.stack([built[0].box.z] * 2)
     losses = [np.asarray(Evaluator(p.plan, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
@@ -300,9 +311,9 @@ KILLED = """
 import sys, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np, iblf_jax as ij
-O = ij.objectives
+o = ij.objectives
 slow = (lambda loop: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
-best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], O.tracking() + 10 * O.peak_torque() + O.margin_above(0.11),
+best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11),
                duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], callback=slow)
 np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best.values.items()})
 """

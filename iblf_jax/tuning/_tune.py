@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,14 +20,14 @@ from iblf_jax._progress import bar
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import simulate
+from iblf_jax.rollout import SimulationWarning, simulate
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.objectives import Objective, complete
 from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared
+from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, value
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.result import Setup, TuneResult
 from iblf_jax.tuning.robust import Risk, as_risk
@@ -34,6 +35,8 @@ from iblf_jax.tuning.robust import Risk, as_risk
 OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
 SPREAD = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a factor e for gains."""
+SCREENED = 32
+"""Points that are looked at where the first start leaves its bounds."""
 
 
 def tune(
@@ -106,7 +109,7 @@ def tune(
     problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     iterations, starts = checks.positive_integer("iterations", iterations), checks.positive_integer("starts", starts)
-    z = starting_points(problem.box, starts, seed)
+    z = way_in(problem, starting_points(problem.box, starts, seed), seed)
     evaluator = Evaluator(problem.plan, problem.shared, problem.lanes(z), mode)
     loop = Loop(evaluator, make_method(optimiser, problem.box, iterations, tolerance, learning_rate), z, resample=resample)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, iterations if optimiser == "adam" else 0)
@@ -167,7 +170,9 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
     blocks, box = layout(scenario, parameters, timing["dt"], timing["method"])
 
     def exact_at_start(quantities):
-        run = simulate(scenario, metrics=(Quantities(quantities),), record_every=steps, **timing)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SimulationWarning)  # an infeasible start is what `way_in` is for
+            run = simulate(scenario, metrics=(Quantities(quantities),), record_every=steps, **timing)
         return run.metrics["tuning_exact"]
 
     objective = complete(objective, exact_at_start)
@@ -204,6 +209,25 @@ def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng([seed, 1])
     drawn = box.z + rng.uniform(-SPREAD, SPREAD, (starts - 1, len(box.z)))
     return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
+
+
+def way_in(problem: Problem, z: np.ndarray, seed: int) -> np.ndarray:
+    """The starting points, or better ones where the first leaves its bounds or cannot be integrated.
+
+    Past the wall the motion is chaotic, and its gradient points nowhere.  So SCREENED points of the box are looked at, values
+    only, and the starts are those that break the requirements and the bounds least.
+    """
+    first = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(z[:1]), plan=problem.plan))
+    if first.sound[0] and first.margin[0] > 0:
+        return z
+    rng = np.random.default_rng([seed, 2])
+    low = np.where(np.isfinite(problem.box.low), problem.box.low, problem.box.z - 3 * SPREAD)
+    high = np.where(np.isfinite(problem.box.high), problem.box.high, problem.box.z + 3 * SPREAD)
+    points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
+    found = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), plan=problem.plan))
+    broken = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-found.margin, 0.0)
+    order = np.lexsort((found.objective, broken, ~found.sound))
+    return points[order[: len(z)]]
 
 
 def _show(shown: Any, loop: Loop) -> None:
