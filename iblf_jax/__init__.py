@@ -49,12 +49,16 @@ if TYPE_CHECKING:
     from iblf_jax import testing as testing
     from iblf_jax.tuning import TuneResult as TuneResult
     from iblf_jax.tuning import cvar as cvar
+    from iblf_jax.tuning import falsify as falsify
+    from iblf_jax.tuning import pareto as pareto
     from iblf_jax.tuning import objectives as objectives
     from iblf_jax.tuning import tunable as tunable
     from iblf_jax.tuning import tune as tune
 
 _ON_FIRST_USE = {
     "TuneResult": ("iblf_jax.tuning", "TuneResult"),
+    "falsify": ("iblf_jax.tuning", "falsify"),
+    "pareto": ("iblf_jax.tuning", "pareto"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "objectives": ("iblf_jax.tuning.objectives", None),
     "tunable": ("iblf_jax.tuning", "tunable"),

@@ -18,7 +18,7 @@ from typing import NoReturn
 
 import jax
 
-COMMANDS = ("reproduce", "simulate", "presets", "parameters")
+COMMANDS = ("reproduce", "simulate", "presets", "parameters", "tune")
 
 
 class Parser(argparse.ArgumentParser):

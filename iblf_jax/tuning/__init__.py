@@ -11,6 +11,10 @@
 """
 
 from iblf_jax.tuning import objectives as objectives
+from iblf_jax.tuning._falsify import Attack as Attack
+from iblf_jax.tuning._falsify import falsify as falsify
+from iblf_jax.tuning._pareto import Front as Front
+from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
 from iblf_jax.tuning.parameters import tunable as tunable
 from iblf_jax.tuning.report import Report as Report
