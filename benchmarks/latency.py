@@ -26,7 +26,7 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.closed_loop import initial_state, rate
-from iblf_jax.metrics import STANDARD
+from iblf_jax.metrics import standard
 from iblf_jax.rollout import _run_compiled
 
 
@@ -76,9 +76,10 @@ def main() -> None:
 
     scenario = ij.presets.zhang_yan_2024()
     dt = jnp.asarray(1e-3)
-    run = partial(_run_compiled, steps=steps, record_every=1, method="rk4")
+    run = partial(_run_compiled, steps=steps, record_every=1, method="rk4", alone=True)
     start = time.perf_counter()
-    compiled = jax.jit(run).lower(scenario, STANDARD, dt).compile()
+    folds = standard()
+    compiled = jax.jit(run).lower(scenario, folds, dt).compile()
     compile_time = time.perf_counter() - start
 
     x0, unravel = ravel_pytree(initial_state(scenario))
@@ -89,7 +90,7 @@ def main() -> None:
         "LSODA, NumPy loop": lambda: lsoda(numpy_loop).y,
         "LSODA, compiled field": lambda: lsoda(lambda t, x: np.asarray(field(t, x))).y,
         "simulate, user's call": lambda: ij.simulate(scenario, duration=duration, dt=1e-3).q,
-        "simulate, compiled": lambda: compiled(scenario, STANDARD, dt),
+        "simulate, compiled": lambda: compiled(scenario, folds, dt),
     }
     ij.simulate(scenario, duration=duration, dt=1e-3)
     best = interleaved(calls, repeats)

@@ -13,7 +13,6 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
-from iblf_jax._monte_carlo import monte_carlo as monte_carlo
 from iblf_jax.distributions import choice as choice
 from iblf_jax.distributions import factor as factor
 from iblf_jax.distributions import log_uniform as log_uniform
@@ -40,13 +39,19 @@ from iblf_jax.scenario_file import load_scenario as load_scenario
 from iblf_jax.scenario_file import save_scenario as save_scenario
 from iblf_jax.stability import recommended_dt as recommended_dt
 from iblf_jax.status import Status as Status
-from iblf_jax.study import Study as Study
 
 __version__ = _version("iblf_jax")
 
 if TYPE_CHECKING:
+    from iblf_jax import distributed as distributed
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
+    from iblf_jax._monte_carlo import monte_carlo as monte_carlo
+    from iblf_jax._sensitivity import sensitivity as sensitivity
+    from iblf_jax._sweep import load_sweep as load_sweep
+    from iblf_jax._sweep import sweep as sweep
+    from iblf_jax.store import StoreError as StoreError
+    from iblf_jax.study import Study as Study
     from iblf_jax.tuning import TuneResult as TuneResult
     from iblf_jax.tuning import cvar as cvar
     from iblf_jax.tuning import falsify as falsify
@@ -54,8 +59,17 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import objectives as objectives
     from iblf_jax.tuning import tunable as tunable
     from iblf_jax.tuning import tune as tune
+    from iblf_jax.tuning_file import load_tuning as load_tuning
+    from iblf_jax.tuning_file import tune_file as tune_file
 
 _ON_FIRST_USE = {
+    "Study": ("iblf_jax.study", "Study"),
+    "StoreError": ("iblf_jax.store", "StoreError"),
+    "distributed": ("iblf_jax.distributed", None),
+    "load_sweep": ("iblf_jax._sweep", "load_sweep"),
+    "monte_carlo": ("iblf_jax._monte_carlo", "monte_carlo"),
+    "sensitivity": ("iblf_jax._sensitivity", "sensitivity"),
+    "sweep": ("iblf_jax._sweep", "sweep"),
     "TuneResult": ("iblf_jax.tuning", "TuneResult"),
     "falsify": ("iblf_jax.tuning", "falsify"),
     "pareto": ("iblf_jax.tuning", "pareto"),
@@ -63,6 +77,8 @@ _ON_FIRST_USE = {
     "objectives": ("iblf_jax.tuning.objectives", None),
     "tunable": ("iblf_jax.tuning", "tunable"),
     "tune": ("iblf_jax.tuning", "tune"),
+    "load_tuning": ("iblf_jax.tuning_file", "load_tuning"),
+    "tune_file": ("iblf_jax.tuning_file", "tune_file"),
     "plotting": ("iblf_jax.plotting", None),
     "testing": ("iblf_jax.testing", None),
 }

@@ -31,7 +31,9 @@ def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
     checks.one_of("sampler", sampler, SAMPLERS)
     replicates = checks.positive_integer("replicates", replicates)
     if sampler == "independent" and replicates != 1:
-        raise checks.fail("replicates", replicates, "1 with independent draws", 'Replicates belong to sampler="latin_hypercube" or "sobol".')
+        raise checks.fail(
+            "replicates", replicates, "1 with independent draws", 'Replicates belong to sampler="latin_hypercube" or "sobol".'
+        )
     if runs % replicates:
         raise checks.fail("runs", runs, f"a multiple of replicates = {replicates}", f"Take runs={replicates * max(1, runs // replicates)}.")
     each = runs // replicates

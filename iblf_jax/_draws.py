@@ -24,6 +24,8 @@ from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation
 from iblf_jax.scenario import Scenario
 
+_SIGNS = {"positive": "> 0", "nonnegative": ">= 0"}
+
 
 class Target(NamedTuple):
     """One leaf (or entry) that is perturbed; static."""
@@ -113,7 +115,7 @@ def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> lis
 def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, what: str) -> None:
     name = f"{what}[{target.source!r}]"
     try:
-        low, high = perturbation.range(nominal)
+        low, _ = perturbation.range(nominal)
         fits = np.broadcast_shapes(np.shape(low), nominal.shape) == nominal.shape
     except ValueError:
         fits = False
@@ -126,7 +128,10 @@ def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, 
     if np.any(bad & bounded):
         worst = float(np.min(np.where(bounded, low, np.inf)))
         raise checks.fail(
-            name, f"values down to {worst:g}", f"values {checks.SIGNS[target.sign]} only, as {target.path} needs", "Narrow the distribution."
+            name,
+            f"values down to {worst:g}",
+            f"values {_SIGNS[target.sign or '']} only, as {target.path} needs",
+            "Narrow the distribution.",
         )
 
 
@@ -180,7 +185,9 @@ def merge(scenario: Scenario, point: Mapping[str, Any], made: Mapping[str, Any])
     if not overlapping:
         return {**point, **made}
     changed = paths.with_parameters(paths.with_parameters(scenario, point), made)
-    touched = {_leaf(full) for p in (*overlapping, *(m for m in made if any(same_place(m, p) for p in overlapping))) for full in paths.expand(p)}
+    touched = {
+        _leaf(full) for p in (*overlapping, *(m for m in made if any(same_place(m, p) for p in overlapping))) for full in paths.expand(p)
+    }
     rest = {p: v for p, v in {**point, **made}.items() if not any(same_place(p, leaf) for leaf in touched)}
     return {**rest, **{leaf: paths.get(changed, leaf) for leaf in touched}}
 

@@ -6,7 +6,10 @@ at again in full with `study.replay(i)`.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -16,7 +19,7 @@ from iblf_jax._designs import check_sampler
 from iblf_jax._progress import bar
 from iblf_jax._setup import prepare
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import STANDARD, Fold
+from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario
 from iblf_jax.study import Study
 
@@ -30,7 +33,7 @@ def monte_carlo(
     dt: float = 1e-3,
     seed: int = 0,
     method: str = "rk4",
-    metrics: Sequence[Fold] = STANDARD,
+    metrics: Sequence[Fold] | None = None,
     sampler: str = "independent",
     replicates: int = 1,
     backend: str = "auto",
@@ -56,7 +59,7 @@ def monte_carlo(
       dt: time step [s].
       seed: whole number that fixes all draws.
       method: "rk4", "heun" or "euler".
-      metrics: the folds to run (`iblf_jax.metrics`).
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       sampler: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
       backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
@@ -76,16 +79,19 @@ def monte_carlo(
     runs, chunk = checks.positive_integer("runs", runs), chunk and checks.positive_integer("chunk", chunk)
     replicates = check_sampler(sampler, runs, replicates)
     if isinstance(perturbations, Mapping) and not perturbations:
-        raise checks.fail("perturbations", perturbations, "at least one perturbation", "Without any all runs are the same: use ij.simulate.")
-    timing = {"duration": duration, "dt": dt, "method": method}
+        raise checks.fail(
+            "perturbations", perturbations, "at least one perturbation", "Without any all runs are the same: use ij.simulate."
+        )
+    timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
     setup = prepare(scenario, perturbations, runs, seed, metrics=metrics, backend=backend, sampler=sampler, replicates=replicates, **timing)
-    mine = distributed.share(np.arange(-(-runs // block_size())))
-    results = None
+    results, blocks = None, range(-(-runs // block_size()))
+    mine = distributed.share(blocks) or [0]
+    begin = time.monotonic()
     with bar(progress, min(runs, len(mine) * block_size())) as shown:
         for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, chunk=chunk, memory=memory, devices=devices):
             results = _stored(results, part, block, runs)
             shown.update(min(block_size(), runs - block * block_size()))
-    results = distributed.gather_blocks(results, mine, block_size(), runs)
+    results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))
     return Study.of(setup, results)
 
 

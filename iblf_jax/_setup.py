@@ -16,7 +16,7 @@ from iblf_jax._designs import check_seed, split, unit_points
 from iblf_jax._draws import Cases, Lanes, plan, sample_size
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
-from iblf_jax.metrics import Fold
+from iblf_jax.metrics import Fold, as_folds
 from iblf_jax.scenario import Scenario, canonical
 
 
@@ -59,7 +59,7 @@ def prepare(
     duration: float,
     dt: float,
     method: str,
-    metrics: Sequence[Fold],
+    metrics: Sequence[Fold] | None,
     backend: str,
     sampler: str = "independent",
     replicates: int = 1,
@@ -71,7 +71,8 @@ def prepare(
     seed, scenario = check_seed(seed), canonical(scenario)
     targets, by_path = plan(scenario, perturbations)
     dtype = scenario.initial.q.dtype
-    folds, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (tuple(metrics), by_path, dt))
+    folds = as_folds(metrics, dtype)
+    by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
     designed: dict[str, Any] = {}
     if sampler != "independent":
         shapes = sample_size(targets, by_path)

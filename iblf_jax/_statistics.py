@@ -8,8 +8,9 @@ Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -20,7 +21,8 @@ SMALLER_IS_WORSE = ("margin", "xi_margin", "first_violation_time")
 """Metrics of which the smallest value, over joints and over runs, is the worst."""
 
 
-class Probability(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Probability:
     """How often something happened, with an interval for how often it would."""
 
     estimate: float

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.linalg import solve_spd
+from iblf_jax.linalg import inner, matvec, solve_spd
 from iblf_jax.scenario import Scenario
 
 
@@ -87,9 +87,9 @@ def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array |
     ddq = solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
 
     M0 = model.mass_matrix(q)
-    f = M0 @ ddq + model.coriolis(q, dq, dq) + model.gravity(q) - command.tau
+    f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + model.gravity(q) - command.tau
     e2, f_tilde = dq - command.alpha, f - f_hat
-    V = jnp.sum(command.V1) + 0.5 * (e2 @ (M0 @ e2) + f_tilde @ f_tilde)
+    V = jnp.sum(command.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
     sample = Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),

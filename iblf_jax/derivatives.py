@@ -23,12 +23,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.one_function import as_one_function
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import Carry, Outcome, advance, as_one_function, finish, start
+from iblf_jax.rollout import Carry, Outcome, advance, finish, start
 from iblf_jax.scenario import Scenario
 
 SMALL = 64
-"""Batches up to this size gain from being one machine function (see `rollout.as_one_function`)."""
+"""Batches up to this size gain from being one machine function (see `one_function`)."""
 
 
 class Outer(NamedTuple):
@@ -123,7 +124,7 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
         reals, tangents, rest, products = loop
         (reals, _), (tangents, pushed), (rest, factors) = _pushed(partial(one, rest, index), directions, (varied, reals), (tangents,))
         products = tuple(
-            decay * N + jnp.einsum("i,ui,vi->uv", weight, y, y) for N, y, (weight, decay) in zip(products, pushed, factors, strict=True)
+            decay * N + jnp.sum(weight * y[:, None] * y[None, :], axis=-1) for N, y, (weight, decay) in zip(products, pushed, factors, strict=True)
         )
         return (reals, tangents, rest, products), None
 

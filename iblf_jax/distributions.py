@@ -42,6 +42,11 @@ class Distribution(Protocol):
         ...
 
 
+def is_distribution(thing: Any) -> bool:
+    """Whether something has the methods of a `Distribution`."""
+    return all(callable(getattr(thing, name, None)) for name in ("quantile", "support"))
+
+
 @component
 class Uniform:
     """Evenly between `low` and `high`."""
@@ -54,11 +59,11 @@ class Uniform:
         _increasing("uniform", self.low, self.high)
 
     def quantile(self, u: jax.Array) -> jax.Array:
-        """low + u (high - low)."""
+        """F^-1(u) = low + u (high - low)."""
         return self.low + u * (self.high - self.low)
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
-        """low and high."""
+        """The two ends."""
         return np.asarray(self.low), np.asarray(self.high)
 
 
@@ -70,7 +75,7 @@ class Normal:
     std: jax.Array = leaf("", sign="positive", shape="any")
 
     def quantile(self, u: jax.Array) -> jax.Array:
-        """mean + std Phi^-1(u)."""
+        """F^-1(u) = mean + std Phi^-1(u)."""
         return self.mean + self.std * jax.scipy.special.ndtri(u)
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
@@ -91,11 +96,11 @@ class LogUniform:
         _increasing("log_uniform", self.low, self.high)
 
     def quantile(self, u: jax.Array) -> jax.Array:
-        """low (high / low)^u."""
+        """F^-1(u) = low (high / low)^u."""
         return self.low * jnp.exp(u * jnp.log(self.high / self.low))
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
-        """low and high."""
+        """The two ends."""
         return np.asarray(self.low), np.asarray(self.high)
 
 
@@ -137,7 +142,7 @@ class Perturbation:
 
     def check(self) -> None:
         """Raises ValueError for something that is not a distribution."""
-        if not callable(getattr(self.distribution, "quantile", None)):
+        if not is_distribution(self.distribution):
             raise checks.fail(
                 f"{self.kind}(...)", self.distribution, "a distribution", f"Write ij.{self.kind}(ij.uniform(low, high)), for example."
             )
@@ -164,7 +169,9 @@ class Perturbation:
 
 def _increasing(name: str, low: jax.Array, high: jax.Array) -> None:
     if checks.is_concrete((low, high)) and not np.all(np.asarray(low) < np.asarray(high)):
-        raise checks.fail(f"{name}(low, high)", (np.asarray(low).tolist(), np.asarray(high).tolist()), "low < high", "Exchange or widen them.")
+        raise checks.fail(
+            f"{name}(low, high)", (np.asarray(low).tolist(), np.asarray(high).tolist()), "low < high", "Exchange or widen them."
+        )
 
 
 def uniform(low: Any, high: Any) -> Uniform:
@@ -180,8 +187,6 @@ def uniform(low: Any, high: Any) -> Uniform:
 
     Raises:
       ValueError: unless low < high.
-
-    Source: textbook.
     """
     return Uniform(low, high)
 
@@ -202,8 +207,6 @@ def normal(mean: Any = 0.0, std: Any = 1.0) -> Normal:
 
     Raises:
       ValueError: unless std > 0.
-
-    Source: textbook.
     """
     return Normal(mean, std)
 
@@ -221,8 +224,6 @@ def log_uniform(low: Any, high: Any) -> LogUniform:
 
     Raises:
       ValueError: unless 0 < low < high.
-
-    Source: textbook.
     """
     return LogUniform(low, high)
 
@@ -241,10 +242,8 @@ def choice(values: Any, weights: Any = None) -> Choice:
 
     Raises:
       ValueError: an empty list, or weights that do not fit it.
-
-    Source: textbook.
     """
-    return Choice(values, np.ones(np.shape(values)) if weights is None else weights)
+    return Choice(values, jnp.ones(np.shape(values)) if weights is None else weights)
 
 
 def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
+from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots import Robot
 
@@ -74,7 +75,7 @@ class ModelShaped:
         """f(t, q, q'), (n,) [N m]."""
         a = self.acceleration_amplitude * jnp.sin(self.acceleration_frequency * t + self.acceleration_phase + self.phase)
         b = self.velocity_amplitude * jnp.sin(self.velocity_frequency * t + self.velocity_phase + self.phase)
-        return model.mass_matrix(q) @ a + model.coriolis(q, dq, b)
+        return matvec(model.mass_matrix(q), a) + model.coriolis(q, dq, b)
 
     def jump_times(self) -> jax.Array:
         """None: it is smooth."""
@@ -132,7 +133,7 @@ class TipForce:
         """J(q)^T F(t), (n,) [N m]."""
         J = plant.jacobian(q)
         force = self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
-        return J.T @ jnp.broadcast_to(force, (J.shape[0],))
+        return matvec(J.T, jnp.broadcast_to(force, (J.shape[0],)))
 
     def jump_times(self) -> jax.Array:
         """None: it is smooth."""

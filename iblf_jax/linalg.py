@@ -1,13 +1,29 @@
 """Algebra of small symmetric positive definite matrices, unrolled over their static size.
 
-LAPACK calls cost microseconds on a 2x2 matrix and stop XLA from fusing a time step.  A mass matrix is n x n with n the
-number of joints, known when the program is traced, so its Cholesky factor is written out as scalar operations.
+Calls into a matrix library cost microseconds on a 2x2 matrix and stop XLA from fusing a time step.  A mass matrix is n x n with n
+the number of joints, known when the program is traced, so its Cholesky factor is written out as scalar operations, and products
+are sums of elementwise ones.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+
+
+def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """The product of a matrix and a vector, (m,), for an (m, n) matrix and an (n,) vector."""
+    return jnp.sum(matrix * vector, axis=-1)
+
+
+def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
+    """The product of two matrices, (m, p), for an (m, n) and an (n, p) matrix."""
+    return jnp.sum(left[:, :, None] * right[None, :, :], axis=1)
+
+
+def inner(u: jax.Array, v: jax.Array) -> jax.Array:
+    """u^T v, (), for two (n,) vectors."""
+    return jnp.sum(u * v)
 
 
 def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:

@@ -243,12 +243,14 @@ class Estimation:
         return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
 
 
-def as_folds(metrics: Sequence[Fold], dtype: jax.typing.DTypeLike) -> tuple[Fold, ...]:
-    """The folds that a user asked for, checked, their numbers in one floating-point type.
+def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike) -> tuple[Fold, ...]:
+    """The folds that a user asked for (None: the standard ones), checked, their numbers in one floating-point type.
 
     Raises:
       ValueError: something that is not a fold, or two folds that return the same name.
     """
+    if metrics is None:
+        metrics = standard()
     if not isinstance(metrics, tuple | list):
         raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
     owner: dict[str, int] = {}
@@ -263,5 +265,9 @@ def as_folds(metrics: Sequence[Fold], dtype: jax.typing.DTypeLike) -> tuple[Fold
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tuple(metrics))
 
 
-STANDARD: tuple[Fold, ...] = (Tracking(), Settling(), Margin(), Torque(), Estimation())
-"""The folds that every run carries."""
+def standard() -> tuple[Fold, ...]:
+    """The folds that every run carries unless told otherwise.
+
+    Made on the call: an array made at import would start JAX's backend and fix its precision before a user can choose.
+    """
+    return (Tracking(), Settling(), Margin(), Torque(), Estimation())

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf, static
 
 
@@ -98,7 +99,7 @@ class WaypointSpline:
         basis = jnp.zeros(len(self.times), dtype)
         for power in jnp.asarray(coefficients, dtype)[:, piece]:
             basis = basis * x + power
-        return basis @ self.waypoints
+        return matvec(self.waypoints.T, basis)
 
 
 @functools.lru_cache(maxsize=32)

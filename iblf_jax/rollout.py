@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax import checks
 from iblf_jax.bounds import NARROWEST, tube_at
 from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state, rate
 from iblf_jax.integrators import step, tableau
-from iblf_jax.metrics import STANDARD, Fold, as_folds
+from iblf_jax.metrics import Fold, as_folds
+from iblf_jax.one_function import as_one_function
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.stability import comfortable_dt, fastest_mode
@@ -172,20 +172,11 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
     return outcome._replace(records=records)
 
 
-def as_one_function(f):
-    """`f` compiled as one machine function on CPU, where XLA would otherwise dispatch every operation of a loop by itself.
-
-    Two to five times faster for one run and for small batches, with the same numbers.  The attributes are XLA's own and only
-    hints: where they are unknown, nothing changes.
-    """
-    if jax.default_backend() != "cpu":
-        return f
-    return set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(f))
-
-
-@partial(jax.jit, static_argnames=("steps", "record_every", "method"))
-def _run_compiled(scenario, folds, dt, *, steps, record_every, method):
-    return as_one_function(partial(run, steps=steps, record_every=record_every, method=method))(scenario, folds, dt)
+@partial(jax.jit, static_argnames=("steps", "record_every", "method", "alone"))
+def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
+    """`run`, compiled; `alone` says that nobody will batch it from outside, so that it may become one machine function."""
+    one = partial(run, steps=steps, record_every=record_every, method=method)
+    return (as_one_function(one) if alone else one)(scenario, folds, dt)
 
 
 def simulate(
@@ -195,7 +186,7 @@ def simulate(
     dt: float = 1e-3,
     method: str = "rk4",
     record_every: int = 1,
-    metrics: Sequence[Fold] = STANDARD,
+    metrics: Sequence[Fold] | None = None,
     throw: bool = False,
 ) -> Rollout:
     """Runs a scenario with a fixed step and returns everything that can be looked at.
@@ -211,7 +202,7 @@ def simulate(
       dt: time step [s]; `recommended_dt(scenario)` says which will do.
       method: "rk4", "heun" or "euler".
       record_every: record every so-many-th step; metrics and status cover every step whatever is recorded.
-      metrics: the folds to run (`iblf_jax.metrics`).
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
 
     Returns:
@@ -240,7 +231,8 @@ def simulate(
 
 def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int) -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
-    outcome = _run_compiled(scenario, folds, dt, steps=steps, record_every=record_every, method=method)
+    alone = checks.is_concrete((scenario, folds))
+    outcome = _run_compiled(scenario, folds, dt, steps=steps, record_every=record_every, method=method, alone=alone)
     arrays, controller_state, observer_state = outcome.records
     units = tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
     return Rollout(

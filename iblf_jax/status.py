@@ -31,9 +31,7 @@ class Status(enum.IntFlag):
     """A study drew a value that its leaf does not admit (a negative mass, say): the run was not made, its metrics are NaN."""
 
 
-FAILED = (
-    Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
-)
+FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
 """The flags that make a run one that did not do its job."""
 
 VELOCITY_LIMIT = 1e4

@@ -12,12 +12,12 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from iblf_jax import _statistics, checks
+from iblf_jax import _statistics, _summaries, checks
 from iblf_jax._blocks import Results, block_size, run_blocks
 from iblf_jax._setup import Setup
 from iblf_jax._statistics import Probability
@@ -29,11 +29,15 @@ from iblf_jax.rollout import trajectory
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED, Status, describe
 
+if TYPE_CHECKING:
+    import xarray
+
 VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE
 """What `violation_probability` counts: a run that left its bounds, or that ran away, after which it has no say."""
 
 
-class Run(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Run:
     """One run of a study."""
 
     index: int
@@ -176,6 +180,63 @@ class Study:
         """Which runs a statistic is over, (N,) bool, and what to say about it."""
         used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
         return used, {"runs": int(used.sum()), "excluded": int(self.runs - used.sum()), "failed_excluded": str(bool(exclude_failed))}
+
+    def quantiles(self, quantiles: Sequence[float] = (0.05, 0.5, 0.95), *, exclude_failed: bool = False) -> xarray.Dataset:
+        """Quantiles of every metric over the runs, an `xarray.Dataset` with the dimensions `quantile` and `joint`.
+
+            Q(p) = min {y : at least p N of the runs have a value <= y}
+
+        Args:
+          quantiles: numbers p from 0 to 1.
+          exclude_failed: leave out failed runs; the attributes `runs` and `excluded` say how many were used and left out.
+
+        Raises:
+          ValueError: numbers outside [0, 1].
+        """
+        return _summaries.metric_quantiles(self, quantiles, exclude_failed)
+
+    def correlations(self, metrics: Sequence[str] | None = None, *, exclude_failed: bool = False) -> xarray.Dataset:
+        """Spearman's rank correlation of every drawn parameter with every metric (its worst joint), and the p-value.
+
+        Args:
+          metrics: names; all if not given.
+          exclude_failed: leave out failed runs, as in `quantiles`.
+
+        Raises:
+          ValueError: an unknown metric.
+        """
+        return _summaries.correlations(self, metrics, exclude_failed)
+
+    def bands(
+        self,
+        quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+        *,
+        runs: int = 1024,
+        samples: int = 200,
+        exclude_failed: bool = False,
+    ) -> xarray.Dataset:
+        """The tube with the quantiles of the runs along time, (quantile, time, joint), from the first `runs` runs, made again.
+
+        Args:
+          quantiles: numbers from 0 to 1.
+          runs: how many of the runs; their decimated trajectories are in memory together.
+          samples: about how many times.
+          exclude_failed: leave out failed runs, as in `quantiles`.
+
+        Raises:
+          ValueError: bad arguments, or no run that is left.
+        """
+        return _summaries.bands(self, quantiles, runs, samples, exclude_failed)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All runs as an `xarray.Dataset`: metrics and status along `run` (and `joint`), the drawn values as coordinates."""
+        return _summaries.to_xarray(self)
+
+    def plot(self, **options: Any) -> Any:
+        """Overview figure: the tube with bands, margins, and margin against each parameter.  Options as `plotting.study_overview`."""
+        from iblf_jax import plotting
+
+        return plotting.study_overview(self, **options)
 
     def replay(self, index: int, *, record_every: int = 1) -> Rollout:
         """Makes one run again, with its whole trajectory.

@@ -18,6 +18,7 @@ from iblf_jax import checks
 from iblf_jax.barriers import Barrier, Integral
 from iblf_jax.barriers._base import guard_is_active
 from iblf_jax.controllers._base import Command, Setting
+from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf, static
 
 READINGS = ("printed", "corrected")
@@ -75,7 +76,7 @@ class Backstepping:
         alpha, dalpha = jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))
         tube, model = setting.tube(t), setting.model
         carried = alpha if self.reading == "corrected" else dq
-        feedforward = model.coriolis(q, dq, carried) + model.gravity(q) + model.mass_matrix(q) @ dalpha
+        feedforward = model.coriolis(q, dq, carried) + model.gravity(q) + matvec(model.mass_matrix(q), dalpha)
         tau = feedforward - f_hat - self.K2 * (dq - alpha) - self.barrier.slope(tube, q)
         guard_active = guard_is_active(tube, q, self.barrier.guard)
         return Command(tau, alpha, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active)), ()

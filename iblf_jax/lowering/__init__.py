@@ -10,16 +10,16 @@ from collections.abc import Mapping
 import jax
 
 from iblf_jax import checks
+from iblf_jax.one_function import as_one_function
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import Outcome, as_one_function, run
+from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
-
 
 BACKENDS = ("auto", "vmap")
 """How a batch can be executed."""
 
 _SMALL = 64
-"""Batches up to this size gain from being one machine function; from 128 on XLA refuses some of its fusions there."""
+"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
 
 
 def run_batch(
@@ -53,6 +53,7 @@ def run_batch(
         return run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
 
     checks.one_of("backend", backend, BACKENDS)
-    batch = min(len(x) for x in varied.values())
     batched = jax.vmap(one)
-    return (as_one_function(batched) if batch <= _SMALL else batched)(dict(varied))
+    if min(len(values) for values in varied.values()) <= _SMALL:
+        batched = as_one_function(batched)
+    return batched(dict(varied))

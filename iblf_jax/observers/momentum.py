@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 
 from iblf_jax import checks
+from iblf_jax.linalg import matvec
 from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
 from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot, mass_matrix_rate
@@ -38,10 +39,10 @@ class Momentum:
 
     def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
         """f_hat, (n,) [N m]."""
-        return state + self.kf * (model.mass_matrix(q) @ dq)
+        return state + self.kf * matvec(model.mass_matrix(q), dq)
 
     def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
-        drift = model.coriolis(q, dq, dq) + model.gravity(q) - mass_matrix_rate(model, q, dq) @ dq
+        drift = model.coriolis(q, dq, dq) + model.gravity(q) - matvec(mass_matrix_rate(model, q, dq), dq)
         return -self.kf * (f_hat + tau - drift)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
+from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot
 
@@ -40,7 +41,7 @@ class Printed:
 
     def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
         """f_hat, (n,) [N m]."""
-        return state + self.kf * (model.mass_matrix(q) @ dq)
+        return state + self.kf * matvec(model.mass_matrix(q), dq)
 
     def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
         """eta', (n,) [N m/s]."""
@@ -59,4 +60,4 @@ def kf_advice(kf: jax.Array) -> list[str]:
 def initial_eta(observer, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
     """eta(0) of an observer with `kf`, `eta0` and `start`, (n,) [N m]."""
     eta0 = jnp.broadcast_to(observer.eta0, q.shape)
-    return eta0 - observer.kf * (model.mass_matrix(q) @ dq) if observer.start == "matched" else eta0
+    return eta0 - observer.kf * matvec(model.mass_matrix(q), dq) if observer.start == "matched" else eta0

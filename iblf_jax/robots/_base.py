@@ -17,6 +17,8 @@ from typing import Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.linalg import inner, matvec
+
 T = TypeVar("T")
 
 
@@ -73,8 +75,8 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
     """
     _, M_along_v = jax.jvp(mass_matrix, (q,), (v,))
     _, M_along_u = jax.jvp(mass_matrix, (q,), (u,))
-    energy_gradient = jax.grad(lambda x: u @ (mass_matrix(x) @ v))(q)
-    return 0.5 * (M_along_v @ u + M_along_u @ v - energy_gradient)
+    energy_gradient = jax.grad(lambda x: inner(u, matvec(mass_matrix(x), v)))(q)
+    return 0.5 * (matvec(M_along_v, u) + matvec(M_along_u, v) - energy_gradient)
 
 
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.linalg import inner, matmul, matvec
 from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.robots._base import from_energy, planar_skeleton
 
@@ -43,9 +44,7 @@ class PlanarChain:
         names = ("mass", "length", "centre", "inertia")
         sizes = {name: getattr(self, name).shape for name in names if getattr(self, name).ndim == 1}
         if not sizes:
-            raise checks.fail(
-                "PlanarChain.mass", self.mass, "one number a link, (n,)", "One field must say how many links."
-            )
+            raise checks.fail("PlanarChain.mass", self.mass, "one number a link, (n,)", "One field must say how many links.")
         shape = next(iter(sizes.values()))
         if shape[0] == 0:
             raise checks.fail("PlanarChain.mass", self.mass, "at least one link")
@@ -72,17 +71,17 @@ class PlanarChain:
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
         masses, arms = self._lever_arms()
-        A = arms.T @ (masses[:, None] * arms)
+        A = matmul(arms.T, masses[:, None] * arms)
         theta = jnp.cumsum(q)
         c, s = jnp.cos(theta), jnp.sin(theta)
         H = A * (c[:, None] * c[None, :] + s[:, None] * s[None, :]) + jnp.diag(self.inertia)
         S = jnp.asarray(np.tril(np.ones((self.n, self.n))), H.dtype)
-        return S.T @ H @ S
+        return matmul(S.T, matmul(H, S))
 
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q), () [J]."""
         masses, arms = self._lever_arms()
-        return self.g * (masses @ arms) @ jnp.sin(jnp.cumsum(q))
+        return self.g * inner(matvec(arms.T, masses), jnp.sin(jnp.cumsum(q)))
 
     def tip(self, q: jax.Array) -> jax.Array:
         """Position of the tip, (2,) [m]."""

@@ -1,0 +1,100 @@
+"""What defines the data of a sweep, as JSON: written into its attributes, and compared before a store is continued."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import re
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax._blocks import _execute, block_size
+from iblf_jax._points import Points
+from iblf_jax._setup import Setup
+from iblf_jax.paths import get, parameters
+from iblf_jax.pytree import is_leaf_field
+
+
+def describe_component(part: Any) -> Any:
+    """A component as JSON: its class, its structural fields and its numbers, all the way down."""
+    if isinstance(part, tuple | list):
+        return [describe_component(x) for x in part]
+    if isinstance(part, jax.Array | np.ndarray | np.generic | float | int) and not isinstance(part, bool):
+        return np.asarray(part).tolist()
+    if not dataclasses.is_dataclass(part) or isinstance(part, type):
+        return part if isinstance(part, str | bool | None) else repr(part)
+    fields = {field.name: describe_component(getattr(part, field.name)) for field in dataclasses.fields(part)}
+    return {"class": type(part).__qualname__, **fields}
+
+
+def structure(part: Any) -> Any:
+    """As `describe_component`, without the numbers: what a parameter table does not tell."""
+    if isinstance(part, tuple | list):
+        return [structure(x) for x in part]
+    if not dataclasses.is_dataclass(part) or isinstance(part, type):
+        return None
+    found: dict[str, Any] = {"class": type(part).__qualname__}
+    for field in dataclasses.fields(part):
+        inner = getattr(part, field.name)
+        if field.metadata.get("static"):
+            found[field.name] = inner if isinstance(inner, str | bool | int | float) else repr(inner)
+        elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):
+            found[field.name] = structure(inner)
+    return found
+
+
+def program_digest(setup: Setup) -> str:
+    """A digest of what a run computes: it tells when the code of a law, a robot or a metric has changed."""
+    traced = _execute.trace(setup.shared, setup.lanes(np.arange(block_size())), program=setup.program)
+    text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, Any]:
+    """Everything that the data of a sweep depend on."""
+    import jaxlib
+
+    import iblf_jax
+
+    scenario = setup.shared.cases.scenario
+    units = {p.path: p.unit for p in parameters(scenario)}
+
+    def unit(path: str) -> str:
+        plain = path.replace("robot", "plant", 1) if path.startswith("robot") else path
+        return units.get(plain, units.get(re.sub(r"(\[\d+\])+$", "", plain), ""))
+
+    def place(path: str) -> dict[str, Any]:
+        return {
+            "along": points.along[path],
+            "values": points.ticks[path].tolist(),
+            "unit": unit(path),
+            "shape": list(np.shape(get(scenario, path))),
+        }
+
+    program = setup.program
+    return {
+        "design": design,
+        "dims": dict(points.dims),
+        "points": {path: place(path) for path in points.values},
+        "perturbations": {path: describe_component(p) for path, p in setup.perturbations.items()},
+        "perturbed": {t.path: {"unit": unit(t.path), "source": t.source} for t in program.targets},
+        "runs": setup.runs,
+        "seed": setup.seed,
+        "sampler": setup.sampler,
+        "replicates": setup.replicates,
+        "duration": round(program.steps * dt, 12),
+        "dt": dt,
+        "method": program.method,
+        "metrics": describe_component(setup.shared.folds),
+        "scenario": {p.path: np.asarray(p.value).tolist() for p in parameters(scenario)},
+        "structure": structure(scenario),
+        "joints": scenario.n,
+        "dtype": str(scenario.initial.q.dtype),
+        "backend": program.backend,
+        "platform": jax.default_backend(),
+        "block": block_size(),
+        "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__, "jaxlib": jaxlib.__version__},
+        "program": program_digest(setup),
+    }

@@ -1,0 +1,115 @@
+"""The points of a sweep: a full grid of values, or a random or Latin-hypercube design over distributions.
+
+A grid has one dimension a path, and its points are numbered with the last path running fastest.  A design has the one dimension
+"point"; point j draws as run j of a study does (`_draws`), from a key of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax import checks, paths
+from iblf_jax._designs import split, unit_points
+from iblf_jax._draws import Cases, Lanes, Target, check_paths, draw, plan, sample_size
+from iblf_jax.distributions import Perturbation, is_distribution, value
+from iblf_jax.scenario import Scenario
+
+DESIGNS = ("grid", "random", "latin_hypercube")
+POINT = "point"
+_SALT = 0x706F696E
+"""Keeps the draws of a design apart from those of the runs."""
+
+
+class Points(NamedTuple):
+    """Where a sweep goes."""
+
+    dims: dict[str, int]
+    """Dimension -> size; P is their product."""
+    along: dict[str, str]
+    """Path -> the dimension that it varies along."""
+    ticks: dict[str, np.ndarray]
+    """Path -> its values along that dimension, (size,) or (size, ...)."""
+    values: dict[str, np.ndarray]
+    """Path -> its value at every point, (P,) or (P, ...)."""
+
+    @property
+    def total(self) -> int:
+        """Number of points P."""
+        return int(np.prod(list(self.dims.values()), dtype=int))
+
+
+def make_points(scenario: Scenario, grid: Any, design: str, points: int | None, seed: int) -> Points:
+    """The points of a sweep, checked against the scenario.
+
+    Raises:
+      ValueError: an unknown or overlapping path, values of a wrong shape, type or sign, a design that does not fit the grid.
+    """
+    checks.one_of("design", design, DESIGNS)
+    if not isinstance(grid, Mapping):
+        raise checks.fail("grid", grid, 'a mapping such as {"controller.K2": [10, 20, 40]}')
+    check_paths(scenario, grid, "grid")
+    if design == "grid":
+        if points is not None:
+            raise checks.fail("points", points, "none with a grid", 'A grid has as many as it has; or take design="latin_hypercube".')
+        return _grid(scenario, grid)
+    return _design(scenario, grid, design, checks.positive_integer("points", points), seed)
+
+
+def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
+    ticks = {path: _ticks(scenario, path, values) for path, values in grid.items()}
+    dims = {path: len(values) for path, values in ticks.items()}
+    places = np.indices(tuple(dims.values())).reshape(len(dims), -1)
+    values = {path: ticks[path][place] for path, place in zip(dims, places, strict=True)}
+    return Points(dims, {path: path for path in grid}, ticks, values)
+
+
+def _ticks(scenario: Scenario, path: str, values: Any) -> np.ndarray:
+    """The values of one path of a grid, (m,) for numbers that fill the leaf, or (m, ...) for whole leaves."""
+    name = f"grid[{path!r}]"
+    if isinstance(values, Perturbation) or is_distribution(values):
+        raise checks.fail(name, values, "a list of values", 'Distributions go with design="random" or "latin_hypercube".')
+    shape = np.shape(paths.get(scenario, path))
+    array = np.asarray(checks.as_floats(name, values)).astype(scenario.initial.q.dtype)
+    if array.ndim == 0 or array.shape[1:] not in ((), shape) or len(array) == 0:
+        raise checks.fail(name, array, f"a list of numbers{f' or of arrays of shape {shape}' if shape else ''}")
+    checks.check_values(name, array, paths.sign_at(scenario, path))
+    if len(np.unique(array, axis=0)) < len(array):
+        raise checks.fail(name, array, "values that differ", "Remove the repeated ones.")
+    return array
+
+
+def _design(scenario: Scenario, grid: Mapping[str, Any], design: str, count: int, seed: int) -> Points:
+    if not grid:
+        raise checks.fail("grid", dict(grid), f'at least one distribution for design="{design}"')
+    ways = {path: way if isinstance(way, Perturbation) else value(_distribution(path, way)) for path, way in grid.items()}
+    targets, by_path = plan(scenario, ways, "grid")
+    dtype = scenario.initial.q.dtype
+    by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
+    designed: dict[str, np.ndarray] = {}
+    if design == "latin_hypercube":
+        shapes = sample_size(targets, by_path)
+        designed = split(
+            unit_points(design, sum(int(np.prod(s, dtype=int)) for s in shapes.values()), count, 1, seed, _SALT), shapes, dtype
+        )
+    values = _draw_points(Cases(scenario, by_path, jax.random.fold_in(jax.random.key(seed), _SALT)), targets, count, designed)
+    return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
+
+
+def _distribution(path: str, way: Any) -> Any:
+    if not is_distribution(way):
+        raise checks.fail(f"grid[{path!r}]", way, "a distribution, such as ij.uniform(10, 40)", 'Lists of values go with design="grid".')
+    return way
+
+
+def _draw_points(cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    lanes = Lanes(np.arange(count, dtype=np.uint32), {}, designed)
+    drawn, fine = jax.jit(jax.vmap(lambda lane: draw(cases, targets, lane.index, lane.points, lane.u)[1:]))(lanes)
+    if not np.all(fine):
+        bad = int(np.argmin(np.asarray(fine)))
+        shown = {path: np.asarray(x[bad]).tolist() for path, x in drawn.items()}
+        raise checks.fail(f"grid: point {bad}", shown, "admissible values", "Choose distributions that stay inside the leaf's range.")
+    return {path: np.asarray(x) for path, x in drawn.items()}

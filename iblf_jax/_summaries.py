@@ -1,0 +1,136 @@
+"""Summaries of a study as labelled data: quantiles, rank correlations, quantile bands along time, everything."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from iblf_jax import _statistics, checks
+from iblf_jax._blocks import block_size, run_blocks
+from iblf_jax._config import describe_component
+from iblf_jax._dataset import own_dims
+from iblf_jax.paths import get, parameters
+from iblf_jax.status import FAILED, Status
+
+if TYPE_CHECKING:
+    import xarray
+
+    from iblf_jax.study import Study
+
+RECORDED = {"q": "rad", "e1": "rad"}
+"""What bands are made of, and its unit."""
+
+
+def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
+    """Numbers in [0, 1], or a ValueError."""
+    values = np.atleast_1d(np.asarray(checks.as_floats("quantiles", quantiles), float).round(7))
+    if values.ndim != 1 or values.size == 0 or not np.all((values >= 0) & (values <= 1)):
+        raise checks.fail("quantiles", quantiles, "numbers from 0 to 1", "(0.05, 0.5, 0.95), for example.")
+    return values
+
+
+def metric_quantiles(study: Study, quantiles: Sequence[float], exclude_failed: bool) -> xarray.Dataset:
+    """Quantiles of every metric over the runs; see `Study.quantiles`."""
+    import xarray
+
+    levels = check_quantiles(quantiles)
+    used, said = study.chosen(exclude_failed)
+    variables = {}
+    for name, values in study.metrics.items():
+        values = np.asarray(values)
+        made = _quantile(values[used], levels) if used.any() else np.full((len(levels), *values.shape[1:]), np.nan)
+        variables[name] = (
+            ("quantile", *own_dims(name, values.shape[1:], study.scenario.n)),
+            made,
+            {"units": study.metrics.units.get(name, "")},
+        )
+    return xarray.Dataset(variables, {"quantile": levels}, said)
+
+
+def _quantile(values: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Quantiles that are values of some run, so that infinite ones do no harm."""
+    return np.quantile(values, levels, axis=0, method="inverted_cdf")
+
+
+def correlations(study: Study, metrics: Sequence[str] | None, exclude_failed: bool) -> xarray.Dataset:
+    """Spearman's rank correlation of every drawn parameter with metrics; see `Study.correlations`."""
+    import xarray
+
+    used, said = study.chosen(exclude_failed)
+    names = list(study.metrics) if metrics is None else list(metrics)
+    drawn = _statistics.columns(study.samples)
+    found = np.full((len(drawn), len(names), 2), np.nan)
+    for j, name in enumerate(names):
+        y = _statistics.one_number(study.metrics, name)[used]
+        for i, x in enumerate(drawn.values()):
+            found[i, j] = _statistics.rank_correlation(x[used], y)
+    dims = ("parameter", "metric")
+    variables = {"correlation": (dims, found[..., 0], {"units": "1"}), "p_value": (dims, found[..., 1], {"units": "1"})}
+    return xarray.Dataset(variables, {"parameter": list(drawn), "metric": names}, said | {"of": "the worst joint of each metric"})
+
+
+def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exclude_failed: bool) -> xarray.Dataset:
+    """Quantiles along time of position and error; see `Study.bands`."""
+    import xarray
+
+    levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
+    count = min(checks.positive_integer("runs", runs), study.runs)
+    record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
+    parts, times = [], np.zeros(0)
+    for _, (arrays, t, _, _) in run_blocks(
+        setup.program, setup.shared, setup.lanes, range(-(-count // size)), chunk=size, record_every=record_every
+    ):
+        parts.append(arrays)
+        times = t[0]
+    whole = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
+    used = study.made[:count] if not exclude_failed else study.chosen(True)[0][:count]
+    if not used.any():
+        raise checks.fail("runs", count, "at least one run that is not left out", "Take more runs, or exclude_failed=False.")
+    dims = ("quantile", "time", "joint")
+    variables: dict[str, Any] = {name: (dims, _quantile(whole[name][used], levels), {"units": unit}) for name, unit in RECORDED.items()}
+    edges: dict[str, Any] = {"lower": np.max, "upper": np.min, "q_d": np.median}
+    for name, edge in edges.items():
+        words = {"lower": "tightest lower bound", "upper": "tightest upper bound", "q_d": "median reference"}[name]
+        variables[name] = (dims[1:], edge(whole[name][used], axis=0), {"units": "rad", "description": f"{words} of the runs"})
+    said = {"runs": int(used.sum()), "excluded": int(count - used.sum()), "of_runs": study.runs}
+    return xarray.Dataset(variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, said)
+
+
+def to_xarray(study: Study) -> xarray.Dataset:
+    """Metrics, status and samples of all runs; see `Study.to_xarray`."""
+    import xarray
+
+    import iblf_jax
+
+    n = study.scenario.n
+    units = {p.path: p.unit for p in parameters(study.scenario)}
+    variables: dict[str, Any] = {}
+    for name, values in study.metrics.items():
+        variables[name] = (
+            ("run", *own_dims(name, np.shape(values)[1:], n)),
+            np.asarray(values),
+            {"units": study.metrics.units.get(name, "")},
+        )
+    flags = [flag for flag in Status if flag]
+    masks = {"flag_masks": np.array([int(f) for f in flags], np.int32), "flag_meanings": " ".join((f.name or "").lower() for f in flags)}
+    variables["status"] = ("run", study.status, {"units": "1", "description": "bit flags; 0 is ok"} | masks)
+    variables["fastest_mode"] = ("run", study.fastest_mode, {"units": "1/s"})
+    coordinates: dict[str, Any] = {"run": np.arange(study.runs)}
+    for path, values in study.samples.items():
+        plain = path.replace("robot", "plant", 1) if path.startswith("robot") else path
+        unit = units.get(plain, units.get(plain.partition("[")[0], ""))
+        coordinates[path] = (
+            ("run", *own_dims(path, values.shape[1:], n)),
+            values,
+            {"units": unit, "nominal": np.asarray(get(study.scenario, path)).tolist()},
+        )
+    setup = study.setup
+    attributes: dict[str, Any] = {"runs": study.runs, "failed": int(np.sum(study.status & int(FAILED) != 0)), "seed": study.seed}
+    attributes |= {"duration": study.duration, "dt": study.dt, "method": setup.program.method, "sampler": setup.sampler}
+    attributes |= {"backend": setup.program.backend, "iblf_jax_version": iblf_jax.__version__}
+    attributes["perturbations"] = json.dumps({path: describe_component(p) for path, p in study.perturbations.items()})
+    attributes["parameters"] = json.dumps({p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario)})
+    return xarray.Dataset(variables, coordinates, attributes)

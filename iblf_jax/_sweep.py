@@ -1,0 +1,243 @@
+"""Sweeps: a scenario over many values of its parameters, with perturbed runs at each, into an `xarray.Dataset`.
+
+Cases are numbered, case = point * runs + run, and run r draws the same at every point (common random numbers), so that points differ by
+what was swept and not by luck.  With a store the cases are computed and written unit by unit (`store`), and a sweep that was
+killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax import _config, checks, distributed
+from iblf_jax._blocks import MEMORY, Results, _execute, block_size, run_blocks
+from iblf_jax._dataset import DRAWN, own_dims, to_dataset
+from iblf_jax._designs import check_sampler, check_seed
+from iblf_jax._interrupt import CtrlC, Interrupted
+from iblf_jax._points import make_points
+from iblf_jax._progress import bar
+from iblf_jax._setup import Setup, prepare
+from iblf_jax.distributions import Perturbation
+from iblf_jax.metrics import Fold
+from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.store import Store, StoreError, Variable, load_store, open_store
+
+if TYPE_CHECKING:
+    import xarray
+
+STEPS_A_UNIT = 2e8
+"""Steps of all runs of a unit together, unless the caller says otherwise: seconds to a minute of work."""
+UNITS = 16
+"""Units that a sweep has at least, if it is large enough."""
+
+
+class _How(NamedTuple):
+    """How a sweep is carried out; none of it changes a number."""
+
+    chunk: int | None
+    memory: float
+    devices: Sequence[jax.Device] | None
+    progress: bool | None
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """For `run_blocks`."""
+        return {"chunk": self.chunk, "memory": self.memory, "devices": self.devices}
+
+
+def sweep(
+    scenario: Scenario,
+    grid: Mapping[str, Any],
+    *,
+    duration: float,
+    dt: float = 1e-3,
+    perturbations: Mapping[str, Perturbation] | None = None,
+    runs: int = 1,
+    seed: int = 0,
+    design: str = "grid",
+    points: int | None = None,
+    method: str = "rk4",
+    metrics: Sequence[Fold] | None = None,
+    sampler: str = "independent",
+    replicates: int = 1,
+    store: str | os.PathLike | None = None,
+    unit: int | None = None,
+    backend: str = "auto",
+    chunk: int | None = None,
+    memory: float = MEMORY,
+    devices: Sequence[jax.Device] | None = None,
+    progress: bool | None = None,
+) -> xarray.Dataset:
+    """Runs a scenario over many values of its parameters, with perturbed runs at each.
+
+        case = point * runs + run;   leaf = perturbation(value at the point, F^-1(u)),   u from seed, run and path only
+
+    Results are bit-identical whatever `chunk`, `unit`, the devices, the processes, and however often it was killed and started again.
+
+    Args:
+      scenario: what to run, of n joints.
+      grid: path -> values for a grid: numbers, or arrays for a vector leaf; a number fills every entry.  Path -> distribution (or
+        `factor`, `offset` of one) for the other designs.  Empty for one point.
+      duration: length of a run [s], a whole number of steps.
+      dt: time step [s].
+      perturbations: path -> `factor`, `offset` or `value` of a distribution, around the values of each point.
+      runs: perturbed runs at each point.
+      seed: whole number that fixes all draws.
+      design: "grid", "random" or "latin_hypercube".
+      points: number of points of a random or Latin-hypercube design.
+      method: "rk4", "heun" or "euler".
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
+      sampler: of the runs: "independent", "latin_hypercube" or "sobol".
+      replicates: number of independent designs that a designed sampler is made of.
+      store: folder to write to, unit by unit, and to go on from; needs the extra `sweep`.
+      unit: cases that are written together; chosen if not given.
+      backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
+      chunk: cases in flight on the devices at a time; from `memory` if not given.
+      memory: bytes that cases in flight may take.
+      devices: devices to use; all of this process if not given.
+      progress: a progress bar; shown where somebody watches if not given.
+
+    Returns:
+      An `xarray.Dataset` of the metrics and `status`, with one dimension for each path of a grid (or "point"), then `run` if there are
+      perturbations, then `joint`; the configuration, seed and versions are in its attributes.
+
+    Raises:
+      ValueError: bad arguments; the message names the field, the value and the mend.
+      StoreError: a store of another configuration, a foreign or unwritable one, a full disk.  What was written stays valid.
+      Interrupted: Ctrl-C; with a store only after the unit at hand, and the message says how to go on.
+
+    Source: design of this package.
+    """
+    runs, chunk = checks.positive_integer("runs", runs), chunk and checks.positive_integer("chunk", chunk)
+    replicates, perturbations = check_sampler(sampler, runs, replicates), perturbations or {}
+    if not perturbations and runs > 1:
+        raise checks.fail("runs", runs, "1 without perturbations", "Without any all runs at a point are the same.")
+    if not perturbations and not grid:
+        raise checks.fail("grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate.")
+    where = make_points(canonical(scenario), grid, design, points, check_seed(seed))
+    options: dict[str, Any] = {"metrics": metrics, "backend": backend, "sampler": sampler, "replicates": replicates, "points": where.values}
+    setup = prepare(scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options)
+    config = _config.describe(setup, where, design, float(dt))
+    how = _How(chunk, memory, devices, progress)
+    if store is None:
+        return _in_memory(setup, config, how)
+    return _into_store(setup, config, how, store, unit)
+
+
+def load_sweep(store: str | os.PathLike) -> xarray.Dataset:
+    """The data of a store, complete or not.
+
+    Args:
+      store: folder that `sweep` writes to.
+
+    Returns:
+      The Dataset that `sweep` returns; where nothing has been computed yet, NaN and status -1.  Its attributes `computed_cases` and
+      `cases` say how far it is.
+
+    Raises:
+      StoreError: no store, a foreign or a damaged one.
+    """
+    return _dataset(load_store(store))
+
+
+def _dataset(store: Store) -> xarray.Dataset:
+    data, done = store.read_all()
+    return to_dataset(store.config, data, {name: store.units_of(name) for name in data}, done)
+
+
+def _flat(results: Results) -> dict[str, Any]:
+    drawn = {DRAWN + path: x for path, x in results.samples.items()}
+    return {**results.metrics, "status": results.status, "fastest_mode": results.fastest_mode, **drawn}
+
+
+def _variables(setup: Setup, config: dict[str, Any]) -> dict[str, Variable]:
+    """The arrays of a sweep."""
+    shapes = _flat(jax.eval_shape(lambda *x: _execute(*x, program=setup.program), setup.shared, setup.lanes(np.arange(block_size()))))
+    units = {name: unit for fold in setup.shared.folds for name, unit in fold.units.items()}
+    units |= {"status": "1", "fastest_mode": "1/s"} | {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
+    return {
+        name: Variable(x.shape[1:], str(x.dtype), own_dims(name.removeprefix(DRAWN), x.shape[1:], config["joints"]), units.get(name, ""))
+        for name, x in shapes.items()
+    }
+
+
+def _in_memory(setup: Setup, config: dict[str, Any], how: _How) -> xarray.Dataset:
+    if distributed.size() > 1:
+        raise checks.fail("store", None, "a store, in a job of several processes", "They meet there: store='sweep.zarr' on a shared disk.")
+    variables = _variables(setup, config)
+    data = {name: np.zeros((setup.cases, *v.shape), v.dtype) for name, v in variables.items()}
+    with bar(how.progress, setup.cases) as shown:
+        for part, cases in _units(setup, [0], setup.cases, how, shown):
+            for name, values in part.items():
+                data[name][cases] = values
+    return to_dataset(config, data, {name: v.unit for name, v in variables.items()}, np.ones(setup.cases, bool))
+
+
+def _units(setup: Setup, units: Sequence[int], unit: int, how: _How, shown: Any) -> Iterator[tuple[dict[str, np.ndarray], slice]]:
+    """Computes units and yields their data and cases, in order; in pieces, if a unit is all there is."""
+    size = block_size()
+    spans = [slice(u * unit, min((u + 1) * unit, setup.cases)) for u in units]
+    blocks = [block for span in spans for block in range(span.start // size, -(-span.stop // size))]
+    pieces: list[dict[str, np.ndarray]] = []
+    waiting = iter(spans)
+    span = next(waiting, None)
+    for block, results in run_blocks(setup.program, setup.shared, setup.lanes, blocks, **how.where):
+        assert span is not None
+        here = min(size, span.stop - block * size)
+        pieces.append({name: x[:here] for name, x in _flat(results).items()})
+        shown.update(here)
+        if block * size + here == span.stop:
+            yield {name: np.concatenate([p[name] for p in pieces]) for name in pieces[0]}, span
+            pieces, span = [], next(waiting, None)
+
+
+def _chosen_unit(setup: Setup, unit: int | None) -> int:
+    """Cases in a unit: whole blocks, or all there is."""
+    size, cases = block_size(), setup.cases
+    wanted = min(STEPS_A_UNIT / setup.program.steps, cases / UNITS) if unit is None else checks.positive_integer("unit", unit)
+    return min(cases, size * max(1, round(wanted / size)))
+
+
+def _into_store(setup: Setup, config: dict[str, Any], how: _How, path: str | os.PathLike, unit: int | None) -> xarray.Dataset:
+    store = open_store(path, config, _variables(setup, config), setup.cases, _chosen_unit(setup, unit), any_unit=unit is None)
+    size = store.unit
+    pending, damaged = store.pending()
+    if damaged:
+        warnings.warn(
+            f"{path}: {len(damaged)} units are damaged (their data do not fit their checksums) and are computed again: {damaged[:10]}.",
+            stacklevel=3,
+        )
+    mine = distributed.share(pending)
+    done, longest, begin = 0, 0.0, time.monotonic()
+    with CtrlC() as ctrl_c, bar(how.progress, setup.cases, setup.cases - sum(_length(store, u) for u in pending)) as shown:
+        for data, span in _units(setup, mine, size, how, shown):
+            store.write(span.start // size, data)
+            done, longest, begin = done + 1, max(longest, time.monotonic() - begin), time.monotonic()
+            if ctrl_c.asked and done < len(mine):
+                raise _interrupted(store)
+        if distributed.size() > 1:
+            distributed.wait_for(lambda: int(store.marks().sum()), store.units, longest, str(path))
+    return _dataset(store)
+
+
+def _length(store: Store, unit: int) -> int:
+    span = store.span(unit)
+    return span.stop - span.start
+
+
+def _interrupted(store: Store) -> Interrupted:
+    marks = store.marks()
+    return Interrupted(
+        f"Stopped after {int(marks.sum())} of {store.units} units, which are written to {store.path}. "
+        "Start the same call or command again to go on from there."
+    )
+
+
+__all__ = ["Interrupted", "StoreError", "load_sweep", "sweep"]

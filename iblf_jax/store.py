@@ -1,0 +1,292 @@
+"""A store of runs on disk (zarr) that survives a kill at any moment.
+
+- It is made in a temporary folder and renamed in: there is never half a store.
+- A **unit** is a number of consecutive cases, and one whole chunk of every array, so processes that write different units never touch the
+  same file, and two that write the same unit write the same bytes.  zarr writes a chunk to a temporary file and renames it.
+- A unit's data are written first, its mark in `done` after them, one unit a chunk.  The mark holds a checksum of the unit's data and of
+  the configuration: data that are torn, missing, or of another store do not fit their mark and are not read.
+- The attributes hold the whole configuration.  A store that was made with another one is refused, naming the difference.
+
+zarr does not force data to the disk's surface: a kill cannot tear a store, a power failure can, and then the checksum tells.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import shutil
+import time
+import uuid
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+FORMAT = 1
+DONE = "done"
+CASE = "case"
+_MARK = "iblf_jax_store"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+_STALE = 3600.0
+
+
+class StoreError(RuntimeError):
+    """A store that cannot be written, read or continued; the message says why, and what to do."""
+
+
+class Variable(NamedTuple):
+    """One array of a store, by its rows: one row a case."""
+
+    shape: tuple[int, ...]
+    dtype: str
+    dims: tuple[str, ...]
+    unit: str
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError:
+        raise StoreError("A store needs zarr, which is not installed: pip install 'iblf_jax[sweep]'.") from None
+    return zarr
+
+
+def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
+    """Where two configurations differ, "name: the store has x, this call y"."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        keys = [*theirs, *(key for key in ours if key not in theirs)]
+        absent = object()
+        found = [differences(theirs.get(k, absent), ours.get(k, absent), f"{name}.{k}" if name else str(k)) for k in keys]
+        return [text for texts in found for text in texts]
+    if type(theirs) is type(ours) and theirs == ours:
+        return []
+
+    def shown(value):
+        text = json.dumps(value) if isinstance(value, str | int | float | list | dict | bool | None) else "nothing"
+        return text if len(text) <= 80 else text[:77] + "..."
+
+    return [f"{name}: the store has {shown(theirs)}, this call {shown(ours)}"]
+
+
+class Store:
+    """A store that is open for writing and reading; made by `open_store`."""
+
+    def __init__(self, path: Path, group: Any):
+        self.path = path
+        self.group = group
+        attributes = dict(group.attrs)
+        self.config: dict[str, Any] = attributes["config"]
+        self.cases: int = attributes["cases"]
+        self.unit: int = attributes["unit"]
+        self.units = -(-self.cases // self.unit)
+        self._salt = zlib.crc32(json.dumps(self.config, sort_keys=True).encode())
+        self._arrays = {name: group[name] for name in attributes["variables"]}
+        self._done = group[DONE]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the arrays."""
+        return list(self._arrays)
+
+    def span(self, unit: int) -> slice:
+        """The cases of a unit."""
+        return slice(unit * self.unit, min((unit + 1) * self.unit, self.cases))
+
+    def marks(self) -> np.ndarray:
+        """Which units are marked as done, (units,) bool."""
+        with self._reading("the marks"):
+            return np.asarray(self._done[:]) != 0
+
+    def dims(self, name: str) -> tuple[str, ...]:
+        """Dimensions of an array."""
+        return tuple(self._arrays[name].metadata.dimension_names)
+
+    def units_of(self, name: str) -> str:
+        """SI unit of an array."""
+        return str(self._arrays[name].attrs.get("units", ""))
+
+    def _mark(self, data: Mapping[str, np.ndarray]) -> int:
+        total = self._salt
+        for name in sorted(data):
+            total = zlib.crc32(np.ascontiguousarray(data[name]).tobytes(), zlib.crc32(name.encode(), total))
+        return (1 << 32) | total
+
+    def write(self, unit: int, data: Mapping[str, np.ndarray]) -> None:
+        """Writes one unit: its data, then its mark."""
+        with self._writing():
+            for name, array in self._arrays.items():
+                array[self.span(unit)] = data[name]
+            self._done[unit] = self._mark(data)
+
+    def read(self, unit: int) -> dict[str, np.ndarray] | None:
+        """The data of one unit; None if they do not fit its mark."""
+        try:
+            data = {name: np.asarray(array[self.span(unit)]) for name, array in self._arrays.items()}
+            return data if int(self._done[unit]) == self._mark(data) else None
+        except OSError as error:
+            if error.errno in _FORBIDDEN:
+                raise StoreError(f"{self.path}: cannot be read: {error.strerror}.") from error
+            return None
+        except Exception:  # whatever a decoder makes of a torn file
+            return None
+
+    def pending(self) -> tuple[list[int], list[int]]:
+        """The units that are to be computed, and those of them that are marked done but damaged."""
+        marks = self.marks()
+        damaged = [int(unit) for unit in np.flatnonzero(marks) if self.read(int(unit)) is None]
+        return sorted([*map(int, np.flatnonzero(~marks)), *damaged]), damaged
+
+    def read_all(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Everything that is done, (cases, ...), and which cases are, (cases,) bool; StoreError if a unit is damaged."""
+        done = np.zeros(self.cases, bool)
+        out = {name: np.full(array.shape, array.fill_value, array.dtype) for name, array in self._arrays.items()}
+        for unit in np.flatnonzero(self.marks()):
+            data = self.read(int(unit))
+            if data is None:
+                raise StoreError(
+                    f"{self.path}: unit {unit} is damaged (its data do not fit its checksum). Run the same sweep again to mend it."
+                )
+            done[self.span(int(unit))] = True
+            for name, values in data.items():
+                out[name][self.span(int(unit))] = values
+        return out, done
+
+    @contextlib.contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            raise StoreError(f"{self.path}: {what} cannot be read ({type(error).__name__}: {error}).") from error
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            kept = f"{int(self.marks().sum())} of {self.units} units are written and valid: start the same call again to go on"
+            raise _why(self.path, error, kept) from error
+
+
+def _why(path: Path, error: OSError, kept: str = "") -> StoreError:
+    """The error for a failed write, in words."""
+    if error.errno in _FULL:
+        text = f"{path}: no space left to write to ({error.strerror}). Make room, or take another disk."
+    elif error.errno in _FORBIDDEN:
+        text = f"{path}: cannot be written ({error.strerror}). Choose a path that you may write to."
+    else:
+        text = f"{path}: cannot be written ({error.strerror or error})."
+    return StoreError(text + (f" {kept[0].upper()}{kept[1:]}." if kept else ""))
+
+
+def load_store(path: str | os.PathLike) -> Store:
+    """Opens a store that exists.
+
+    Raises:
+      StoreError: there is none, or something else is in its place.
+    """
+    zarr, place = _zarr(), Path(path)
+    if not place.exists():
+        raise StoreError(f"{place}: there is no store here.")
+    try:
+        group = zarr.open_group(str(place), mode="r+")
+        known = group.attrs.get(_MARK)
+    except PermissionError as error:
+        raise StoreError(f"{place}: cannot be read ({error.strerror}).") from error
+    except Exception as error:
+        raise StoreError(f"{place}: is not a store of iblf_jax ({type(error).__name__}). Choose another path.") from error
+    if known != FORMAT:
+        came = "something that iblf_jax did not write" if known is None else f"a store of format {known}"
+        raise StoreError(f"{place}: holds {came}, expected a store of format {FORMAT}. Choose another path.")
+    try:
+        return Store(place, group)
+    except Exception as error:
+        raise StoreError(f"{place}: is damaged: its description is incomplete ({type(error).__name__}: {error}).") from error
+
+
+def open_store(
+    path: str | os.PathLike, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int, *, any_unit: bool = False
+) -> Store:
+    """Opens a store to go on with it, or makes it.
+
+    Args:
+      path: its folder.
+      config: what defines the data; JSON.
+      variables: name -> array.
+      cases: number of cases.
+      unit: cases in a unit.
+      any_unit: take the unit of a store that exists, whatever it is.
+
+    Raises:
+      StoreError: it was made with another configuration, is foreign or damaged, or cannot be written.
+    """
+    place, config = Path(path), json.loads(json.dumps(config))
+    if not _exists(place):
+        _make(place, config, variables, cases, unit)
+    store = load_store(place)
+    found = differences(store.config, config)
+    named = [text for text in found if not text.startswith("program:")]
+    found = named or [text + " (the code of a law, a robot or a metric has changed)" for text in found]
+    if not any_unit:
+        found += differences({"unit": store.unit}, {"unit": unit})
+    if found:
+        more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
+        raise StoreError(
+            f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. "
+            "Go on with the same arguments, or choose another path."
+        )
+    if not os.access(place, os.W_OK):
+        raise _why(place, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+    return store
+
+
+def _exists(place: Path) -> bool:
+    """Whether something is there (an empty folder is nothing)."""
+    try:
+        return place.exists() and not (place.is_dir() and not any(place.iterdir()))
+    except OSError as error:
+        raise _why(place, error) from error
+
+
+def _make(place: Path, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int) -> None:
+    """Makes a store beside its place and renames it in; if another process was first, its store stays."""
+    zarr = _zarr()
+    draft = place.parent / f".{place.name}.{uuid.uuid4().hex}.partial"
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        _sweep_up(place)
+        group = zarr.open_group(str(draft), mode="w")
+        for name, v in variables.items():
+            array = group.create_array(
+                name,
+                shape=(cases, *v.shape),
+                chunks=(unit, *v.shape),
+                dtype=v.dtype,
+                fill_value=np.nan if np.dtype(v.dtype).kind == "f" else -1,
+                dimension_names=(CASE, *v.dims),
+                config={"write_empty_chunks": True},
+            )
+            array.attrs["units"] = v.unit
+        group.create_array(DONE, shape=(-(-cases // unit),), chunks=(1,), dtype="uint64", fill_value=0, dimension_names=("unit",))
+        group.attrs.update({_MARK: FORMAT, "config": config, "cases": cases, "unit": unit, "variables": list(variables)})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # zarr says that consolidated metadata are not in its specification yet
+            zarr.consolidate_metadata(group.store)
+        os.rename(draft, place)
+    except OSError as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not place.is_dir():
+            raise _why(place, error) from error
+
+
+def _sweep_up(place: Path) -> None:
+    """Removes what a process that was killed while making this store has left behind an hour ago or more."""
+    for draft in place.parent.glob(f".{place.name}.*.partial"):
+        with contextlib.suppress(OSError):
+            if time.time() - draft.stat().st_mtime > _STALE:
+                shutil.rmtree(draft, ignore_errors=True)

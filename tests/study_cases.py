@@ -1,0 +1,128 @@
+"""The one small study that these tests share, in this process and in others: few programs to compile.
+
+As a script it does the small sweep in a process of its own: `python study_cases.py OUT [--store S] [--devices N] [--job ADDRESS N I]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+
+def perturbations(mass=0.1, q=0.05):
+    """Two perturbations by standard deviation; other numbers do not recompile."""
+    import iblf_jax as ij
+
+    return {"plant.mass[1]": ij.factor(ij.normal(1.0, mass)), "initial.q": ij.offset(ij.normal(0.0, q))}
+
+
+def options():
+    import iblf_jax as ij
+
+    return {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),), "seed": 3}
+
+
+GRID = {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
+RUNS = 500
+"""3000 cases: 12 blocks of 256."""
+UNIT = 256
+
+
+def study(runs=600, ways=None, **more):
+    import iblf_jax as ij
+
+    return ij.monte_carlo(ij.presets.zhang_yan_2024(), ways or perturbations(), runs=runs, **options() | more)
+
+
+def table(**more):
+    import iblf_jax as ij
+
+    return ij.sweep(ij.presets.zhang_yan_2024(), GRID, perturbations=perturbations(), runs=RUNS, **options() | {"unit": UNIT} | more)
+
+
+def arrays(dataset):
+    return {str(name): np.asarray(dataset[name]) for name in dataset.variables}
+
+
+def same(a, b):
+    """Whether two mappings of arrays have the same names and bits."""
+    return set(a) == set(b) and all(
+        np.asarray(a[k]).dtype == np.asarray(b[k]).dtype and np.array_equal(a[k], b[k], equal_nan=True) for k in a
+    )
+
+
+def environment(cache: Path, **more: str) -> dict[str, str]:
+    """For a process of its own: this package, float64, and compiled programs shared between such processes."""
+    root = str(Path(__file__).parents[1])
+    import jax
+
+    chosen = {
+        "JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64)),
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
+    return os.environ | chosen | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"} | more
+
+
+def start(cache: Path, *words: str, **more: str) -> subprocess.Popen:
+    """Starts this file as a script."""
+    command = [sys.executable, __file__, *words]
+    return subprocess.Popen(command, env=environment(cache, **more), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("out")
+    parser.add_argument("--store")
+    parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--job", nargs=3)
+    parser.add_argument("--slow", type=float, default=0.0, help="sleep so long after each unit")
+    parser.add_argument("--die-after", type=int, help="kill this process after so many units")
+    parser.add_argument("--study", action="store_true")
+    args = parser.parse_args()
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", args.devices)
+    import iblf_jax as ij
+
+    if args.job:
+        ij.distributed.initialize(args.job[0], int(args.job[1]), int(args.job[2]), heartbeat=5, start=60)
+    _hinder(args)
+    if args.study:
+        found = study()
+        data = dict(found.metrics) | found.samples | {"status": found.status}
+    else:
+        data = arrays(table(**({"store": args.store} if args.store else {})))
+    np.savez(args.out, **data)
+    print("done")
+
+
+def _hinder(args) -> None:
+    """Makes writing slow, or deadly."""
+    import signal
+    import time
+
+    from iblf_jax.store import Store
+
+    plain, written = Store.write, []
+
+    def write(self, unit, data):
+        plain(self, unit, data)
+        written.append(unit)
+        print("unit", unit, flush=True)
+        time.sleep(args.slow)
+        if args.die_after is not None and len(written) >= args.die_after:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    if args.slow or args.die_after is not None:
+        Store.write = write
+
+
+if __name__ == "__main__":
+    main()

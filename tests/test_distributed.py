@@ -1,0 +1,105 @@
+"""Several processes on loopback, two CPU devices each: the same bits as one, and a clear end when one is killed."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import study_cases as cases
+
+import iblf_jax as ij
+from iblf_jax import distributed
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A folder for compiled programs, shared between the processes of all tests."""
+    return tmp_path_factory.getbasetemp() / "compiled"
+
+
+def free_address():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+def job(compiled, tmp_path, words, more=((), ()), devices="2"):
+    """Starts two processes."""
+    address = free_address()
+    return [
+        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i]) for i in (0, 1)
+    ]
+
+
+def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path):
+    path = tmp_path / "sweep.zarr"
+    words = ("--store", str(path))
+    survivor, victim = job(compiled, tmp_path, words, (("--slow", "1.0"), ("--die-after", "2")), devices="1")
+    victim.communicate(timeout=300)
+    assert victim.returncode == -signal.SIGKILL
+    begin = time.monotonic()
+    _, errors = survivor.communicate(timeout=60)
+    assert time.monotonic() - begin < 30
+    assert survivor.returncode != 0
+    assert "another process was lost" in errors
+    assert "start the same command again" in errors
+    assert 0 < ij.load_sweep(path).attrs["computed_cases"] < 6 * cases.RUNS
+    both = job(compiled, tmp_path, words)
+    for process in both:
+        _, errors = process.communicate(timeout=300)
+        assert process.returncode == 0, errors
+    one = cases.arrays(cases.table())
+    for i in (0, 1):
+        assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), one)
+
+
+@pytest.mark.slow
+def test_a_study_over_two_processes(compiled, tmp_path):
+    for process in job(compiled, tmp_path, ("--study",)):
+        _, errors = process.communicate(timeout=300)
+        assert process.returncode == 0, errors
+    study = cases.study()
+    expected = dict(study.metrics) | study.samples | {"status": study.status}
+    for i in (0, 1):
+        assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), expected)
+
+
+def test_a_stalled_process_is_not_waited_for_for_ever(monkeypatch):
+    monkeypatch.setattr(distributed, "LEAST_PATIENCE", 0.2)
+    with pytest.raises(distributed.ProcessLostError, match=r"x has 3 of 5 units, which are valid"):
+        distributed.wait_for(lambda: 3, 5, 0.0, "x")
+    with pytest.raises(distributed.ProcessLostError, match="did not answer"):
+        distributed.bounded(lambda: time.sleep(2), 0.1)
+    assert distributed.bounded(lambda: 3, 5.0) == 3
+
+
+def test_progress_of_others_keeps_the_patience(monkeypatch):
+    monkeypatch.setattr(distributed, "LEAST_PATIENCE", 0.5)
+    begin = time.monotonic()
+    distributed.wait_for(lambda: int(4 * (time.monotonic() - begin)), 5, 0.0, "x")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("localhost:1", None, None), "all three"),
+        (("localhost", 2, 0), "port"),
+        (("localhost:1", 0, 0), "num_processes"),
+        (("localhost:1", 2, 2), "from 0 to 1"),
+    ],
+)
+def test_bad_jobs_are_refused(words, message):
+    with pytest.raises(ValueError, match=message):
+        distributed.initialize(*words)
+
+
+def test_importing_the_package_starts_no_device(compiled):
+    """Else neither `jax.distributed.initialize` nor the number of CPU devices could come after the import."""
+    code = "import jax, iblf_jax as ij; ij.monte_carlo, ij.sweep; jax.config.update('jax_num_cpu_devices', 3); print(len(jax.devices()))"
+    done = subprocess.run([sys.executable, "-c", code], env=cases.environment(compiled), capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "3", done.stderr

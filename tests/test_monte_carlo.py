@@ -1,0 +1,345 @@
+"""Monte-Carlo studies: the law of the draws, bit-identity, statistics, failed runs, refusals."""
+
+from __future__ import annotations
+
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import study_cases as cases
+from scipy import stats
+
+import iblf_jax as ij
+from iblf_jax import _blocks, _statistics
+from iblf_jax.status import FAILED, Status
+
+SCENARIO = ij.presets.zhang_yan_2024()
+
+
+@pytest.fixture(scope="module")
+def study():
+    return cases.study()
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A folder for compiled programs, shared between the processes of all tests."""
+    return tmp_path_factory.getbasetemp() / "compiled"
+
+
+def results(study):
+    return dict(study.metrics) | study.samples | {"status": study.status, "mode": study.fastest_mode}
+
+
+# ------------------------------------------------------------------------------------------------------------ bit-identity
+
+
+@pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
+def test_chunk_changes_nothing(study, chunk):
+    assert cases.same(results(study), results(cases.study(chunk=chunk)))
+
+
+@pytest.mark.parametrize("runs", [1, 255, 256, 257])
+def test_number_of_runs_changes_no_run(study, runs):
+    fewer = results(cases.study(runs=runs))
+    assert cases.same({name: x[:runs] for name, x in results(study).items()}, fewer)
+
+
+def test_seed_changes_every_draw(study):
+    other = cases.study(runs=10, seed=4)
+    assert not np.any(other.samples["plant.mass[1]"] == study.samples["plant.mass[1]"][:10])
+
+
+def test_other_perturbations_change_no_draw(study):
+    alone = cases.study(runs=3)
+    assert cases.same({"m": alone.samples["plant.mass[1]"]}, {"m": study.samples["plant.mass[1]"][:3]})
+
+
+@pytest.mark.slow
+def test_two_devices_and_one_agree_bit_for_bit(study, tmp_path, compiled):
+    process = cases.start(compiled, str(tmp_path / "two.npz"), "--study", "--devices", "2")
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    two = dict(np.load(tmp_path / "two.npz"))
+    assert cases.same(two, dict(study.metrics) | study.samples | {"status": study.status})
+
+
+def test_a_study_compiles_once_whatever_its_numbers(study):
+    before = _blocks._execute._cache_size()
+    stiffer = ij.with_parameters(SCENARIO, {"controller.K2": 30.0})
+    ij.monte_carlo(stiffer, cases.perturbations(0.05, 0.01), runs=300, **cases.options() | {"seed": 9})
+    assert _blocks._execute._cache_size() == before
+
+
+# ------------------------------------------------------------------------------------------------------------- the draws
+
+
+def test_draws_follow_the_documented_law(study):
+    dtype = SCENARIO.initial.q.dtype
+    for i in (0, 1, 256, 599):
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(3), i), zlib.crc32(b"plant.mass[1]"))
+        u = jax.random.uniform(key, (), dtype) + jnp.finfo(dtype).eps / 2
+        expected = float(SCENARIO.plant.mass[1]) * stats.norm.ppf(float(u), 1.0, 0.1)
+        np.testing.assert_allclose(study.samples["plant.mass[1]"][i], expected, rtol=1e-5)
+
+
+def test_entries_of_a_vector_are_independent(study):
+    assert abs(np.corrcoef(study.samples["initial.q"].T)[0, 1]) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("distribution", "reference"),
+    [
+        (ij.uniform(2.0, 5.0), stats.uniform(2.0, 3.0)),
+        (ij.normal(1.0, 0.3), stats.norm(1.0, 0.3)),
+        (ij.log_uniform(0.1, 10.0), stats.loguniform(0.1, 10.0)),
+    ],
+    ids=["uniform", "normal", "log_uniform"],
+)
+def test_quantiles_agree_with_scipy(distribution, reference):
+    u = jnp.linspace(0.01, 0.99, 99)
+    np.testing.assert_allclose(distribution.quantile(u), reference.ppf(np.asarray(u, float)), rtol=2e-5)
+
+
+def test_choice_has_its_weights():
+    draws = np.asarray(ij.choice([1.0, 5.0, 9.0], weights=[1, 0, 3]).quantile(jnp.linspace(0.0005, 0.9995, 1000)))
+    assert np.mean(draws == 1.0) == pytest.approx(0.25, abs=2e-3)
+    assert set(draws) == {1.0, 9.0}
+
+
+def test_robot_paths_move_plant_and_model_together_and_shared_draws_are_one():
+    ways = {"robot.mass[1]": ij.factor(ij.uniform(0.5, 2.0)), "initial.q": ij.offset(ij.normal(0, 0.01), shared=True)}
+    study = cases.study(2, ways)
+    np.testing.assert_array_equal(study.samples["initial.q"][:, 0], study.samples["initial.q"][:, 1])
+    run = study.replay(1)
+    drawn = study.samples["robot.mass[1]"][1]
+    assert run.scenario.plant.mass[1] == drawn == run.scenario.model.mass[1]
+
+
+@pytest.mark.parametrize("sampler", ["latin_hypercube", "sobol"])
+def test_designs_fill_the_range_evenly(sampler):
+    study = cases.study(256, sampler=sampler, replicates=4)
+    u = stats.norm.cdf(study.samples["plant.mass[1]"].astype(float) / 0.85, 1.0, 0.1)
+    for replicate in np.split(u, 4):
+        assert np.array_equal(np.sort(np.floor(replicate * 64 + 1e-4)), np.arange(64))
+    assert len(np.unique(study.samples["plant.mass[1]"])) == 256
+
+
+# ---------------------------------------------------------------------------------------------------------- one run again
+
+
+def test_replay_is_bit_identical_and_has_the_trajectory(study):
+    for i in (0, 300, int(study.worst(1)[0])):
+        run = study.replay(i)
+        assert all(np.array_equal(run.metrics[name], study.metrics[name][i]) for name in run.metrics)
+        assert int(run.status) == study.status[i]
+        assert float(run.fastest_mode) == study.fastest_mode[i]
+        np.testing.assert_array_equal(run.q[0], study.samples["initial.q"][i])
+        np.testing.assert_allclose(np.min(np.minimum(run.q - run.lower, run.upper - run.q), 0), run.metrics.margin, atol=1e-6)
+
+
+def test_an_index_selects_a_run(study):
+    one = study[-1]
+    assert one.index == len(study) - 1
+    np.testing.assert_array_equal(one.metrics.margin, study.metrics.margin[-1])
+    with pytest.raises(IndexError, match="runs 0 to 599"):
+        study.replay(600)
+
+
+# ------------------------------------------------------------------------------------------------- failed runs, statistics
+
+
+def test_a_failing_run_touches_no_other(study):
+    outside = study.status & int(Status.BOUND_VIOLATED) != 0
+    assert 0 < outside.sum() < len(study), "some of these runs start outside their bounds, by design"
+    assert np.array_equal(np.flatnonzero(study.status & int(FAILED)), study.failed)
+    assert all(np.all(np.isfinite(study.metrics[name])) for name in ("margin", "xi_margin"))
+    counts = study.status_counts
+    assert counts["FAILED"] == len(study.failed)
+    assert counts["BOUND_VIOLATED"] == outside.sum()
+
+
+def test_violation_probability_is_clopper_pearson(study):
+    found = study.violation_probability
+    k, n = found.count, found.runs
+    assert (k, n) == (int(np.sum(study.status & 3 != 0)), 600)
+    assert found.estimate == k / n
+    assert found.low == pytest.approx(stats.beta.ppf(0.025, k, n - k + 1))
+    assert found.high == pytest.approx(stats.beta.ppf(0.975, k + 1, n - k))
+
+
+@pytest.mark.parametrize(("count", "runs"), [(0, 50), (50, 50)])
+def test_clopper_pearson_at_the_ends(count, runs):
+    found = _statistics.probability(np.arange(runs) < count, np.ones(runs, bool), 0.95, "independent", 1)
+    end = 1 - 0.025 ** (1 / runs)
+    assert (found.low, found.high) == pytest.approx((0.0, end) if count == 0 else (1 - end, 1.0))
+
+
+def test_intervals_of_designs_need_replicates():
+    rng = np.random.default_rng(0)
+    events, valid = rng.random(800) < 0.2, np.ones(800, bool)
+    assert _statistics.probability(events, valid, 0.95, "sobol", 1).low is None
+    found = _statistics.probability(events, valid, 0.95, "sobol", 8)
+    means = events.reshape(8, 100).mean(1)
+    expected = stats.t.interval(0.95, 7, means.mean(), stats.sem(means))
+    assert (found.low, found.high) == pytest.approx(expected)
+    assert _statistics.probability(np.zeros(800, bool), valid, 0.95, "sobol", 8).low is None
+
+
+def test_inadmissible_draws_are_flagged_and_left_out():
+    study = cases.study(256, cases.perturbations(1.0))
+    bad = study.samples["plant.mass[1]"] <= 0
+    assert 0 < bad.sum() < 128
+    np.testing.assert_array_equal(bad, ~study.made)
+    assert np.all(study.status[bad] == int(Status.INADMISSIBLE_DRAW))
+    assert np.all(np.isnan(study.metrics.margin[bad]))
+    assert np.all(np.isfinite(study.metrics.margin[~bad]))
+    assert study.violation_probability.runs == (~bad).sum()
+    assert study.quantiles().attrs["excluded"] == bad.sum()
+    assert np.all(study.made[study.worst(200)])
+    with pytest.raises(ValueError, match="admissible"):
+        study.replay(int(np.argmax(bad)))
+
+
+def test_quantiles_include_failed_runs_unless_told(study):
+    every = study.quantiles((0.0, 0.5, 1.0))
+    np.testing.assert_allclose(every.margin.sel(quantile=0.0), study.metrics.margin.min(0))
+    assert every.attrs["excluded"] == 0
+    some = study.quantiles((0.0,), exclude_failed=True)
+    assert some.attrs["excluded"] == len(study.failed)
+    assert np.all(some.margin > 0)
+
+
+def test_rank_correlation_agrees_with_scipy(study):
+    found = study.correlations(["margin"])
+    y = study.metrics.margin.min(1)
+    for name, x in (("initial.q[1]", study.samples["initial.q"][:, 1]), ("plant.mass[1]", study.samples["plant.mass[1]"])):
+        cell = found.sel(parameter=name, metric="margin")
+        expected = stats.spearmanr(x, y)
+        assert float(cell.correlation) == pytest.approx(expected.statistic)
+        assert float(cell.p_value) == pytest.approx(expected.pvalue)
+
+
+def test_bands_enclose_the_runs(study):
+    bands = study.bands((0.0, 0.5, 1.0), runs=300, samples=10)
+    assert bands.sizes == {"quantile": 3, "time": 11, "joint": 2}
+    start = study.samples["initial.q"][:300]
+    np.testing.assert_allclose(bands.q.isel(time=0, quantile=[0, 2]), [start.min(0), start.max(0)], rtol=1e-6)
+    np.testing.assert_allclose(float(bands.time[-1]), 0.02)
+    assert np.all(bands.q.diff("quantile") >= 0)
+
+
+def test_study_as_dataset(study):
+    data = study.to_xarray()
+    assert data.margin.attrs["units"] == "rad"
+    assert data.sizes == {"run": 600, "joint": 2}
+    assert data["plant.mass[1]"].attrs["units"] == "kg"
+    assert data.attrs["seed"] == 3
+
+
+def test_worst_runs_come_first(study):
+    worst = study.worst(600)
+    margins = study.metrics.margin.min(1)[worst]
+    assert np.all(np.diff(margins) >= 0)
+
+
+def test_study_says_what_happened(study):
+    text = repr(study)
+    assert "600 runs" in text
+    assert "95% interval" in text
+    assert f"failed: {len(study.failed)}" in text
+
+
+# ------------------------------------------------------------------------------------------------------------ sensitivity
+
+
+def test_sobol_indices_of_what_is_known():
+    """The margin of a joint that is nearest to its bound at the start is linear in where it starts, and in nothing else."""
+    ways = cases.perturbations(0.01, 0.003)
+
+    def start(metrics):
+        return np.asarray(metrics.margin)[:, 1]
+
+    found = ij.sensitivity(SCENARIO, ways, output=start, points=64, **cases.options())
+    assert found.parameters == ("plant.mass[1]", "initial.q[0]", "initial.q[1]")
+    np.testing.assert_allclose(found.total_order, [0.0, 0.0, 1.0], atol=0.05)
+    assert found.runs == 320
+    assert "initial.q[1]" in repr(found)
+    assert found.to_xarray().sizes["parameter"] == 3
+    with pytest.raises(ValueError, match="first_violation_time: got '64 of 64 runs without a finite value'"):
+        ij.sensitivity(SCENARIO, ways, output="first_violation_time", points=64, **cases.options())
+
+
+# --------------------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("perturbation", "message"),
+    [
+        ({"plant.maas": ij.factor(ij.uniform(0.9, 1.1))}, "plant.mass"),
+        ({"plant.mass[7]": ij.factor(ij.uniform(0.9, 1.1))}, "plant.mass"),
+        ({"plant.mass[-1]": ij.factor(ij.uniform(0.9, 1.1))}, "index >= 0"),
+        ({"plant.mass[1]": ij.uniform(0.9, 1.1)}, "ij.factor"),
+        ({"plant.mass[1]": ij.factor(ij.uniform(-1.0, 1.0))}, "plant.mass"),
+        ({"plant.mass": ij.offset(ij.uniform(-3.0, 1.0))}, "plant.mass"),
+        ({"plant.mass": ij.factor(ij.uniform([0.9] * 3, [1.1] * 3))}, "shape"),
+        ({"initial.dq": ij.factor(ij.uniform(0.9, 1.1))}, "offset"),
+        ({"robot.mass": ij.factor(ij.uniform(0.9, 1.1)), "plant.mass[0]": ij.factor(ij.uniform(0.9, 1.1))}, "overlap"),
+        ({}, "at least one"),
+        ([1], "mapping"),
+    ],
+)
+def test_bad_perturbations_are_refused(perturbation, message):
+    with pytest.raises(ValueError, match=message):
+        ij.monte_carlo(SCENARIO, perturbation, runs=2, duration=0.01)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"runs": 0}, "runs"),
+        ({"runs": 2.0}, "runs"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"seed": True}, "seed"),
+        ({"method": "rk5"}, "rk4"),
+        ({"sampler": "halton"}, "sobol"),
+        ({"runs": 100, "sampler": "sobol"}, "128"),
+        ({"runs": 10, "replicates": 2}, "replicates"),
+        ({"backend": "fast"}, "backend"),
+        ({"chunk": 0.5}, "chunk"),
+        ({"duration": 0.0105}, "duration"),
+    ],
+)
+def test_bad_arguments_are_refused(more, message):
+    with pytest.raises(ValueError, match=message):
+        ij.monte_carlo(SCENARIO, cases.perturbations(), **{"runs": 2, "duration": 0.01} | more)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ij.uniform(1.0, 1.0),
+        lambda: ij.normal(0.0, 0.0),
+        lambda: ij.log_uniform(-1.0, 1.0),
+        lambda: ij.choice([]),
+        lambda: ij.choice([1.0, 2.0], weights=[1.0]),
+        lambda: ij.choice([1.0], weights=[0.0]),
+        lambda: ij.factor(1.1),
+        lambda: ij.uniform("a", 2.0),
+    ],
+)
+def test_bad_distributions_are_refused(make):
+    with pytest.raises(ValueError, match="expected"):
+        make()
+
+
+def test_progress_is_shown_when_asked(capsys):
+    cases.study(runs=300, progress=True)
+    shown = capsys.readouterr().err
+    assert "runs/s" in shown
+    assert "300/300" in shown
+    cases.study(runs=300)
+    assert capsys.readouterr().err == ""

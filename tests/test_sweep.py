@@ -1,0 +1,326 @@
+"""Sweeps: the labelled result, common random numbers, designs, refusals; stores: killed, torn, foreign, full, unwritable."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import study_cases as cases
+
+import iblf_jax as ij
+from iblf_jax import _interrupt, _sweep, store
+
+SCENARIO = ij.presets.zhang_yan_2024()
+
+
+@pytest.fixture(scope="module")
+def table():
+    return cases.table()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, table):
+    """A finished store, to be copied."""
+    path = tmp_path_factory.mktemp("finished") / "sweep.zarr"
+    assert cases.table(store=path).identical(table)
+    return path
+
+
+@pytest.fixture
+def finished(written, tmp_path):
+    return Path(shutil.copytree(written, tmp_path / "sweep.zarr"))
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A folder for compiled programs, shared between the processes of all tests."""
+    return tmp_path_factory.getbasetemp() / "compiled"
+
+
+def once(**more):
+    """A small sweep without perturbed runs."""
+    return ij.sweep(SCENARIO, more.pop("grid", cases.GRID), **cases.options() | more)
+
+
+# --------------------------------------------------------------------------------------------------------------- the result
+
+
+def test_dataset_is_labelled(table):
+    assert dict(table.margin.sizes) == {"controller.K2": 3, "observer.kf": 2, "run": 500, "joint": 2}
+    assert table["controller.K2"].attrs["units"] == "N m s/rad"
+    assert table.margin.attrs["units"] == "rad"
+    assert table["plant.mass[1]"].dims == ("run",)
+    assert table.status.attrs["flag_meanings"].startswith("bound_violated not_finite")
+    config = json.loads(table.attrs["config"])
+    assert config["seed"] == 3
+    assert config["versions"]["iblf_jax"] == ij.__version__
+    assert config["scenario"]["plant.mass"] == pytest.approx([2.0, 0.85])
+
+
+def test_points_are_the_studies_of_their_scenarios(table):
+    """Common random numbers: run r of every point draws what run r of a study does."""
+    for K2, kf in ((10.0, 20.0), (40.0, 10.0)):
+        there = ij.with_parameters(SCENARIO, {"controller.K2": K2, "observer.kf": kf})
+        study = ij.monte_carlo(there, cases.perturbations(), runs=500, **cases.options())
+        point = table.sel({"controller.K2": K2, "observer.kf": kf})
+        np.testing.assert_allclose(point.margin, study.metrics.margin, atol=1e-6)
+        np.testing.assert_array_equal(point.status, study.status)
+        np.testing.assert_allclose(table["plant.mass[1]"], study.samples["plant.mass[1]"], rtol=1e-6)
+
+
+@pytest.mark.parametrize("chunk", [1, 700])
+def test_chunk_changes_nothing(table, chunk):
+    assert cases.table(chunk=chunk).identical(table)
+
+
+def test_designs_and_vectors():
+    ways = {"controller.K2": ij.uniform(10.0, 40.0), "observer.kf": ij.factor(ij.log_uniform(0.5, 2.0), shared=True)}
+    for design in ("random", "latin_hypercube"):
+        found = once(grid=ways, design=design, points=5)
+        assert found.sizes == {"point": 5, "joint": 2}
+        assert np.all((found["controller.K2"] > 10) & (found["controller.K2"] < 40))
+        np.testing.assert_array_equal(found["observer.kf"][:, 0], found["observer.kf"][:, 1])
+
+
+def test_vectors_in_a_grid_and_a_point_that_cannot_work():
+    found = once(grid={"controller.K2": [[10.0, 20.0], [30.0, 40.0]], "initial.q": [0.8, 2.0]})
+    assert found["controller.K2 values"].values.tolist() == [[10, 20], [30, 40]]
+    assert found.margin.sizes == {"controller.K2": 2, "initial.q": 2, "joint": 2}
+    assert np.all(found.status.sel({"initial.q": 0.8}) == 0)
+    assert np.all(found.status.sel({"initial.q": 2.0}) & int(ij.Status.BOUND_VIOLATED)), "a flag, not an error"
+
+
+@pytest.mark.parametrize(
+    ("grid", "more", "message"),
+    [
+        ({"controller.K3": [1.0]}, {}, "controller.K2"),
+        ({"controller.K2": 10.0}, {}, "list of numbers"),
+        ({"controller.K2": []}, {}, "list of numbers"),
+        ({"controller.K2": [[1.0, 2.0, 3.0]]}, {}, "shape"),
+        ({"controller.K2": [10.0, -1.0]}, {}, "> 0"),
+        ({"controller.K2": [10.0, 10.0]}, {}, "differ"),
+        ({"controller.K2": ["a"]}, {}, "numbers"),
+        ({"controller.K2": ij.uniform(1.0, 2.0)}, {}, "random"),
+        ({"controller.K2": [10.0], "controller.K2[0]": [10.0]}, {}, "overlap"),
+        ({"controller.K2": [10.0]}, {"design": "random", "points": 3}, "distribution"),
+        ({"controller.K2": ij.uniform(1.0, 2.0)}, {"design": "random"}, "points"),
+        ({"controller.K2": [10.0]}, {"points": 3}, "points"),
+        ({"controller.K2": [10.0]}, {"runs": 3}, "perturbations"),
+        ({}, {}, "vary"),
+        ([1.0], {}, "mapping"),
+    ],
+)
+def test_bad_grids_are_refused(grid, more, message):
+    with pytest.raises(ValueError, match=message):
+        ij.sweep(SCENARIO, grid, duration=0.01, **more)
+
+
+# ------------------------------------------------------------------------------------------------------------------ stores
+
+
+def test_store_opens_with_xarray_and_load(written, table):
+    xarray = pytest.importorskip("xarray")
+    flat = xarray.open_zarr(written, chunks=None)
+    assert flat.margin.dims == ("case", "joint")
+    assert ij.load_sweep(written).identical(table)
+
+
+def test_a_finished_store_is_not_computed_again(finished, table, monkeypatch):
+    monkeypatch.setattr(_sweep, "run_blocks", lambda *_, **__: pytest.fail("computed again"))
+    monkeypatch.setattr(_sweep, "_units", lambda *_: iter(()))
+    assert cases.table(store=finished).identical(table)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 4}, "seed: the store has 3, this call 4"),
+        ({"duration": 0.04}, "duration: the store has 0.02, this call 0.04"),
+        ({"unit": 512}, "unit: the store has 256, this call 512"),
+    ],
+)
+def test_another_configuration_is_refused(finished, change, message):
+    before = cases.arrays(ij.load_sweep(finished))
+    with pytest.raises(ij.StoreError, match=message) as caught:
+        cases.table(store=finished, **change)
+    assert "program" not in str(caught.value)
+    assert cases.same(before, cases.arrays(ij.load_sweep(finished)))
+
+
+def test_another_scenario_law_or_backend_is_refused(finished):
+    ways, options = cases.perturbations(), cases.options() | {"runs": cases.RUNS, "store": finished}
+    heavier = ij.with_parameters(SCENARIO, {"plant.payload": 1.0})
+    with pytest.raises(ij.StoreError, match=r"scenario.plant.payload: the store has 0.0, this call 1.0"):
+        ij.sweep(heavier, cases.GRID, perturbations=ways, **options)
+    with pytest.raises(ij.StoreError, match=r"structure.controller.*corrected"):
+        ij.sweep(ij.presets.zhang_yan_2024(reading="corrected"), cases.GRID, perturbations=ways, **options)
+    with pytest.raises(ij.StoreError, match="backend"):
+        ij.sweep(SCENARIO, cases.GRID, perturbations=ways, **options, backend="vmap")
+
+
+def chunks(path, name="margin"):
+    return sorted(file for file in (path / name / "c").rglob("*") if file.is_file())
+
+
+def test_torn_missing_and_foreign_chunks_are_found_and_mended(finished, table, tmp_path):
+    torn, missing, foreign = chunks(finished)[:3]
+    torn.write_bytes(torn.read_bytes()[:-7])
+    missing.unlink()
+    foreign.write_bytes(chunks(finished)[5].read_bytes())
+    with pytest.raises(ij.StoreError, match="unit 0 is damaged"):
+        ij.load_sweep(finished)
+    with pytest.warns(UserWarning, match="3 units are damaged"):
+        assert cases.table(store=finished).identical(table)
+
+
+def test_chunks_of_another_store_do_not_fit(finished, tmp_path):
+    """Whole units copied from a store of another seed, marks included."""
+    other = tmp_path / "other.zarr"
+    cases.table(store=other, seed=4)
+    for source in other.rglob("c/0*"):
+        target = finished / source.relative_to(other)
+        if source.is_dir():
+            shutil.copytree(source, target, dirs_exist_ok=True)
+        else:
+            shutil.copy(source, target)
+    with pytest.raises(ij.StoreError, match="unit 0 is damaged"):
+        ij.load_sweep(finished)
+
+
+def test_what_is_no_store_is_refused(tmp_path):
+    (tmp_path / "file").write_text("hello")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "notes.txt").write_text("mine")
+    import zarr
+
+    zarr.create_group(str(tmp_path / "group"))
+    for name in ("file", "folder", "group"):
+        with pytest.raises(ij.StoreError, match=rf"{name}.*(not a store|did not write)"):
+            cases.table(store=tmp_path / name)
+    assert (tmp_path / "folder" / "notes.txt").read_text() == "mine"
+    with pytest.raises(ij.StoreError, match="no store here"):
+        ij.load_sweep(tmp_path / "nothing")
+
+
+def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ij.StoreError, match="cannot be written"):
+        cases.table(store=tmp_path / "file" / "sweep.zarr")
+    if os.getuid() == 0:
+        monkeypatch.setattr(store.os, "access", lambda *_: False)
+    else:
+        finished.chmod(0o500)
+    with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
+        cases.table(store=finished)
+
+
+def test_without_zarr_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ij.StoreError, match=r"iblf_jax\[sweep\]"):
+        cases.table(store=tmp_path / "sweep.zarr")
+
+
+def test_disk_full_keeps_what_was_written(tmp_path, table, monkeypatch):
+    import zarr
+
+    path, plain, count = tmp_path / "sweep.zarr", zarr.Array.__setitem__, []
+
+    def full(self, *words):
+        count.append(1)
+        if len(count) > 40:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return plain(self, *words)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zarr.Array, "__setitem__", full)
+        with pytest.raises(ij.StoreError, match=r"no space left.*units are written and valid"):
+            cases.table(store=path)
+    part = ij.load_sweep(path)
+    assert 0 < part.attrs["computed_cases"] < part.attrs["cases"]
+    assert np.array_equal(np.isnan(part.margin[..., 0]), part.status == -1)
+    assert cases.table(store=path).identical(table)
+
+
+def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
+    """RLIMIT_FSIZE: the kernel itself refuses to write more."""
+    code = (
+        "import resource, sys; sys.path.insert(0, sys.argv[1]); import study_cases as c; c.table()\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)); c.table(store=sys.argv[2])"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "sweep.zarr")]
+    done = subprocess.run(command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert "StoreError" in done.stderr
+    assert "no space left" in done.stderr
+
+
+# -------------------------------------------------------------------------------------------------------- killed, interrupted
+
+
+def killed_until_done(path, compiled, table, kills, seed):
+    """Kills the sweep at random moments, then lets it finish."""
+    rng, out = random.Random(seed), path.parent / "out.npz"
+    done = 0
+    while done < kills:
+        process = cases.start(compiled, str(out), "--store", str(path), "--slow", "0.15")
+        first = process.stdout.readline() if done % 2 else ""  # every second time, not before a unit is written
+        time.sleep(rng.uniform(0.0, 1.0 if first else 4.0))
+        if process.poll() is not None:
+            shutil.rmtree(path)
+        process.kill()
+        process.communicate()
+        done += 1
+    process = cases.start(compiled, str(out), "--store", str(path))
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert cases.same(dict(np.load(out)), cases.arrays(table))
+
+
+def test_three_kills(tmp_path, compiled, table):
+    killed_until_done(tmp_path / "sweep.zarr", compiled, table, 3, seed=1)
+
+
+@pytest.mark.slow
+def test_twenty_kills(tmp_path, compiled, table):
+    killed_until_done(tmp_path / "sweep.zarr", compiled, table, 20, seed=2)
+
+
+def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table):
+    path = tmp_path / "sweep.zarr"
+    process = cases.start(compiled, str(tmp_path / "x.npz"), "--store", str(path), "--die-after", "5")
+    process.communicate(timeout=300)
+    assert process.returncode == -signal.SIGKILL
+    assert ij.load_sweep(path).attrs["computed_cases"] == 5 * cases.UNIT
+    computed = []
+    plain = store.Store.write
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store.Store, "write", lambda self, unit, data: (computed.append(unit), plain(self, unit, data)))
+        assert cases.table(store=path).identical(table)
+    assert computed == list(range(5, 12))
+
+
+def test_ctrl_c_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monkeypatch, capsys):
+    path, plain = tmp_path / "sweep.zarr", store.Store.write
+
+    def write(self, unit, data):
+        if unit == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        plain(self, unit, data)
+
+    monkeypatch.setattr(store.Store, "write", write)
+    with pytest.raises(_interrupt.Interrupted, match=r"after 3 of 12 units.*Start the same call"):
+        cases.table(store=path)
+    assert "Ctrl-C" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert cases.table(store=path).identical(table)
