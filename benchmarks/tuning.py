@@ -89,6 +89,7 @@ class Judge:
         self.times: list[float] = []
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
+        """J at points (S, p) or (p,)."""
         found = problem.value(self.built.shared, self.built.lanes(np.atleast_2d(points)), plan=self.built.plan)
         losses = np.where(np.asarray(found.sound), np.asarray(found.loss), 1e6)
         losses = np.where(np.isfinite(losses), losses, 1e6)
@@ -184,9 +185,8 @@ def compare(name: str, quick: bool) -> list[list[Any]]:
     rows += [_row(name, size, peer, judge, goal, 1.0) for peer, judge in peers.items()]
     counts = [r[5] for r in rows if str(r[2]).startswith("CMA") and r[5] != "never"]
     if counts and rows[0][5] != "never":
-        print(
-            f"{name}: derivative with value costs {cost:.2f} values; CMA-ES (median) needs {np.median(counts) / rows[0][5]:.2f} x the rollouts"
-        )
+        ratio = np.median(counts) / rows[0][5]
+        print(f"{name}: derivative with value costs {cost:.2f} values; CMA-ES (median) needs {ratio:.2f} x the rollouts")
     return rows
 
 

@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import TuneResult as TuneResult
     from iblf_jax.tuning import cvar as cvar
     from iblf_jax.tuning import falsify as falsify
-    from iblf_jax.tuning import pareto as pareto
     from iblf_jax.tuning import objectives as objectives
+    from iblf_jax.tuning import pareto as pareto
     from iblf_jax.tuning import tunable as tunable
     from iblf_jax.tuning import tune as tune
     from iblf_jax.tuning_file import load_tuning as load_tuning

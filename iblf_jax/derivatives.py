@@ -123,9 +123,8 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
     def body(loop, index):
         reals, tangents, rest, products = loop
         (reals, _), (tangents, pushed), (rest, factors) = _pushed(partial(one, rest, index), directions, (varied, reals), (tangents,))
-        products = tuple(
-            decay * N + jnp.sum(weight * y[:, None] * y[None, :], axis=-1) for N, y, (weight, decay) in zip(products, pushed, factors, strict=True)
-        )
+        terms = zip(products, pushed, factors, strict=True)
+        products = tuple(decay * N + jnp.sum(weight * y[:, None] * y[None, :], axis=-1) for N, y, (weight, decay) in terms)
         return (reals, tangents, rest, products), None
 
     def end(rest, varied, reals):

@@ -167,16 +167,21 @@ def test_bijections_keep_inside_and_invert():
     np.testing.assert_allclose(squash(jnp.asarray(unsquash(z, box)), box), z, rtol=1e-12)
     for w in (-50.0, 50.0):
         inside = np.asarray(squash(jnp.full(4, w), box))
-        assert np.all(inside >= box.low) and np.all(inside <= box.high)
+        assert np.all(inside >= box.low)
+        assert np.all(inside <= box.high)
 
 
 def test_default_limits_keep_the_conditions_and_the_step(paper):
     blocks, box = layout(canonical(paper), [*GAINS, ij.tunable("controller.o", tied=True)], 1e-3, "rk4")
     low, high = np.exp(box.low), np.exp(box.high)
-    assert [b.path for b in blocks] == [*GAINS, "controller.o"] and blocks[-1].size == 1
-    assert np.all(low[:2] > 0) and np.all(low[2:4] > 0.5) and np.all(low[4:6] > 1.0)
+    assert [b.path for b in blocks] == [*GAINS, "controller.o"]
+    assert blocks[-1].size == 1
+    assert np.all(low[:2] > 0)
+    assert np.all(low[2:4] > 0.5)
+    assert np.all(low[4:6] > 1.0)
     run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
-    assert run.ok and 1e-3 * float(run.fastest_mode) > 1.2
+    assert run.ok
+    assert 1e-3 * float(run.fastest_mode) > 1.2
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):
@@ -191,7 +196,9 @@ def test_box_step_solves_the_quadratic_programme():
         step, drop = box_step(g, B, np.full(5, -0.3), np.full(5, 0.5))
         slope = g + B @ step
         free = (step > -0.3 + 1e-9) & (step < 0.5 - 1e-9)
-        assert np.all(np.abs(slope[free]) < 1e-8) and np.all(slope[step <= -0.3 + 1e-9] > -1e-8) and drop > 0
+        assert np.all(np.abs(slope[free]) < 1e-8)
+        assert np.all(slope[step <= -0.3 + 1e-9] > -1e-8)
+        assert drop > 0
 
 
 # ---------------------------------------------------------------------------------------------------------------- the loop
@@ -203,9 +210,11 @@ def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
     first = best.history["objective"][0, 0]
     assert best.objective < 0.75 * first
     x = best.history["x"]
-    assert np.all(x[..., 2:4] >= 0.6 - 1e-12) and np.all(x[..., 0:2] <= 100 + 1e-9)
+    assert np.all(x[..., 2:4] >= 0.6 - 1e-12)
+    assert np.all(x[..., 0:2] <= 100 + 1e-9)
     np.testing.assert_allclose(best.values["controller.K2"], np.asarray(best.scenario.controller.K2))
-    assert "one nominal run" in str(best.report) and best.report.improved
+    assert "one nominal run" in str(best.report)
+    assert best.report.improved
     again = ij.simulate(best.scenario, metrics=STANDARD, **SHORT).metrics
     before = ij.simulate(paper, metrics=STANDARD, **SHORT).metrics
     assert best.report.changes[1].after == pytest.approx(float(again.ise.sum() / before.ise.sum()), rel=1e-9)
@@ -274,10 +283,13 @@ def robust(paper):
 
 def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
     report = robust.report
-    assert report.runs == 256 and report.seed != robust.setup.seed
+    assert report.runs == 256
+    assert report.seed != robust.setup.seed
     change = report.changes[0]
-    assert change.name == "objective (cvar 0.75)" and change.low < change.after - change.before < change.high < 0
-    assert "significant" in str(report) and "NOT" not in str(report.changes[0])
+    assert change.name == "objective (cvar 0.75)"
+    assert change.low < change.after - change.before < change.high < 0
+    assert "significant" in str(report)
+    assert "NOT" not in str(report.changes[0])
     with pytest.raises(ValueError, match="fresh"):
         robust.check(seed=robust.setup.seed)
 
@@ -286,13 +298,16 @@ def test_a_change_that_is_not_significant_is_called_so(robust, paper):
     from iblf_jax.tuning.report import make_report
 
     report = make_report(paper, paper, robust.setup.objective, DRAWS, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=SHORT)
-    assert report.changes[0].significant is False and "NOT significant" in str(report)
-    assert "do not show that tuning helped" in str(report) and not report.improved
+    assert report.changes[0].significant is False
+    assert "NOT significant" in str(report)
+    assert "do not show that tuning helped" in str(report)
+    assert not report.improved
 
 
 def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
     best = ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, starts=2, resample=True, iterations=3, **SHORT)
-    assert best.optimiser == "adam" and best.history["loss"].shape == (3, 2)
+    assert best.optimiser == "adam"
+    assert best.history["loss"].shape == (3, 2)
     with pytest.raises(ValueError, match="adam"):
         ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, resample=True, optimiser="newton", **SHORT)
 
@@ -329,7 +344,8 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
     killed = start("a.npz", "slow", "never.npz")
     deadline = time.monotonic() + 300
     while not (tmp_path / "a.npz").exists():
-        assert killed.poll() is None and time.monotonic() < deadline
+        assert killed.poll() is None
+        assert time.monotonic() < deadline
         time.sleep(0.05)
     time.sleep(0.6)
     killed.send_signal(signal.SIGKILL)

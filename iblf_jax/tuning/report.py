@@ -126,8 +126,6 @@ class Report:
         """Everything as plain numbers and strings."""
         out = dataclasses.asdict(self)
         out["changes"] = [{**dataclasses.asdict(c), "significant": c.significant} for c in self.changes]
-        out["violation"] = [p._asdict() for p in self.violation]
-        out["verdicts"] = [dataclasses.asdict(v) | {"before": v.before._asdict(), "after": v.after._asdict()} for v in self.verdicts]
         return out
 
 

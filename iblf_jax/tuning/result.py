@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from functools import cached_property
+from functools import cached_property, partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks, paths
 from iblf_jax._designs import check_seed
 from iblf_jax.distributions import Perturbation
-from iblf_jax.scenario import Scenario
+from iblf_jax.lowering import run_batch
+from iblf_jax.metrics import as_folds
+from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.problem import UNSOUND
+from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
+
+
+@partial(jax.jit, static_argnames=("steps", "method"))
+def _slice(scenario, changes, folds, dt, *, steps, method):
+    return run_batch(scenario, changes, folds, dt, steps=steps, method=method)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,10 +74,12 @@ class TuneResult:
     @property
     def objective(self) -> float:
         """The objective at the tuned gains, on the runs that it was tuned on."""
-        sound = self.history["sound"] & np.all(np.abs(self.history["x"] - self._x()) <= 1e-12 * np.abs(self._x()), axis=-1)
+        sound = self.history["sound"] & np.all(np.abs(self.history["x"] - self.tuned) <= 1e-12 * np.abs(self.tuned), axis=-1)
         return float(np.min(np.where(sound, self.history["objective"], np.inf)))
 
-    def _x(self) -> np.ndarray:
+    @property
+    def tuned(self) -> np.ndarray:
+        """The tuned numbers, (p,), in the order of `names`."""
         flat = []
         for path, value in self.values.items():
             own = sum(name == path or name.startswith(path + "[") for name in self.names)
@@ -114,6 +127,36 @@ class TuneResult:
             confidence=setup.confidence,
             timing=timing,
         )
+
+    def landscape(self, first: str, second: str, *, points: int = 13, span: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The objective of the nominal run on a slice through the optimum.
+
+        Args:
+          first, second: two of `names`.
+          points: on each axis.
+          span: each axis reaches from exp(-span) to exp(span) times the tuned number.
+
+        Returns:
+          Values of the first (points,), of the second (points,), and the objective (points, points), infinite where a run is unsound.
+
+        Raises:
+          ValueError: an unknown name.
+
+        Source: design of this package.
+        """
+        for name in (first, second):
+            checks.one_of("landscape: name", name, self.names)
+        factor = np.exp(np.linspace(-span, span, checks.positive_integer("points", points)))
+        a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
+        changes = {first: np.repeat(a, points), second: np.tile(b, points)}
+        setup, scenario = self.setup, canonical(self.scenario)
+        dtype = scenario.initial.q.dtype
+        folds = as_folds((Quantities(setup.objective.quantities),), dtype)
+        steps = checks.whole_steps(setup.duration, setup.dt)
+        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), steps=steps, method=setup.method)
+        values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
+        sound = np.asarray(outcome.status) & int(UNSOUND) == 0
+        return a, b, np.where(sound, np.asarray(values), np.inf).reshape(points, points)
 
     def plot(self, **options):
         """Figure of the tuning: loss, gains, margin, tubes before and after.  Options as `plotting.tuning`."""
