@@ -56,21 +56,39 @@ if TYPE_CHECKING:
     from iblf_jax.certificates import certify as certify
     from iblf_jax.store import StoreError as StoreError
     from iblf_jax.study import Study as Study
+    from iblf_jax.tuning import TuneResult as TuneResult
+    from iblf_jax.tuning import cvar as cvar
+    from iblf_jax.tuning import falsify as falsify
+    from iblf_jax.tuning import objectives as objectives
+    from iblf_jax.tuning import pareto as pareto
+    from iblf_jax.tuning import tunable as tunable
+    from iblf_jax.tuning import tune as tune
+    from iblf_jax.tuning_file import load_tuning as load_tuning
+    from iblf_jax.tuning_file import tune_file as tune_file
 
 _ON_FIRST_USE = {
     "certificates": ("iblf_jax.certificates", None),
     "certify": ("iblf_jax.certificates", "certify"),
     "compare": ("iblf_jax._compare", "compare"),
     "Comparison": ("iblf_jax._comparison", "Comparison"),
+    "cvar": ("iblf_jax.tuning", "cvar"),
     "distributed": ("iblf_jax.distributed", None),
+    "falsify": ("iblf_jax.tuning", "falsify"),
     "load_sweep": ("iblf_jax._sweep", "load_sweep"),
+    "load_tuning": ("iblf_jax.tuning_file", "load_tuning"),
     "monte_carlo": ("iblf_jax._monte_carlo", "monte_carlo"),
+    "objectives": ("iblf_jax.tuning.objectives", None),
+    "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
     "sensitivity": ("iblf_jax._sensitivity", "sensitivity"),
     "StoreError": ("iblf_jax.store", "StoreError"),
     "Study": ("iblf_jax.study", "Study"),
     "sweep": ("iblf_jax._sweep", "sweep"),
     "testing": ("iblf_jax.testing", None),
+    "tunable": ("iblf_jax.tuning", "tunable"),
+    "tune": ("iblf_jax.tuning", "tune"),
+    "tune_file": ("iblf_jax.tuning_file", "tune_file"),
+    "TuneResult": ("iblf_jax.tuning", "TuneResult"),
 }
 """Public name -> (module, attribute or None for the module itself): imported when first used, so that `import iblf_jax` stays
 quick and brings neither matplotlib nor optax nor xarray."""

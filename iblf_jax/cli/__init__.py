@@ -18,7 +18,7 @@ from typing import NoReturn
 
 import jax
 
-COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "presets", "parameters")
+COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
 
 class Parser(argparse.ArgumentParser):

@@ -17,5 +17,7 @@ from iblf_jax.plotting._figures import torques as torques
 from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
 from iblf_jax.plotting._figures import velocity_errors as velocity_errors
 from iblf_jax.plotting._overview import overview as overview
+from iblf_jax.plotting._tuning import pareto as pareto
+from iblf_jax.plotting._tuning import tuning as tuning
 from iblf_jax.plotting.animation import animate as animate
 from iblf_jax.plotting.comparison import comparison as comparison

@@ -1,0 +1,190 @@
+"""`falsify`: attack a scenario before it is believed, by gradient ascent over start, disturbance and plant within stated sets.
+
+Random runs seldom meet the worst case: in d dimensions its corner of the set is small.  Here the uniform number u in [0, 1]^d behind
+each perturbation is the unknown, and every one of S attacks, started at random, climbs
+
+    u <- clip(u - rate sign(d margin / du), 0, 1),     margin = smallest over time and joints, smooth (`quantities.Peak`)
+
+with a rate that falls, all attacks in one batch, gradients by forward mode.  What comes back is the run with the smallest margin that
+was seen, so it is never better news than its own starting points.
+
+Source: projected sign-gradient ascent, A. Madry et al., ICLR 2018.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax._designs import check_seed
+from iblf_jax._draws import Cases, Target, draw, plan, sample_size
+from iblf_jax._progress import bar
+from iblf_jax.derivatives import value_and_tangents
+from iblf_jax.distributions import Perturbation
+from iblf_jax.integrators import tableau
+from iblf_jax.paths import with_parameters
+from iblf_jax.results import Rollout
+from iblf_jax.rollout import simulate
+from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.status import Status
+from iblf_jax.tuning.quantities import Peak, Quantities
+
+FIRST_RATE, LAST_RATE = 0.5, 0.02
+"""Steps in u, from the first to the last."""
+SMOOTHING = 1e-3
+"""rad.  Of the smallest margin over time and joints."""
+
+
+class _Sizes(NamedTuple):
+    """Path -> shape of its u, flattened; static."""
+
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]
+
+    @property
+    def total(self) -> int:
+        return sum(int(np.prod(shape, dtype=int)) for _, shape in self.shapes)
+
+    def split(self, u: jax.Array) -> dict[str, jax.Array]:
+        """Path -> its part of u, (d,)."""
+        parts, at = {}, 0
+        for path, shape in self.shapes:
+            size = int(np.prod(shape, dtype=int))
+            parts[path] = u[at : at + size].reshape(shape)
+            at += size
+        return parts
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Attack:
+    """The worst run that `falsify` found."""
+
+    scenario: Scenario
+    """With the worst parameters in it."""
+    values: dict[str, np.ndarray]
+    """Path -> worst value, in the leaf's unit."""
+    margin: float
+    """Its smallest margin [rad]; negative if a bound was violated."""
+    first_margin: float
+    """The smallest margin of the random starting points [rad]."""
+    status: int
+    """Flags of `Status` of that run."""
+    history: np.ndarray
+    """Margin of every attack at every step, (iterations + 1, starts) [rad]."""
+    runs: int
+    """Rollouts with derivatives that were made."""
+    timing: dict[str, Any]
+
+    @property
+    def violated(self) -> bool:
+        """Whether the scenario was falsified: a run within the sets left its bounds or ran away."""
+        return bool(self.status & int(Status.BOUND_VIOLATED | Status.NOT_FINITE))
+
+    def replay(self, record_every: int = 1) -> Rollout:
+        """The worst run, in full."""
+        return simulate(self.scenario, record_every=record_every, **self.timing)
+
+    def __repr__(self) -> str:
+        word = "FALSIFIED" if self.violated else "not falsified"
+        lines = [f"Attack({word}: smallest margin {self.margin:.4g} rad, {self.first_margin:.4g} at random; {self.runs} runs)"]
+        lines += [f"  {path}: {np.array2string(np.asarray(x), precision=5)}" for path, x in self.values.items()]
+        return "\n".join(lines)
+
+
+def falsify(
+    scenario: Scenario,
+    sets: Mapping[str, Perturbation],
+    *,
+    duration: float,
+    dt: float = 1e-3,
+    method: str = "rk4",
+    starts: int = 16,
+    iterations: int = 12,
+    seed: int = 0,
+    progress: bool | None = None,
+) -> Attack:
+    """Looks for the run with the smallest margin within stated sets.
+
+        minimise over u in [0, 1]^d:   min over t and joints of min(q - lower, upper - q)
+
+    Args:
+      scenario: what to attack, with its tuned gains say.
+      sets: path -> `factor`, `offset` or `value` of a bounded distribution, whose range is the set: the same as in `monte_carlo`.
+      duration: length of a run [s], a whole number of steps.
+      dt: time step [s].
+      method: integrator.
+      starts: attacks, each from its own random point, in one batch.
+      iterations: steps of each attack.
+      seed: fixes the starting points.
+      progress: a progress bar; shown where somebody watches if not given.
+
+    Returns:
+      An `Attack`: the worst run found, and whether it left its bounds.  Not to have found one proves nothing.
+
+    Raises:
+      ValueError: a set without bounds (a normal distribution), or bad arguments.
+
+    Source: head of this module.
+    """
+    tableau(method)
+    steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
+    starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
+    targets, by_path = plan(scenario, sets, "sets")
+    if not targets:
+        raise checks.fail("sets", sets, "at least one set", "Say what may vary, and between which limits.")
+    _check_bounded(scenario, targets, by_path)
+    dtype = scenario.initial.q.dtype
+    by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
+    cases = Cases(scenario, by_path, jax.random.key(0))
+    sizes = _Sizes(tuple(sample_size(targets, by_path).items()))
+    push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method)
+    u, best, history = np.random.default_rng([check_seed(seed), 3]).uniform(size=(starts, sizes.total)), None, []
+    with bar(progress, iterations + 1) as shown:
+        for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
+            margin, slope, status = (np.asarray(x) for x in push(cases, step, jnp.asarray(u, dtype)))
+            history.append(margin)
+            s = int(np.argmin(margin))
+            if best is None or margin[s] < best[0]:
+                best = (float(margin[s]), u[s].copy(), int(status[s]))
+            if rate is not None:
+                u = np.clip(u - rate * np.sign(np.where(np.isfinite(slope), slope, 0.0)), 0.0, 1.0)
+            shown.update(1)
+            shown.set_postfix_str(f"margin {best[0]:.4g} rad")
+    assert best is not None
+    values = {path: np.asarray(x) for path, x in _made(cases, targets, sizes, jnp.asarray(best[1], dtype)).items()}
+    timing = {"duration": duration, "dt": dt, "method": method}
+    worst = with_parameters(scenario, values)
+    return Attack(worst, values, best[0], float(history[0].min()), best[2], np.stack(history), starts * (iterations + 1), timing)
+
+
+def _check_bounded(scenario: Scenario, targets: tuple[Target, ...], by_path) -> None:
+    for target in targets:
+        low, high = by_path[target.path].distribution.support()
+        if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
+            raise checks.fail(
+                f"sets[{target.source!r}]", by_path[target.path].distribution, "a bounded distribution", "Use ij.uniform(low, high)."
+            )
+
+
+def _made(cases: Cases, targets: tuple[Target, ...], sizes: _Sizes, u: jax.Array) -> dict[str, jax.Array]:
+    """Path -> value of one run."""
+    return draw(cases, targets, jnp.uint32(0), {}, sizes.split(u))[0]
+
+
+@partial(jax.jit, static_argnames=("targets", "sizes", "steps", "method"))
+def _push(cases: Cases, dt, u, *, targets, sizes, steps, method):
+    """Smallest margin (S,) [rad], its gradient by u (S, d) and the status of each attack."""
+    one: Any = jnp.ones_like(dt)
+    fold = Quantities((Peak(one, "deficit", smoothing=one * SMOOTHING),))
+    made = partial(_made, cases, targets, sizes)
+    varied = jax.vmap(made)(u)
+    directions = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), jax.vmap(jax.jacfwd(made))(u))
+    found = value_and_tangents(cases.scenario, varied, directions, (fold,), dt, steps=steps, method=method)
+    margin = -found.outcome.metrics["tuning_exact"][:, 0]
+    return margin, -found.tangents["tuning_smooth"][:, :, 0], found.outcome.status

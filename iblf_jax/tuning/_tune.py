@@ -1,0 +1,270 @@
+"""`tune`: gains by gradient through the closed loop, under requirements, over perturbed runs, checked on fresh ones."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax._designs import check_seed
+from iblf_jax._draws import Cases, plan
+from iblf_jax._progress import bar
+from iblf_jax.distributions import Perturbation
+from iblf_jax.integrators import tableau
+from iblf_jax.paths import with_parameters
+from iblf_jax.rollout import SimulationWarning, simulate
+from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.tuning.first_order import LBFGS, Adam
+from iblf_jax.tuning.newton import Newton
+from iblf_jax.tuning.objectives import Objective, complete
+from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
+from iblf_jax.tuning.parameters import Box, Tunable, layout, names_of, values_at
+from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, value
+from iblf_jax.tuning.quantities import Quantities
+from iblf_jax.tuning.result import Setup, TuneResult
+from iblf_jax.tuning.robust import Risk, as_risk
+
+OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
+SPREAD = 1.0
+"""Half-width of the box around the start in which further starts are drawn, in the coordinates z: a factor e for gains."""
+SCREENED = 32
+"""Points that are looked at where the first start leaves its bounds."""
+
+
+def tune(
+    scenario: Scenario,
+    parameters: Sequence[str | Tunable],
+    objective: Objective,
+    *,
+    duration: float,
+    dt: float = 1e-3,
+    perturbations: Mapping[str, Perturbation] | None = None,
+    runs: int = 1,
+    seed: int = 0,
+    risk: str | Risk = "mean",
+    resample: bool = False,
+    method: str = "rk4",
+    optimiser: str = "auto",
+    mode: str = "auto",
+    starts: int = 1,
+    iterations: int = 60,
+    tolerance: float = 1e-5,
+    patience: int = 15,
+    learning_rate: float = 0.1,
+    report_runs: int = 1000,
+    report_seed: int | None = None,
+    confidence: float = 0.95,
+    checkpoint: str | os.PathLike | None = None,
+    progress: bool | None = None,
+    callback: Callable[[Loop], None] | None = None,
+) -> TuneResult:
+    """Tunes leaves of a scenario, its gains say, by gradient through the closed loop.
+
+        minimise  risk_b [ sum_k w_k term_k ]   subject to the requirements and the limits of the parameters
+
+    Args:
+      scenario: where to start from, of n joints.
+      parameters: paths such as "controller.K2" (one number a joint) or `tunable(path, low, high, tied=...)`.
+      objective: composed from `iblf_jax.objectives` with + and weights; it may hold requirements.
+      duration: length of a run [s], a whole number of steps.
+      dt: time step [s].
+      perturbations: path -> `factor`, `offset` or `value` of a distribution; one nominal run if there are none.
+      runs: perturbed runs that a loss is made of.
+      seed: fixes these runs, and the further starts.
+      risk: "mean", "worst", "cvar" or `cvar(level)`.
+      resample: draw the runs anew at every step (adam only); the same ones for all steps otherwise.
+      method: integrator.
+      optimiser: "newton" (Gauss-Newton in a trust region), "lbfgs", "adam", or "auto": newton where forward mode is used, else lbfgs, and
+        adam where runs are resampled.
+      mode: "forward", "reverse", or "auto": forward up to 32 numbers.
+      starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch.
+      iterations: steps of the optimiser at most.
+      tolerance: relative change of the loss below which a start has settled.
+      patience: stop after so many steps without a better result.
+      learning_rate: of adam, in squashed coordinates.
+      report_runs, report_seed: fresh runs for the report, and their seed (seed + 1 if not given).
+      confidence: of the report's intervals.
+      checkpoint: a file that holds the state after each step; if it exists, tuning goes on from there.
+      progress: a progress bar; shown where somebody watches if not given.
+      callback: called with the loop after each step.
+
+    Returns:
+      A `TuneResult`: scenario, history, report, plot.
+
+    Raises:
+      ValueError: bad arguments, or a start that cannot be integrated with this step; the message names the mend.
+
+    Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
+    """
+    began = time.perf_counter()
+    timing = {"duration": duration, "dt": dt, "method": method}
+    problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing)
+    mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
+    iterations, starts = checks.positive_integer("iterations", iterations), checks.positive_integer("starts", starts)
+    z = way_in(problem, starting_points(problem.box, starts, seed), seed)
+    evaluator = Evaluator(problem.plan, problem.shared, problem.lanes(z), mode)
+    loop = Loop(evaluator, make_method(optimiser, problem.box, iterations, tolerance, learning_rate), z, resample=resample)
+    options = (optimiser, mode, starts, tolerance, learning_rate, resample, iterations if optimiser == "adam" else 0)
+    mark = fingerprint(problem.plan, problem.shared, options)
+    if checkpoint is not None and Path(checkpoint).exists():
+        load_checkpoint(checkpoint, loop, mark)
+    with bar(progress, iterations, int(loop.state["iteration"])) as shown:
+
+        def on_step(loop: Loop) -> None:
+            if checkpoint is not None:
+                save_checkpoint(checkpoint, loop, mark)
+            _show(shown, loop)
+            if callback is not None:
+                callback(loop)
+
+        stopped = loop.run(iterations, tolerance=tolerance, patience=checks.positive_integer("patience", patience), on_step=on_step)
+    _check_found(loop, problem)
+    setup = Setup(
+        problem.shared.objective,
+        dict(perturbations or {}),
+        problem.plan.risk,
+        problem.runs,
+        seed,
+        float(duration),
+        float(dt),
+        method,
+        checks.positive_integer("report_runs", report_runs),
+        (seed + 1) % 2**32 if report_seed is None else check_seed(report_seed),
+        confidence,
+    )
+    return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began)
+
+
+class Problem:
+    """A tuning problem, checked and ready to be evaluated."""
+
+    def __init__(self, plan: Plan, shared: Shared, box: Box, runs: int):
+        self.plan, self.shared, self.box, self.runs = plan, shared, box, runs
+
+    def lanes(self, z: np.ndarray) -> Lane:
+        """Lanes at z, (S, p): the same runs for all, no multipliers yet."""
+        starts, dtype = len(z), self.shared.dt.dtype
+        index = np.broadcast_to(np.arange(self.runs, dtype=np.uint32), (starts, self.runs))
+        count, terms = len(self.plan.shares), len(self.shared.objective.terms)
+        weights, lam, mu = np.ones((starts, terms), dtype), np.zeros((starts, count), dtype), np.full(starts, FIRST_MU, dtype)
+        return Lane(np.asarray(z, dtype), index, weights, lam, mu)
+
+
+def build(scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, scalarisation: str = "sum") -> Problem:
+    """Checks what `tune` and its relatives were asked for."""
+    tableau(timing["method"])
+    steps = checks.whole_steps(timing["duration"], timing["dt"])
+    seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs), canonical(scenario)
+    dtype = scenario.initial.q.dtype
+    targets, by_path = plan(scenario, perturbations or {})
+    if not targets and runs > 1:
+        raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
+    blocks, box = layout(scenario, parameters, timing["dt"], timing["method"])
+
+    def exact_at_start(quantities):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SimulationWarning)  # an infeasible start is what `way_in` is for
+            run = simulate(scenario, metrics=(Quantities(quantities),), record_every=steps, **timing)
+        return run.metrics["tuning_exact"]
+
+    objective = complete(objective, exact_at_start)
+    shares = tuple(float(r.allowed) for r in objective.requirements)
+    objective, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (objective, by_path, timing["dt"]))
+    plan_ = Plan(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation)
+    return Problem(plan_, Shared(Cases(scenario, by_path, jax.random.key(seed)), objective, step), box, runs)
+
+
+def choose(mode: str, optimiser: str, size: int, resample: bool) -> tuple[str, str]:
+    """Mode and optimiser, where the user left them open."""
+    checks.one_of("mode", mode, ("auto", "forward", "reverse"))
+    checks.one_of("optimiser", optimiser, OPTIMISERS)
+    if mode == "auto":
+        mode = "forward" if optimiser == "newton" or size <= FORWARD_MOST else "reverse"
+    if optimiser == "auto":
+        optimiser = "adam" if resample else "newton" if mode == "forward" else "lbfgs"
+    if optimiser == "newton" and mode == "reverse":
+        raise checks.fail("mode", mode, '"forward" with newton', 'Reverse mode has no Gauss-Newton matrix: take optimiser="lbfgs".')
+    if resample and optimiser != "adam":
+        raise checks.fail("resample", resample, f"False with {optimiser}", 'It compares losses of the same runs: take optimiser="adam".')
+    return mode, optimiser
+
+
+def make_method(optimiser: str, box: Box, iterations: int, tolerance: float, learning_rate: float) -> Any:
+    """The optimiser by name."""
+    if optimiser == "newton":
+        return Newton(box, tolerance)
+    return LBFGS(box, tolerance) if optimiser == "lbfgs" else Adam(box, iterations, learning_rate)
+
+
+def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
+    """The scenario's point and `starts - 1` drawn around it, inside the box, (S, p)."""
+    rng = np.random.default_rng([seed, 1])
+    drawn = box.z + rng.uniform(-SPREAD, SPREAD, (starts - 1, len(box.z)))
+    return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
+
+
+def way_in(problem: Problem, z: np.ndarray, seed: int) -> np.ndarray:
+    """The starting points, or better ones where the first leaves its bounds or cannot be integrated.
+
+    Past the wall the motion is chaotic, and its gradient points nowhere.  So SCREENED points of the box are looked at, values
+    only, and the starts are those that break the requirements and the bounds least.
+    """
+    first = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(z[:1]), plan=problem.plan))
+    if first.sound[0] and first.margin[0] > 0:
+        return z
+    rng = np.random.default_rng([seed, 2])
+    low = np.where(np.isfinite(problem.box.low), problem.box.low, problem.box.z - 3 * SPREAD)
+    high = np.where(np.isfinite(problem.box.high), problem.box.high, problem.box.z + 3 * SPREAD)
+    points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
+    found = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), plan=problem.plan))
+    broken = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-found.margin, 0.0)
+    order = np.lexsort((found.objective, broken, ~found.sound))
+    return points[order[: len(z)]]
+
+
+def _show(shown: Any, loop: Loop) -> None:
+    shown.update(1)
+    last = {name: x[-1] for name, x in loop.history.items()}
+    s = int(np.argmin(np.where(last["sound"], last["loss"], np.inf)))
+    shown.set_postfix_str(f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin {last['margin'][s]:.3g} rad")
+
+
+def _check_found(loop: Loop, problem: Problem) -> None:
+    if not np.any(np.isfinite(loop.state["best_key"])):
+        raise checks.fail(
+            "scenario",
+            "gains with which no run could be integrated to its end",
+            "a start whose runs are finite and within the step's stability",
+            f"Take a smaller dt than {float(problem.shared.dt):g} s (ij.recommended_dt), lower gains, or narrower perturbations.",
+        )
+
+
+def _result(problem: Problem, loop: Loop, setup: Setup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
+    state, blocks = loop.state, problem.plan.blocks
+    best = min(range(len(state["best_key"])), key=lambda s: tuple(state["best_key"][s]))
+    values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
+    history = {name: np.stack(x) for name, x in loop.history.items()}
+    log = np.concatenate([np.full(b.size, b.log) for b in blocks])
+    history["x"] = np.where(log, np.exp(np.where(log, history["z"], 0.0)), history["z"])
+    start = problem.shared.cases.scenario
+    return TuneResult(
+        scenario=with_parameters(start, values),
+        start=start,
+        values=values,
+        names=tuple(names_of(blocks)),
+        history=history,
+        best_start=best,
+        stopped=stopped,
+        optimiser=optimiser,
+        mode=mode,
+        seconds=seconds,
+        setup=setup,
+    )

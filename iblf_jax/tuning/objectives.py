@@ -1,0 +1,253 @@
+"""What gains are tuned for: objectives, composed with + and weights, and requirements, which are penalty and verdict at once.
+
+    objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort() + 10 * ij.objectives.peak_torque()
+    objective += ij.objectives.margin_above(0.05)
+
+A term is a smooth number of a run over its scale, so that terms are comparable:
+
+    plain   weight value / scale                 above   weight softplus(sharpness (value - limit) / scale) / sharpness
+
+`scale` and `limit`, where they are not given, are the value at the gains that tuning starts from.  A requirement holds where
+
+    g = (value - limit) / scale < 0        (its sign turned for "above" requirements);
+
+in the loss g is driven below zero by an augmented Lagrangian (`optimise`), in the report it passes or fails, with a confidence.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.pytree import component, leaf, static
+from iblf_jax.tuning.quantities import Integral, Peak, Quantity
+
+
+@component
+class Term:
+    """One weighted term of an objective."""
+
+    quantity: Quantity
+    weight: jax.Array = leaf("1", sign="nonnegative", shape="scalar", default=1.0)
+    scale: jax.Array | None = leaf("", sign="positive", shape="scalar", default=None)
+    limit: jax.Array | None = leaf("", shape="scalar", default=None)
+    sharpness: jax.Array = leaf("1", sign="positive", shape="scalar", default=20.0)
+    shape: str = static(default="plain")
+    name: str = static(default="term")
+
+    def check(self) -> None:
+        """Raises ValueError for an unknown shape."""
+        checks.one_of("Term.shape", self.shape, ("plain", "above"))
+
+    def value(self, x: jax.Array) -> jax.Array:
+        """The term, from the quantity's value."""
+        scale: Any = self.scale
+        limit: Any = self.limit
+        if self.shape == "plain":
+            return self.weight * x / scale
+        return self.weight * jax.nn.softplus(self.sharpness * (x - limit) / scale) / self.sharpness
+
+
+@component
+class Requirement:
+    """A limit that every run, but for an allowed share of them, has to keep."""
+
+    quantity: Quantity
+    limit: jax.Array = leaf("", shape="scalar")
+    scale: jax.Array = leaf("", sign="positive", shape="scalar")
+    allowed: jax.Array = leaf("1", sign="nonnegative", shape="scalar", default=0.01)
+    """Share of perturbed runs that may break it."""
+    event: str = static(default="value")
+    """"value": broken where g >= 0; "violated": broken where the run left its bounds or ran away."""
+    name: str = static(default="requirement")
+
+    def excess(self, x: jax.Array) -> jax.Array:
+        """g: below zero where the requirement holds."""
+        return (x - self.limit) / self.scale
+
+    def __add__(self, other: Any) -> Objective:
+        return Objective((), (self,)) + other
+
+    __radd__ = __add__
+
+
+@component
+class Objective:
+    """A sum of terms and a set of requirements; made by the functions of this module and by + and *."""
+
+    terms: tuple[Term, ...] = ()
+    requirements: tuple[Requirement, ...] = ()
+
+    def __add__(self, other: Any) -> Objective:
+        if isinstance(other, Requirement):
+            other = Objective((), (other,))
+        if not isinstance(other, Objective):
+            raise checks.fail("objective", other, "an objective or a requirement to add", "ij.objectives has them.")
+        return Objective((*self.terms, *other.terms), (*self.requirements, *other.requirements))
+
+    def __mul__(self, weight: Any) -> Objective:
+        weight = checks.as_floats("weight", weight)
+        terms = tuple(Term(t.quantity, weight * t.weight, t.scale, t.limit, t.sharpness, t.shape, t.name) for t in self.terms)
+        return Objective(terms, self.requirements)
+
+    __rmul__ = __mul__
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Those of the terms, then those of the requirements."""
+        return (*(t.quantity for t in self.terms), *(r.quantity for r in self.requirements))
+
+    def values(self, smooth: jax.Array) -> jax.Array:
+        """Each term, (n_terms,), from the quantities (K,)."""
+        return jnp.stack([t.value(smooth[i]) for i, t in enumerate(self.terms)])
+
+    def excesses(self, smooth: jax.Array) -> jax.Array:
+        """Excess g of each requirement, (n_requirements,)."""
+        offset = len(self.terms)
+        found = [r.excess(smooth[offset + i]) for i, r in enumerate(self.requirements)]
+        return jnp.stack(found) if found else jnp.zeros((0,), smooth.dtype)
+
+
+def complete(objective: Any, exact_at_start) -> Objective:
+    """The objective with every missing scale and limit set to the value at the start.
+
+    Args:
+      objective: as the user composed it.
+      exact_at_start: function (quantities) -> their exact values at the start, (K,).
+    """
+    if isinstance(objective, Requirement):
+        objective = Objective((), (objective,))
+    if not isinstance(objective, Objective) or not objective.terms:
+        raise checks.fail("objective", objective, "an objective with at least one term", "Such as ij.objectives.tracking().")
+    if all(t.scale is not None and (t.limit is not None or t.shape == "plain") for t in objective.terms):
+        return objective
+    start = exact_at_start(tuple(t.quantity for t in objective.terms))
+    terms = tuple(_completed(t, x) for t, x in zip(objective.terms, start, strict=True))
+    return Objective(terms, objective.requirements)
+
+
+def _completed(t: Term, x: jax.Array) -> Term:
+    missing = t.scale is None or (t.limit is None and t.shape == "above")
+    if missing and not (bool(jnp.isfinite(x)) and float(abs(x)) > 0):
+        raise checks.fail(f"{t.name}: its value at the start", x, "a finite number other than 0", "Give the term a scale of its own.")
+    scale = abs(x) if t.scale is None else t.scale
+    limit = x if t.limit is None and t.shape == "above" else t.limit
+    quantity = t.quantity
+    if isinstance(quantity, Peak) and t.scale is None:
+        quantity = Peak(scale, quantity.signal, quantity.joints, quantity.after, quantity.smoothing)
+    return Term(quantity, t.weight, scale, limit, t.sharpness, shape=t.shape, name=t.name)
+
+
+def _plain(name: str, quantity: Quantity, scale: Any) -> Objective:
+    return Objective((Term(quantity, scale=scale, name=name),))
+
+
+def tracking(*, joints: Any = 1.0, after: Any = 0.0, scale: Any = None) -> Objective:
+    """Integral of the squared position error.
+
+        int |e1|^2 dt / scale
+
+    Args:
+      joints: weight of each joint's error, one number or (n,).
+      after: count from this time on [s].
+      scale: in rad^2 s; the value at the starting gains if not given.
+
+    Returns:
+      An `Objective`, to be weighted and added to others.
+
+    Raises:
+      ValueError: a scale that is not positive.
+
+    Source: the ISE criterion, textbook.
+    """
+    return _plain("tracking", Integral("error", joints, after), scale)
+
+
+def effort(*, joints: Any = 1.0, scale: Any = None) -> Objective:
+    """Integral of the squared torque, int |tau|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2 s."""
+    return _plain("effort", Integral("torque", joints), scale)
+
+
+def torque_rate(*, joints: Any = 1.0, scale: Any = None) -> Objective:
+    """Integral of the squared rate of the torque, int |tau'|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2/s."""
+    return _plain("torque_rate", Integral("torque_rate", joints), scale)
+
+
+def settle(tolerance: Any = 0.01, *, joints: Any = 1.0, scale: Any = 1.0) -> Objective:
+    """Time that the joints spend outside a tolerance, the smooth twin of the settling time, sum over joints / scale.
+
+        int sigmoid((|e1| - tolerance) / (0.1 tolerance)) dt / scale
+
+    Args:
+      tolerance: on |e1| [rad].
+      joints: weight of each joint, one number or (n,).
+      scale: in s.
+    """
+    return _plain("settle", Integral("outside", joints, tolerance=tolerance), scale)
+
+
+def peak_torque(limit: Any = None, *, sharpness: Any = 20.0, smoothing: Any = 0.01, joints: Any = 1.0) -> Objective:
+    """Soft penalty on the largest torque above a limit, with the smooth maximum p.
+
+        softplus(sharpness (p / limit - 1)) / sharpness
+
+    Args:
+      limit: in N m; the peak at the starting gains if not given.
+      sharpness: of the corner at the limit.
+      smoothing: of the maximum over time and joints, as a part of the limit.
+      joints: weight of each joint's torque, one number or (n,).
+    """
+    scale: Any = 1.0 if limit is None else limit
+    quantity = Peak(scale, "torque", joints, smoothing=smoothing)
+    return Objective((Term(quantity, scale=limit, limit=limit, sharpness=sharpness, shape="above", name="peak_torque"),))
+
+
+def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
+    """Soft penalty on coming nearer to a bound than a target, softplus(sharpness (1 - margin / target)) / sharpness.
+
+    Args:
+      target: in rad.
+      sharpness, smoothing: as `peak_torque`, relative to the target.
+    """
+    quantity = Peak(target, "deficit", smoothing=smoothing)
+    return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="margin"),))
+
+
+def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:
+    """|e1| < limit on every joint from a time on: `error_below(0.01, after=1.0)`.
+
+    Args:
+      limit: in rad.
+      after: in s.
+      allowed: share of perturbed runs that may break it.
+      joints: weight of each joint's error; 0 leaves a joint out.
+    """
+    quantity = Peak(limit, "error", joints, after)
+    return Requirement(quantity, limit, limit, allowed, name=f"|e1| < {limit:g} rad" + (f" after {after:g} s" if after else ""))
+
+
+def peak_torque_below(limit: Any, *, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:
+    """Largest |tau| < limit [N m]; arguments as `error_below`."""
+    return Requirement(Peak(limit, "torque", joints), limit, limit, allowed, name=f"peak torque < {limit:g} N m")
+
+
+def margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
+    """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `allowed` as `error_below`."""
+    return Requirement(Peak(limit, "deficit"), -limit, limit, allowed, name=f"margin > {limit:g} rad")
+
+
+def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:
+    """The probability that a run leaves its bounds or runs away is below a limit.
+
+    In the loss: the margin of the worst `probability` share of the runs (at least of one) is driven above zero.
+
+    Args:
+      probability: the limit.
+      scale: the margin that matters [rad].
+    """
+    quantity = Peak(scale, "deficit")
+    name, zero = f"violation probability < {probability:g}", checks.as_floats("limit", 0.0)
+    return Requirement(quantity, zero, scale, probability, event="violated", name=name)

@@ -1,0 +1,232 @@
+"""The loop of a tuning: steps of a method, multipliers of the requirements, the best so far, early stop, checkpoint and resume.
+
+Requirements are driven in by an augmented Lagrangian: whenever a start has settled (or after INNER steps),
+
+    lam <- max(0, lam + mu G),     mu <- 5 mu where the largest G has not fallen to a quarter,
+
+so a start that breaks them finds its way in while the penalty stays finite everywhere.  The best so far is the one with the lowest
+objective among those that keep the requirements, or, while none does, the one that breaks them least.
+
+A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
+from there and gives the same numbers, bit by bit, as one that was not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax import checks
+from iblf_jax.tuning import problem
+from iblf_jax.tuning.problem import Lane, Plan, Shared, Slope
+
+INNER = 12
+"""Steps at most between two updates of the multipliers, for methods that settle; others take this many."""
+FIRST_MU = 10.0
+LARGEST_MU = 1e6
+OUTER = 12
+"""Updates of the multipliers at most."""
+
+
+class Evaluator:
+    """The compiled problem on the host: coordinates in, NumPy arrays out; counts what it did."""
+
+    def __init__(self, plan: Plan, shared: Shared, lanes: Lane, mode: str):
+        self.plan, self.shared, self.lanes = plan, shared, lanes
+        self.derive = Derive(problem.slope if mode == "forward" else problem.gradient, plan)
+        self.evaluations = 0
+
+    def __call__(self, z: np.ndarray) -> Slope:
+        """Value and derivatives at z, (S, p)."""
+        self.evaluations += len(z)
+        found = self.derive(self.shared, self.lanes._replace(z=np.asarray(z, self.shared.dt.dtype)))
+        return jax.tree.map(np.asarray, found)
+
+    def row(self, s: int) -> tuple[Shared, Lane]:
+        """What belongs to one start."""
+        return self.shared, jax.tree.map(lambda x: np.asarray(x)[s : s + 1], self.lanes)
+
+
+class Derive:
+    """A compiled problem with its plan; hashable by both, so that it can be static."""
+
+    def __init__(self, function: Callable, plan: Plan):
+        self.function, self.plan = function, plan
+
+    def __call__(self, shared: Shared, lanes: Lane) -> Slope:
+        """Value and derivatives of every lane."""
+        return self.function(shared, lanes, plan=self.plan)
+
+    def __hash__(self) -> int:
+        return hash((self.function, self.plan))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Derive) and (self.function, self.plan) == (other.function, other.plan)
+
+
+class Loop:
+    """State of a tuning, all of it arrays in `state`; `run` goes on from wherever it is."""
+
+    def __init__(self, evaluator: Evaluator, method: Any, z: np.ndarray, *, resample: bool = False):
+        self.evaluator, self.method, self.resample = evaluator, method, resample
+        starts, count = len(z), len(evaluator.plan.shares)
+        terms = len(evaluator.shared.objective.terms)
+        self.runs = evaluator.lanes.index.shape[1]
+        self.state: dict[str, Any] = {
+            "method": method.init(z),
+            "iteration": np.asarray(0),
+            "evaluations": np.asarray(0),
+            "lam": np.zeros((starts, count)),
+            "mu": np.full(starts, FIRST_MU),
+            "since": np.zeros(starts, int),
+            "outer": np.zeros(starts, int),
+            "worst": np.full(starts, np.inf),
+            "finished": np.zeros(starts, bool),
+            "stale": np.asarray(0),
+            "best_z": z.copy(),
+            "best_key": np.full((starts, 2), np.inf),
+            "best_terms": np.full((starts, terms), np.nan),
+            "best_excess": np.full((starts, count), np.nan),
+        }
+        self.history: dict[str, list[np.ndarray]] = {}
+
+    def run(self, iterations: int, *, tolerance: float, patience: int, on_step: Callable[[Loop], None]) -> str:
+        """Steps until done; returns why it stopped."""
+        state = self.state
+        while int(state["iteration"]) < iterations:
+            if np.all(state["finished"]):
+                return "converged"
+            if int(state["stale"]) >= patience:
+                return f"no improvement in {patience} steps"
+            self._step(tolerance)
+            on_step(self)
+        return "converged" if np.all(state["finished"]) else "iterations used up"
+
+    def _step(self, tolerance: float) -> None:
+        state, evaluator = self.state, self.evaluator
+        index = evaluator.lanes.index
+        if self.resample:
+            index = np.broadcast_to(np.arange(self.runs, dtype=np.uint32) + np.uint32(self.runs * int(state["iteration"])), index.shape)
+        evaluator.lanes = evaluator.lanes._replace(lam=state["lam"].copy(), mu=state["mu"].copy(), index=index)
+        before = evaluator.evaluations
+        z, found = self.method.step(evaluator, state["method"])
+        state["evaluations"] = state["evaluations"] + (evaluator.evaluations - before)
+        improved = self._keep_best(z, found, tolerance)
+        state["stale"] = np.asarray(0) if improved else state["stale"] + 1
+        self._record(z, found)
+        for s in range(len(z)):
+            self._outer(s, found)
+        state["iteration"] = state["iteration"] + 1
+
+    def _keep_best(self, z: np.ndarray, found: Slope, tolerance: float) -> bool:
+        state, improved = self.state, False
+        for s in range(len(z)):
+            if not found.value.sound[s]:
+                continue
+            excess = found.value.exact_excess[s]
+            broken = float(np.max(np.maximum(excess, 0.0), initial=0.0))
+            key = (broken, float(found.value.objective[s]))
+            old = state["best_key"][s]
+            if not np.isfinite(key[1]) or key >= tuple(old):
+                continue
+            overall = tuple(min(map(tuple, state["best_key"])))
+            small = tolerance * max(1e-3, abs(key[1]))
+            improved |= key[0] < overall[0] - tolerance or key[1] < overall[1] - small
+            state["best_key"][s], state["best_z"][s] = key, z[s]
+            state["best_terms"][s], state["best_excess"][s] = found.value.terms[s], excess
+        return improved
+
+    def _record(self, z: np.ndarray, found: Slope) -> None:
+        value = found.value
+        entries = {
+            "z": z,
+            "loss": value.loss,
+            "objective": value.objective,
+            "terms": value.terms,
+            "excess": value.exact_excess,
+            "margin": value.margin,
+            "gradient_norm": np.linalg.norm(found.gradient, axis=-1),
+            "sound": value.sound,
+            "evaluations": self.state["evaluations"],
+        }
+        for name, x in entries.items():
+            self.history.setdefault(name, []).append(np.array(x))
+
+    def _outer(self, s: int, found: Slope) -> None:
+        """Updates the multipliers of one start when it is time, or marks it finished."""
+        state = self.state
+        settled = bool(state["method"]["settled"][s])
+        state["since"][s] += 1
+        if state["finished"][s] or not (settled or state["since"][s] >= INNER):
+            return
+        if state["lam"].shape[1] == 0 or not found.value.sound[s]:
+            state["finished"][s] = settled
+            return
+        excess = found.value.excess[s]
+        new = np.maximum(0.0, state["lam"][s] + state["mu"][s] * excess)
+        worst = float(np.max(np.maximum(excess, -state["lam"][s] / state["mu"][s])))
+        if settled and (abs(worst) < 1e-3 or state["outer"][s] >= OUTER):
+            state["finished"][s] = True
+            return
+        if max(worst, 0.0) > 0.25 * state["worst"][s]:
+            state["mu"][s] = min(5 * state["mu"][s], LARGEST_MU)
+        state["lam"][s], state["worst"][s] = new, max(worst, 0.0)
+        state["since"][s], state["outer"][s] = 0, state["outer"][s] + 1
+        state["stale"] = np.asarray(0)
+        self.method.restart(state["method"], s)
+
+
+# ---------------------------------------------------------------------------------------------------------------- checkpoints
+
+
+def fingerprint(plan: Plan, shared: Shared, options: Any) -> str:
+    """A hash of everything that a checkpoint must agree with."""
+    cases = shared.cases._replace(key=jax.random.key_data(shared.cases.key))
+    leaves, structure = jax.tree.flatten(shared._replace(cases=cases))
+    digest = hashlib.sha256(repr((plan, structure, options)).encode())
+    for x in leaves:
+        digest.update(np.asarray(x).tobytes() + str(np.shape(x)).encode())
+    return digest.hexdigest()
+
+
+def save_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
+    """Writes the state of a loop, whole or not at all."""
+    leaves = jax.tree.leaves(loop.state)
+    arrays = {f"state_{i:03d}": np.asarray(x) for i, x in enumerate(leaves)}
+    arrays |= {f"history_{name}": np.stack(x) for name, x in loop.history.items()}
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    with open(temporary, "wb") as file:
+        np.savez(file, allow_pickle=False, fingerprint=np.asarray(mark), **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, target)
+
+
+def load_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
+    """Puts a loop where its checkpoint left it.
+
+    Raises:
+      ValueError: the file is not a checkpoint, or one of another problem.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError) as error:
+        raise checks.fail("checkpoint", str(path), "a checkpoint of tune", f"It cannot be read: {error}") from error
+    if str(arrays.get("fingerprint")) != mark:
+        raise checks.fail(
+            "checkpoint",
+            str(path),
+            "a checkpoint of this very problem",
+            "Scenario, objective or options differ: delete it or name another file.",
+        )
+    structure = jax.tree.structure(loop.state)
+    loop.state = jax.tree.unflatten(structure, [np.array(arrays[name]) for name in sorted(arrays) if name.startswith("state_")])
+    loop.history = {name[8:]: list(x) for name, x in arrays.items() if name.startswith("history_")}

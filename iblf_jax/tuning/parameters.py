@@ -1,0 +1,225 @@
+"""Which leaves are tuned, within which limits, and in which coordinates.
+
+A tuned number x lives in a coordinate z in which the loss is better shaped: z = log x for a gain that is positive, z = x
+otherwise.  Limits on x are limits on z; the "newton" method keeps to them as a box.  The methods of optax know no limits, so they
+work on a free w that is squashed into the box,
+
+    z = z_low + (z_high - z_low) sigmoid(w)      both limits,      z = z_low + softplus(w)   or   z_high - softplus(w)      one.
+
+Default limits keep inside the conditions of Theorem 2 (k1 > 0, K2 > 1/2, kf > 1) and, above, inside what the step can carry: the
+fastest mode of the closed loop grows with every gain, and past stability / dt the numbers explode (see `stability`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks, paths
+from iblf_jax._draws import check_paths
+from iblf_jax.integrators import tableau
+from iblf_jax.paths import with_parameters
+from iblf_jax.scenario import Scenario
+from iblf_jax.stability import _jacobians
+
+CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
+"""Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the paper's law."""
+SHARE = 0.7
+"""Part of the integrator's stability range that a gain may use up by default."""
+MOST = 1e3
+"""How far above its start a gain may go by default, as a factor, where the step sets no limit."""
+EDGE = 1e-3
+"""Distance from a limit, relative to the box, from which a squashed coordinate starts at least."""
+
+
+class Tunable(NamedTuple):
+    """A leaf to tune; made by `tunable`."""
+
+    path: str
+    low: Any = None
+    high: Any = None
+    tied: bool = False
+    scale: str | None = None
+
+
+class Block(NamedTuple):
+    """One leaf's share of the coordinates; static."""
+
+    path: str
+    shape: tuple[int, ...]
+    start: int
+    size: int
+    log: bool
+
+
+class Box(NamedTuple):
+    """Where tuning starts and how far it may go, in the coordinates z, (p,) each."""
+
+    z: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False, scale: str | None = None) -> Tunable:
+    """A leaf to tune, with limits of one's own.
+
+        z = log x ("log") or z = x ("linear"),   low <= x <= high
+
+    Args:
+      path: of the leaf or entry, such as "controller.K2" or "controller.K2[0]".
+      low, high: limits in the leaf's unit, one number or one an entry; the default ones if not given.
+      tied: one number for all joints rather than one each.
+      scale: "log" or "linear"; "log" for leaves that are positive, if not given.
+
+    Returns:
+      An entry for the list of parameters of `tune`.
+
+    Raises:
+      ValueError: an unknown scale, or low >= high.
+
+    Source: design of this package.
+    """
+    if scale is not None:
+        checks.one_of("tunable: scale", scale, ("log", "linear"))
+    if low is not None and high is not None and not np.all(np.asarray(low, float) < np.asarray(high, float)):
+        raise checks.fail(f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them.")
+    return Tunable(path, low, high, tied, scale)
+
+
+def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple[tuple[Block, ...], Box]:
+    """The coordinates of a list of parameters: blocks, and the box with the start in it.
+
+    Args:
+      scenario: canonical.
+      parameters: paths or `Tunable`s.
+      dt, method: what the step can carry sets the default upper limits.
+
+    Raises:
+      ValueError: an unknown or overlapping path, limits that exclude the start or are not admissible.
+    """
+    if isinstance(parameters, str) or not isinstance(parameters, Sequence) or not parameters:
+        raise checks.fail("parameters", parameters, 'a list of paths, such as ["controller.k1", "controller.K2"]')
+    wanted = [x if isinstance(x, Tunable) else Tunable(x) for x in parameters]
+    check_paths(scenario, [x.path for x in wanted], "parameters")
+    blocks, parts, start = [], [], 0
+    for item in wanted:
+        block, part = _one(scenario, item, start, dt, method)
+        blocks.append(block)
+        parts.append(part)
+        start += block.size
+    return tuple(blocks), Box(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+
+def _one(scenario: Scenario, item: Tunable, start: int, dt: float, method: str) -> tuple[Block, tuple[np.ndarray, ...]]:
+    value = np.asarray(paths.get(scenario, item.path), float)
+    sign = paths.sign_at(scenario, item.path)
+    log = item.scale == "log" if item.scale else sign == "positive"
+    if log and not np.all(value > 0):
+        raise checks.fail(item.path, value, "values > 0 for a logarithmic scale", 'Use scale="linear".')
+    if item.tied and not np.all(value == value.flat[0]):
+        value = np.full_like(value, np.exp(np.mean(np.log(value))) if log else np.mean(value))
+    size = 1 if item.tied else value.size
+    low = _limit(item, "low", item.low, _default_low(item.path, sign), value)
+    high = _limit(item, "high", item.high, lambda: _default_high(scenario, item, value, dt, method), value)
+    if not np.all(low < high) or not np.all((low <= value) & (value <= high)):
+        raise checks.fail(
+            f"tunable({item.path!r})", value, f"a start between its limits {low.tolist()} and {high.tolist()}", "Widen the limits."
+        )
+    block = Block(item.path, value.shape, start, size, log)
+    return block, tuple(_coordinate(x.reshape(-1)[:size], log) for x in (value, low, high))
+
+
+def _limit(item: Tunable, name: str, given: Any, default: Any, value: np.ndarray) -> np.ndarray:
+    if given is None:
+        given = default() if callable(default) else default
+    try:
+        limit = np.broadcast_to(np.asarray(given, float), value.shape)
+    except (TypeError, ValueError):
+        raise checks.fail(f"tunable({item.path!r}): {name}", given, f"one number, or shape {value.shape}") from None
+    return limit
+
+
+def _default_low(path: str, sign: str | None) -> float:
+    leaf = re.sub(r"(\[\d+\])+$", "", path)
+    return CONDITIONS.get(leaf, 0.0 if sign in ("positive", "nonnegative") else -np.inf)
+
+
+def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: float, method: str) -> np.ndarray:
+    """The largest multiple of the start, at most MOST, with which SHARE of the stability range is kept."""
+    if not item.path.startswith(("controller.", "observer.")) or not np.all(value > 0):
+        return np.full(value.shape, np.inf)
+
+    def fits(factor: float) -> bool:
+        modes = _modes(scenario, {item.path: jnp.asarray(value * factor)})
+        return bool(np.all(np.isfinite(modes))) and dt * float(np.max(modes)) <= SHARE * tableau(method).stability
+
+    if not fits(1.0):
+        return 1.01 * value
+    low, high = 0.0, float(np.log(MOST))
+    if fits(MOST):
+        return MOST * value
+    for _ in range(10):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(float(np.exp(middle))) else (low, middle)
+    return np.exp(low) * value
+
+
+def _modes(scenario: Scenario, values: Mapping[str, Any]) -> np.ndarray:
+    dtype = scenario.initial.q.dtype
+    times = jnp.linspace(0.0, 6.0, 7, dtype=dtype)
+    return np.abs(np.linalg.eigvals(np.asarray(_jacobians(with_parameters(scenario, values), times), float)))
+
+
+def _coordinate(x: np.ndarray, log: bool) -> np.ndarray:
+    if not log:
+        return x
+    with np.errstate(divide="ignore"):
+        return np.log(np.maximum(x, 0.0))
+
+
+def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
+    """Path -> value of the leaf at coordinates z, (p,); differentiable."""
+    values = {}
+    for block in blocks:
+        part = z[block.start : block.start + block.size]
+        part = jnp.exp(part) if block.log else part
+        values[block.path] = jnp.broadcast_to(part[0], block.shape) if block.size == 1 else part.reshape(block.shape)
+    return values
+
+
+def names_of(blocks: tuple[Block, ...]) -> list[str]:
+    """What each coordinate is called: "controller.K2[0]", or the path alone if it is tied or has one entry."""
+    names = []
+    for block in blocks:
+        indices = list(np.ndindex(block.shape)) if block.size > 1 else [()]
+        names += [block.path + "".join(f"[{i}]" for i in index) for index in indices]
+    return names
+
+
+def squash(w: jax.Array, box: Box) -> jax.Array:
+    """Coordinates z inside the box for any real w, (p,)."""
+    low, high = jnp.asarray(box.low), jnp.asarray(box.high)
+    below, above = jnp.isfinite(low), jnp.isfinite(high)
+    low_, high_ = jnp.where(below, low, 0.0), jnp.where(above, high, 0.0)
+    both = low_ + (high_ - low_) * jax.nn.sigmoid(w)
+    one = jnp.where(below, low_ + jax.nn.softplus(w), jnp.where(above, high_ - jax.nn.softplus(w), w))
+    return jnp.where(below & above, both, one)
+
+
+def unsquash(z: np.ndarray, box: Box) -> np.ndarray:
+    """The w whose `squash` is z; a z at a limit is moved inside by EDGE."""
+    w = np.array(z, float)
+    for i, (x, low, high) in enumerate(zip(w, box.low, box.high, strict=True)):
+        if np.isfinite(low) and np.isfinite(high):
+            share = np.clip((x - low) / (high - low), EDGE, 1 - EDGE)
+            w[i] = np.log(share / (1 - share))
+        elif np.isfinite(low):
+            w[i] = np.log(np.expm1(max(x - low, EDGE)))
+        elif np.isfinite(high):
+            w[i] = np.log(np.expm1(max(high - x, EDGE)))
+    return w

@@ -1,0 +1,212 @@
+"""The tuning problem as compiled functions of the coordinates z: its loss, its gradient and its Gauss-Newton matrix.
+
+Per start s and run b the quantities m_bk of the objective come from one rollout; the loss puts them together,
+
+    L(z) = risk_b [ sum_k w_k term_k(m_bk) ] + sum_r psi(G_r; lam_r, mu),     G_r = mean of g_r over the worst `allowed` share of the runs,
+    psi(G; lam, mu) = (max(0, lam + mu G)^2 - lam^2) / (2 mu)                                              (augmented Lagrangian)
+
+and its derivatives follow from the rollout's tangents dm/dz by the chain rule,
+
+    dL/dz = sum dL/dm dm/dz,      d2L/dz2 ~ sum dL/dm N + (dm/dz)^T d2L/dm2 dm/dz,                          N: see `quantities`.
+
+Forward mode gives all of it at once; reverse mode, for many parameters, the gradient.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax._draws import Cases, Target, draw, merge
+from iblf_jax.derivatives import run_checkpointed, value_and_tangents
+from iblf_jax.lowering import run_batch
+from iblf_jax.paths import with_parameters
+from iblf_jax.status import Status
+from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.parameters import Block, values_at
+from iblf_jax.tuning.quantities import Peak, Quantities
+from iblf_jax.tuning.robust import Risk, combine, worst_share
+
+FORWARD_MOST = 32
+"""Up to so many numbers forward mode is used, above it reverse mode."""
+UNSOUND = Status.NOT_FINITE | Status.STEP_TOO_LARGE
+"""Runs with these flags have no loss: a step that makes one is rejected."""
+
+
+class Plan(NamedTuple):
+    """What is compiled; static."""
+
+    blocks: tuple[Block, ...]
+    targets: tuple[Target, ...]
+    steps: int
+    method: str
+    risk: Risk
+    shares: tuple[float, ...]
+    """Share of the runs that G_r is taken over, for each requirement."""
+    scalarisation: str = "sum"
+    """"sum" of weighted terms, or "log": sum of weighted logarithms."""
+
+
+class Shared(NamedTuple):
+    """What all starts share; traced."""
+
+    cases: Cases
+    objective: Objective
+    dt: jax.Array
+
+
+class Lane(NamedTuple):
+    """What differs between starts: coordinates (p,), run numbers (B,), weights of the terms, multipliers."""
+
+    z: Any
+    index: Any
+    weights: Any
+    lam: Any
+    mu: Any
+
+
+class Value(NamedTuple):
+    """A problem at one z."""
+
+    loss: Any
+    """L, infinite where a run was unsound."""
+    objective: Any
+    """L without requirements."""
+    terms: Any
+    """Each unweighted term, averaged over the runs, (n_terms,)."""
+    excess: Any
+    """G_r from the smooth quantities, (n_requirements,)."""
+    exact_excess: Any
+    """G_r from the exact ones."""
+    margin: Any
+    """The smallest margin of all runs [rad]."""
+    sound: Any
+
+
+class Slope(NamedTuple):
+    """A problem at one z, with derivatives."""
+
+    value: Value
+    gradient: Any
+    hessian: Any
+
+
+def fold_of(objective: Objective, dtype) -> tuple[Quantities, ...]:
+    """The fold of a problem: its quantities, and the margin last."""
+    one: Any = 1.0
+    parts = (*objective.quantities, Peak(one, "deficit"))
+    return (jax.tree.map(lambda x: jnp.asarray(x, dtype), Quantities(parts)),)
+
+
+def _varied(plan: Plan, shared: Shared, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
+    """Path -> value for one run."""
+    point = {path: x.astype(shared.dt.dtype) for path, x in values_at(plan.blocks, z).items()}
+    if not plan.targets:
+        return point
+    made, _, _ = draw(shared.cases, plan.targets, index, point, {})
+    return merge(shared.cases.scenario, point, made)
+
+
+def _of_lanes(plan: Plan, shared: Shared, lanes: Lane):
+    """Path -> values (S, B, ...)."""
+    one = partial(_varied, plan, shared)
+    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(lanes.z, lanes.index)
+
+
+def _flat(tree, lead: int = 2):
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[lead:])), tree)
+
+
+def _penalty(excess: jax.Array, lam: jax.Array, mu: jax.Array) -> jax.Array:
+    return jnp.sum(jnp.maximum(0.0, lam + mu * excess) ** 2 - lam**2) / (2 * mu)
+
+
+def _excesses(plan: Plan, objective: Objective, quantities: jax.Array) -> jax.Array:
+    each = jax.vmap(objective.excesses)(quantities)
+    found = [worst_share(each[:, r], share) for r, share in enumerate(plan.shares)]
+    return jnp.stack(found) if found else jnp.zeros((0,), quantities.dtype)
+
+
+def _objective(plan: Plan, shared: Shared, lane: Lane, smooth: jax.Array) -> jax.Array:
+    terms = jax.vmap(shared.objective.values)(smooth)
+    terms = jnp.log(terms) if plan.scalarisation == "log" else terms
+    return combine(plan.risk, terms @ lane.weights)
+
+
+def _loss(plan: Plan, shared: Shared, lane: Lane, smooth: jax.Array) -> jax.Array:
+    """L of one start, from the quantities of its runs (B, K)."""
+    objective = _objective(plan, shared, lane, smooth)
+    return objective + _penalty(_excesses(plan, shared.objective, smooth), lane.lam, lane.mu)
+
+
+def _value(plan: Plan, shared: Shared, lane: Lane, smooth, exact, status) -> Value:
+    sound = jnp.all(status & int(UNSOUND) == 0) & jnp.all(jnp.isfinite(smooth))
+    return Value(
+        jnp.where(sound, _loss(plan, shared, lane, smooth), jnp.inf),
+        _objective(plan, shared, lane, smooth),
+        jnp.mean(jax.vmap(shared.objective.values)(smooth), axis=0),
+        _excesses(plan, shared.objective, smooth),
+        _excesses(plan, shared.objective, exact),
+        -jnp.max(exact[:, -1]),
+        sound,
+    )
+
+
+def _slope(plan: Plan, shared: Shared, lane: Lane, outcome, tangents, products) -> Slope:
+    """Loss, gradient and Gauss-Newton matrix of one start; arrays of its B runs."""
+    smooth, exact, weight = (outcome.metrics[name] for name in Quantities.units)
+    pull = jax.grad(partial(_loss, plan, shared, lane))
+    d_loss = pull(smooth)
+    J = tangents["tuning_smooth"]
+    gradient = jnp.einsum("bk,buk->u", d_loss, J)
+    fold = fold_of(shared.objective, smooth.dtype)[0]
+    N = jax.vmap(fold.hessians)(products, J, weight)
+    bent = jax.vmap(lambda tangent: jax.jvp(pull, (smooth,), (tangent,))[1], in_axes=1)(J)
+    hessian = jnp.einsum("bk,bkuv->uv", d_loss, N) + jnp.einsum("ubk,bvk->uv", bent, J)
+    return Slope(_value(plan, shared, lane, smooth, exact, outcome.status), gradient, hessian)
+
+
+@partial(jax.jit, static_argnames="plan")
+def value(shared: Shared, lanes: Lane, *, plan: Plan) -> Value:
+    """The problem at the coordinates of each start, (S, ...)."""
+    fold = fold_of(shared.objective, shared.dt.dtype)
+    varied = _flat(_of_lanes(plan, shared, lanes))
+    outcome = run_batch(shared.cases.scenario, varied, fold, shared.dt, steps=plan.steps, method=plan.method)
+    smooth, exact, _ = (outcome.metrics[name].reshape(*lanes.index.shape, -1) for name in Quantities.units)
+    status = outcome.status.reshape(lanes.index.shape)
+    return jax.vmap(partial(_value, plan, shared))(lanes, smooth, exact, status)
+
+
+@partial(jax.jit, static_argnames="plan")
+def slope(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
+    """The problem with gradient (S, p) and Gauss-Newton matrix (S, p, p), by forward mode."""
+    fold = fold_of(shared.objective, shared.dt.dtype)
+    one = partial(_varied, plan, shared)
+    jacobian = jax.vmap(jax.vmap(jax.jacfwd(one), in_axes=(None, 0)))(lanes.z, lanes.index)
+    directions = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), _flat(jacobian))
+    varied = _flat(_of_lanes(plan, shared, lanes))
+    found = value_and_tangents(shared.cases.scenario, varied, directions, fold, shared.dt, steps=plan.steps, method=plan.method)
+    parts = jax.tree.map(lambda x: x.reshape(*lanes.index.shape, *x.shape[1:]), (found.outcome, found.tangents, found.products))
+    return jax.vmap(partial(_slope, plan, shared))(lanes, *parts)
+
+
+@partial(jax.jit, static_argnames="plan")
+def gradient(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
+    """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
+
+    def one_run(lane: Lane, index):
+        scenario = with_parameters(shared.cases.scenario, _varied(plan, shared, lane.z, index))
+        fold = fold_of(shared.objective, shared.dt.dtype)
+        outcome = run_checkpointed(scenario, fold, shared.dt, steps=plan.steps, method=plan.method)
+        return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
+
+    def loss(z, lane: Lane):
+        lane = lane._replace(z=z)
+        smooth, (exact, status) = jax.vmap(partial(one_run, lane))(lane.index)
+        return _loss(plan, shared, lane, smooth), _value(plan, shared, lane, smooth, exact, status)
+
+    (_, found), slopes = jax.vmap(jax.value_and_grad(loss, has_aux=True))(lanes.z, lanes)
+    return Slope(found, slopes, jnp.zeros((*slopes.shape, slopes.shape[-1]), slopes.dtype))

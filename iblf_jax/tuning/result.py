@@ -1,0 +1,185 @@
+"""What a tuning gives back: `TuneResult`."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from functools import cached_property, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import checks, paths
+from iblf_jax._designs import check_seed
+from iblf_jax.distributions import Perturbation
+from iblf_jax.lowering import run_batch
+from iblf_jax.metrics import as_folds
+from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.problem import UNSOUND
+from iblf_jax.tuning.quantities import Quantities
+from iblf_jax.tuning.report import Report, make_report
+from iblf_jax.tuning.robust import Risk
+
+
+@partial(jax.jit, static_argnames=("steps", "method"))
+def _slice(scenario, changes, folds, dt, *, steps, method):
+    return run_batch(scenario, changes, folds, dt, steps=steps, method=method)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Setup:
+    """What a tuning was asked for, as far as its report needs it."""
+
+    objective: Objective
+    """With all scales and limits."""
+    perturbations: dict[str, Perturbation]
+    risk: Risk
+    runs: int
+    seed: int
+    duration: float
+    dt: float
+    method: str
+    report_runs: int
+    report_seed: int
+    confidence: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TuneResult:
+    """A tuned scenario, how it was found, and what it is worth on runs that tuning never saw."""
+
+    scenario: Scenario
+    """With the tuned gains."""
+    start: Scenario
+    """With the gains that tuning started from."""
+    values: dict[str, np.ndarray]
+    """Path -> tuned value, in the leaf's unit."""
+    names: tuple[str, ...]
+    """What each coordinate is called, (p,)."""
+    history: dict[str, np.ndarray]
+    """Per step, (steps, starts, ...): loss, objective, terms, excess of the requirements, margin [rad], gradient_norm, sound, z and
+    x (the gains tried, in their units); evaluations is (steps,)."""
+    best_start: int
+    """Which of the starts won."""
+    stopped: str
+    """Why it stopped."""
+    optimiser: str
+    mode: str
+    """"forward" or "reverse"."""
+    seconds: float
+    setup: Setup
+
+    @property
+    def objective(self) -> float:
+        """The objective at the tuned gains, on the runs that it was tuned on."""
+        sound = self.history["sound"] & np.all(np.abs(self.history["x"] - self.tuned) <= 1e-12 * np.abs(self.tuned), axis=-1)
+        return float(np.min(np.where(sound, self.history["objective"], np.inf)))
+
+    @property
+    def tuned(self) -> np.ndarray:
+        """The tuned numbers, (p,), in the order of `names`."""
+        flat = []
+        for path, value in self.values.items():
+            own = sum(name == path or name.startswith(path + "[") for name in self.names)
+            flat.append(np.ravel(value)[:own])
+        return np.concatenate(flat)
+
+    @property
+    def evaluations(self) -> int:
+        """Values with derivatives that were computed, each of `setup.runs` rollouts."""
+        return int(self.history["evaluations"][-1])
+
+    @cached_property
+    def report(self) -> Report:
+        """Before and after on fresh draws, requirement by requirement."""
+        return self.check()
+
+    def check(self, runs: int | None = None, seed: int | None = None) -> Report:
+        """The report with another number of fresh runs, or another seed.
+
+        Args:
+          runs: how many fresh runs; as in `report` if not given.
+          seed: of their draws; never the one that was tuned on.
+
+        Returns:
+          A `Report`, which prints as text.
+
+        Raises:
+          ValueError: the seed of the tuning itself.
+
+        Source: `iblf_jax.tuning.report`.
+        """
+        setup = self.setup
+        seed = setup.report_seed if seed is None else check_seed(seed)
+        if setup.perturbations and seed == setup.seed:
+            raise checks.fail("seed", seed, "another seed than the tuning's", "Held-out runs must be fresh.")
+        timing = {"duration": setup.duration, "dt": setup.dt, "method": setup.method}
+        return make_report(
+            self.start,
+            self.scenario,
+            setup.objective,
+            setup.perturbations,
+            runs=setup.report_runs if runs is None else checks.positive_integer("runs", runs),
+            seed=seed,
+            risk=setup.risk,
+            confidence=setup.confidence,
+            timing=timing,
+        )
+
+    def landscape(self, first: str, second: str, *, points: int = 13, span: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The objective of the nominal run on a slice through the optimum.
+
+        Args:
+          first, second: two of `names`.
+          points: on each axis.
+          span: each axis reaches from exp(-span) to exp(span) times the tuned number.
+
+        Returns:
+          Values of the first (points,), of the second (points,), and the objective (points, points), infinite where a run is unsound.
+
+        Raises:
+          ValueError: an unknown name.
+
+        Source: design of this package.
+        """
+        for name in (first, second):
+            checks.one_of("landscape: name", name, self.names)
+        factor = np.exp(np.linspace(-span, span, checks.positive_integer("points", points)))
+        a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
+        changes = {first: np.repeat(a, points), second: np.tile(b, points)}
+        setup, scenario = self.setup, canonical(self.scenario)
+        dtype = scenario.initial.q.dtype
+        folds = as_folds((Quantities(setup.objective.quantities),), dtype)
+        steps = checks.whole_steps(setup.duration, setup.dt)
+        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), steps=steps, method=setup.method)
+        values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
+        sound = np.asarray(outcome.status) & int(UNSOUND) == 0
+        return a, b, np.where(sound, np.asarray(values), np.inf).reshape(points, points)
+
+    def plot(self, **options):
+        """Figure of the tuning: loss, gains, margin, tubes before and after.  Options as `plotting.tuning`."""
+        from iblf_jax import plotting
+
+        return plotting.tuning(self, **options)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes everything to one file, from which `load_tuning` gives the result back with the same report.
+
+        Raises:
+          ValueError: the scenario, the objective or a perturbation holds a class that no file can name.
+          OSError: the file cannot be written.
+        """
+        from iblf_jax.tuning_file import save_tuning
+
+        save_tuning(self, path)
+
+    def __repr__(self) -> str:
+        steps = len(self.history["evaluations"])
+        steps, how = len(self.history["evaluations"]), f"{self.optimiser}, {self.mode} mode"
+        lines = [f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {self.stopped})"]
+        for path, value in self.values.items():
+            before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
+            lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
+        return "\n".join(lines)

@@ -1,0 +1,367 @@
+"""Gain tuning: derivatives, objectives, coordinates, the loop, and the truth of its report."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.metrics import STANDARD
+from iblf_jax.rollout import run as plain_run
+from iblf_jax.rollout import start
+from iblf_jax.scenario import canonical
+from iblf_jax.tuning import _tune, problem
+from iblf_jax.tuning.newton import box_step
+from iblf_jax.tuning.optimise import Evaluator
+from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
+from iblf_jax.tuning.quantities import Integral, Peak, Quantities
+from iblf_jax.tuning.robust import Risk, combine
+
+jax.config.update("jax_enable_x64", True)
+
+objectives = ij.objectives
+SHORT = {"duration": 0.3, "dt": 1e-3, "method": "euler"}
+GAINS = ["controller.k1", "controller.K2", "observer.kf"]
+DRAWS = {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)), "initial.q": ij.offset(ij.uniform(-0.03, 0.03))}
+
+
+def objective():
+    return objectives.tracking() + 0.5 * objectives.effort() + 10 * objectives.peak_torque()
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return ij.presets.zhang_yan_2024()
+
+
+@pytest.fixture(scope="module")
+def nominal(paper):
+    return _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", SHORT)
+
+
+def central(f, z, h=1e-5):
+    return np.stack([(f(z + h * e) - f(z - h * e)) / (2 * h) for e in np.eye(len(z))])
+
+
+# ---------------------------------------------------------------------------------------------------------------- derivatives
+
+
+def test_forward_and_reverse_equal_finite_differences(nominal):
+    z = nominal.box.z
+    lanes = nominal.lanes(z[None])
+    forward = problem.slope(nominal.shared, lanes, plan=nominal.plan)
+    reverse = problem.gradient(nominal.shared, lanes, plan=nominal.plan)
+
+    def loss(z):
+        return np.asarray(problem.value(nominal.shared, nominal.lanes(z[None]), plan=nominal.plan).loss[0])
+
+    expected = central(loss, z)
+    scale = np.max(np.abs(expected))
+    assert np.max(np.abs(forward.gradient[0] - expected)) < 1e-6 * scale
+    assert np.max(np.abs(reverse.gradient[0] - expected)) < 1e-6 * scale
+    np.testing.assert_allclose(forward.gradient, reverse.gradient, rtol=1e-8, atol=1e-10 * scale)
+    np.testing.assert_allclose(forward.value.loss, reverse.value.loss, rtol=1e-12)
+
+
+def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
+    """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v, with e1_u by finite differences of recorded runs."""
+    lanes = nominal.lanes(nominal.box.z[None])
+    found = problem.slope(nominal.shared, lanes, plan=nominal.plan)
+
+    def errors(z):
+        values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.plan.blocks}
+        return np.asarray(ij.simulate(ij.with_parameters(paper, values), **SHORT).e1)[:-1]
+
+    J = central(errors, nominal.box.z)
+    expected = 2 * SHORT["dt"] * np.einsum("utn,vtn->uv", J, J)
+    only = ij.objectives.Objective((nominal.shared.objective.terms[0],))
+    shared = nominal.shared._replace(objective=only)
+    one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), plan=nominal.plan)
+    np.testing.assert_allclose(one.hessian[0] * only.terms[0].scale, expected, rtol=1e-5, atol=1e-9 * np.max(expected))
+    assert np.all(np.isfinite(found.hessian))
+
+
+@pytest.mark.slow
+def test_reverse_mode_remembers_few_states(paper):
+    """Temporary memory of the gradient grows like the cube root of the number of steps, and stays below 2 sqrt(T) states."""
+    sizes = {}
+    for steps in (500, 4000):
+        plan = _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3})
+        compiled = problem.gradient.lower(plan.shared, plan.lanes(plan.box.z[None]), plan=plan.plan).compile()
+        sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
+    state = sum(
+        x.nbytes for x in jax.tree.leaves(start(canonical(paper), problem.fold_of(plan.shared.objective, jnp.float64), plan.shared.dt))
+    )
+    assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
+
+
+# ---------------------------------------------------------------------------------------------------------------- quantities
+
+
+def test_quantities_are_what_numpy_makes_of_the_records(paper):
+    parts = (
+        Integral("error", joints=[1.0, 2.0], after=0.1),
+        Integral("torque"),
+        Integral("torque_rate"),
+        Integral("outside", tolerance=0.05),
+        Peak(10.0, "torque"),
+        Peak(0.1, "deficit", smoothing=0.05),
+        Peak(0.1, "error", after=0.1),
+    )
+    run = ij.simulate(paper, metrics=(Quantities(parts),), **SHORT)
+    e1, tau, t = (np.asarray(x) for x in (run.e1, run.tau, run.t))
+    margin = np.minimum(run.q - run.lower, run.upper - run.q)
+    dt = SHORT["dt"]
+    expected = [
+        dt * np.sum((e1 * [1.0, 2.0])[:-1][t[:-1] >= 0.1 - 1e-9] ** 2),
+        dt * np.sum(tau[:-1] ** 2),
+        np.sum(np.diff(tau[:-1], axis=0) ** 2) / dt,
+        dt * np.sum(1 / (1 + np.exp(-(np.abs(e1[:-1]) - 0.05) / 0.005))),
+        np.max(np.abs(tau)),
+        -np.min(margin),
+        np.max(np.abs(e1[t >= 0.1 - 1e-9])),
+    ]
+    np.testing.assert_allclose(run.metrics["tuning_exact"], expected, rtol=1e-9)
+    T = 0.1 * 0.05
+    both = np.concatenate([run.lower - run.q, run.q - run.upper], axis=1) / T
+    np.testing.assert_allclose(run.metrics["tuning_smooth"][5], T * np.logaddexp.reduce(np.ravel(both)), rtol=1e-9)
+    assert np.all(np.asarray(run.metrics["tuning_smooth"])[4:] >= np.asarray(run.metrics["tuning_exact"])[4:])
+
+
+def test_objectives_compose_and_messages_name_the_mend():
+    both = 2 * (objectives.tracking(scale=1.0) + 3 * objectives.effort(scale=2.0)) + objectives.margin_above(0.05)
+    assert [t.name for t in both.terms] == ["tracking", "effort"]
+    assert [float(t.weight) for t in both.terms] == [2.0, 6.0]
+    assert [r.name for r in (objectives.error_below(0.01, after=1.0) + both).requirements] == [
+        "|e1| < 0.01 rad after 1 s",
+        "margin > 0.05 rad",
+    ]
+    np.testing.assert_allclose(both.values(jnp.array([1.0, 4.0, 0.0])), [2.0, 12.0])
+    assert float(both.excesses(jnp.array([1.0, 4.0, -0.06]))[0]) == pytest.approx(-0.2)
+    with pytest.raises(ValueError, match="an objective or a requirement"):
+        objectives.tracking() + 3
+
+
+def test_risks():
+    losses = jnp.arange(10.0)
+    assert float(combine(Risk("mean"), losses)) == 4.5
+    assert float(combine(Risk("worst"), losses)) == 9.0
+    assert float(combine(ij.cvar(0.8), losses)) == 8.5
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        ij.cvar(1.0)
+
+
+# ---------------------------------------------------------------------------------------------------------------- coordinates
+
+
+def test_bijections_keep_inside_and_invert():
+    box = Box(np.zeros(4), np.array([-1.0, 0.0, -np.inf, -np.inf]), np.array([2.0, np.inf, 3.0, np.inf]))
+    z = np.array([0.5, 0.7, 1.0, -5.0])
+    np.testing.assert_allclose(squash(jnp.asarray(unsquash(z, box)), box), z, rtol=1e-12)
+    for w in (-50.0, 50.0):
+        inside = np.asarray(squash(jnp.full(4, w), box))
+        assert np.all(inside >= box.low)
+        assert np.all(inside <= box.high)
+
+
+def test_default_limits_keep_the_conditions_and_the_step(paper):
+    blocks, box = layout(canonical(paper), [*GAINS, ij.tunable("controller.o", tied=True)], 1e-3, "rk4")
+    low, high = np.exp(box.low), np.exp(box.high)
+    assert [b.path for b in blocks] == [*GAINS, "controller.o"]
+    assert blocks[-1].size == 1
+    assert np.all(low[:2] > 0)
+    assert np.all(low[2:4] > 0.5)
+    assert np.all(low[4:6] > 1.0)
+    run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
+    assert run.ok
+    assert 1e-3 * float(run.fastest_mode) > 1.2
+    with pytest.raises(ValueError, match="do not overlap"):
+        layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
+    with pytest.raises(ValueError, match="Widen the limits"):
+        layout(canonical(paper), [ij.tunable("controller.k1", 3.0, 4.0)], 1e-3, "rk4")
+
+
+def test_box_step_solves_the_quadratic_programme():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        A = rng.normal(size=(5, 5))
+        B, g = A @ A.T + 0.1 * np.eye(5), rng.normal(size=5)
+        step, drop = box_step(g, B, np.full(5, -0.3), np.full(5, 0.5))
+        slope = g + B @ step
+        free = (step > -0.3 + 1e-9) & (step < 0.5 - 1e-9)
+        assert np.all(np.abs(slope[free]) < 1e-8)
+        assert np.all(slope[step <= -0.3 + 1e-9] > -1e-8)
+        assert drop > 0
+
+
+# ---------------------------------------------------------------------------------------------------------------- the loop
+
+
+def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
+    parameters = [ij.tunable("controller.k1", 0.1, 100), ij.tunable("controller.K2", 0.6, 40), ij.tunable("observer.kf", 1.01, 100)]
+    best = ij.tune(paper, parameters, objective(), iterations=25, **SHORT)
+    first = best.history["objective"][0, 0]
+    assert best.objective < 0.75 * first
+    x = best.history["x"]
+    assert np.all(x[..., 2:4] >= 0.6 - 1e-12)
+    assert np.all(x[..., 0:2] <= 100 + 1e-9)
+    np.testing.assert_allclose(best.values["controller.K2"], np.asarray(best.scenario.controller.K2))
+    assert "one nominal run" in str(best.report)
+    assert best.report.improved
+    again = ij.simulate(best.scenario, metrics=STANDARD, **SHORT).metrics
+    before = ij.simulate(paper, metrics=STANDARD, **SHORT).metrics
+    assert best.report.changes[1].after == pytest.approx(float(again.ise.sum() / before.ise.sum()), rel=1e-9)
+
+
+def test_an_infeasible_start_finds_its_way_in(paper):
+    weak = ij.with_parameters(paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]})
+    assert int(plain_status(weak)) & ij.Status.BOUND_VIOLATED
+    wanted = objectives.effort() + objectives.margin_above(0.06) + objectives.violation_probability_below(0.01)
+    best = ij.tune(weak, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    assert int(plain_status(best.scenario)) & ij.Status.BOUND_VIOLATED == 0
+    assert best.report.passed, best.report
+    assert best.report.margin[0] < 0 < 0.06 < best.report.margin[1]
+
+
+def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
+    """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just so."""
+    wanted = objectives.tracking() + objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
+    assert 11.0 < float(np.max(ij.simulate(best.scenario, metrics=STANDARD, **SHORT).metrics.peak_torque)) < 12.0
+
+
+def plain_status(scenario):
+    return jax.jit(lambda s: plain_run(s, STANDARD, jnp.asarray(1e-3), steps=300, record_every=None, method="euler").status)(scenario)
+
+
+class Cliff:
+    """An evaluator whose loss is not finite beyond z = 1, where it would go on falling."""
+
+    def __call__(self, z):
+        loss = np.where(z[:, 0] > 1, np.nan, -z[:, 0])
+        sound = np.isfinite(loss)
+        value = problem.Value(np.where(sound, loss, np.inf), loss, loss[:, None], z[:, :0], z[:, :0], loss, sound)
+        return problem.Slope(value, np.where(sound[:, None], -np.ones_like(z), np.nan), np.zeros((len(z), 1, 1)))
+
+
+@pytest.mark.parametrize("name", ["newton", "adam"])
+def test_steps_that_are_not_finite_are_rejected(name):
+    box = Box(np.zeros(1), np.array([-1.0]), np.array([3.0]))
+    method = _tune.make_method(name, box, 60, 1e-6, 0.5)
+    state, reached = method.init(np.zeros((1, 1))), -np.inf
+    for _ in range(60):
+        z, found = method.step(Cliff(), state)
+        assert np.all(np.isfinite(z))
+        reached = max(reached, z[0, 0]) if found.value.sound[0] else reached
+    assert 0.9 < reached <= 1.0
+
+
+def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
+    stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
+    assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["sound"].all()
+    with pytest.raises(ValueError, match="Take a smaller dt"):
+        ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
+
+
+# ---------------------------------------------------------------------------------------------------------------- robust
+
+
+@pytest.fixture(scope="module")
+def robust(paper):
+    return ij.tune(
+        paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=8, risk=ij.cvar(0.75), iterations=8, report_runs=256, **SHORT
+    )
+
+
+def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
+    report = robust.report
+    assert report.runs == 256
+    assert report.seed != robust.setup.seed
+    change = report.changes[0]
+    assert change.name == "objective (cvar 0.75)"
+    assert change.low < change.after - change.before < change.high < 0
+    assert "significant" in str(report)
+    assert "NOT" not in str(report.changes[0])
+    with pytest.raises(ValueError, match="fresh"):
+        robust.check(seed=robust.setup.seed)
+
+
+def test_a_change_that_is_not_significant_is_called_so(robust, paper):
+    from iblf_jax.tuning.report import make_report
+
+    report = make_report(paper, paper, robust.setup.objective, DRAWS, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=SHORT)
+    assert report.changes[0].significant is False
+    assert "NOT significant" in str(report)
+    assert "do not show that tuning helped" in str(report)
+    assert not report.improved
+
+
+def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
+    best = ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, starts=2, resample=True, iterations=3, **SHORT)
+    assert best.optimiser == "adam"
+    assert best.history["loss"].shape == (3, 2)
+    with pytest.raises(ValueError, match="adam"):
+        ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, resample=True, optimiser="newton", **SHORT)
+
+
+def test_common_random_numbers(paper):
+    """The same draws for every start and every step; other seeds give others."""
+    built = [_tune.build(paper, GAINS, objectives.tracking(), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
+    z = np.stack([built[0].box.z] * 2)
+    losses = [np.asarray(Evaluator(p.plan, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
+    assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
+
+
+# ---------------------------------------------------------------------------------------------------------------- resume
+
+KILLED = """
+import sys, jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np, iblf_jax as ij
+o = ij.objectives
+slow = (lambda loop: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
+best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11),
+               duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], callback=slow)
+np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best.values.items()})
+"""
+
+
+def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
+    env = {**os.environ, "JAX_COMPILATION_CACHE_DIR": os.environ.get("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))}
+    env |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "PYTHONPATH": str(Path(ij.__file__).parents[1])}
+
+    def start(checkpoint, pace, out):
+        return subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / checkpoint), pace, str(tmp_path / out)], env=env)
+
+    killed = start("a.npz", "slow", "never.npz")
+    deadline = time.monotonic() + 300
+    while not (tmp_path / "a.npz").exists():
+        assert killed.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(0.6)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    with np.load(tmp_path / "a.npz") as half:
+        assert 1 <= len(half["history_loss"]) < 12
+    assert start("a.npz", "fast", "resumed.npz").wait() == 0
+    assert start("b.npz", "fast", "whole.npz").wait() == 0
+    with np.load(tmp_path / "resumed.npz") as resumed, np.load(tmp_path / "whole.npz") as whole:
+        assert set(resumed.files) == set(whole.files)
+        for name in whole.files:
+            assert resumed[name].tobytes() == whole[name].tobytes(), name
+
+
+def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
+    file = tmp_path / "c.npz"
+    ij.tune(paper, GAINS, objective(), iterations=2, checkpoint=file, **SHORT)
+    with pytest.raises(ValueError, match="this very problem"):
+        ij.tune(paper, GAINS, 2 * objective(), iterations=2, checkpoint=file, **SHORT)

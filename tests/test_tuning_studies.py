@@ -1,0 +1,120 @@
+"""Fronts, attacks on tuned gains, saved results, the command line and the figures of tuning."""
+
+import jax
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.paths import get
+from iblf_jax.tuning._pareto import non_dominated
+
+jax.config.update("jax_enable_x64", True)
+
+SHORT = {"duration": 0.3, "dt": 1e-3, "method": "euler"}
+SETS = {
+    "plant.mass[1]": ij.factor(ij.uniform(0.5, 1.5)),
+    "initial.q": ij.offset(ij.uniform(-0.05, 0.02)),
+    "initial.dq": ij.value(ij.uniform(-3.0, 3.0)),
+    "disturbance.acceleration_amplitude": ij.value(ij.uniform(-20.0, 20.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return ij.presets.zhang_yan_2024()
+
+
+def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
+    attack = ij.falsify(paper, SETS, starts=4, iterations=8, **SHORT)
+    budget = 6 * attack.runs  # a value with its derivatives costs less than six values
+    study = ij.monte_carlo(paper, SETS, runs=budget, seed=1, progress=False, **SHORT)
+    assert attack.margin < float(np.min(study.metrics.margin))
+    assert attack.margin < attack.first_margin
+    assert attack.margin == pytest.approx(float(np.min(attack.replay().metrics.margin)), abs=1e-9)
+    for path, perturbation in SETS.items():
+        low, high = perturbation.range(np.asarray(get(paper, path)))
+        assert np.all(attack.values[path] >= low - 1e-9)
+        assert np.all(attack.values[path] <= high + 1e-9)
+    with pytest.raises(ValueError, match="bounded"):
+        ij.falsify(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.01))}, **SHORT)
+
+
+def test_pareto_is_a_front(paper):
+    pair = (ij.objectives.tracking(), ij.objectives.effort())
+    front = ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, iterations=10, **SHORT)
+    a, b = front.objectives.T
+    assert len(front) >= 4
+    assert np.all(np.diff(a) > 0)
+    assert np.all(np.diff(b) < 0)
+    assert not np.any(np.all(front.tried[:, None] < front.objectives[None] - 1e-12, axis=-1))
+    assert a[0] < front.first[0]
+    assert b[-1] < front.first[1]
+    again = ij.simulate(front.scenario(0), **SHORT).metrics.ise.sum() / ij.simulate(paper, **SHORT).metrics.ise.sum()
+    assert float(again) == pytest.approx(a[0], rel=1e-9)
+    with pytest.raises(ValueError, match="one plain term"):
+        ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.peak_torque()), **SHORT)
+
+
+def test_non_dominated():
+    points = np.array([[1.0, 5.0], [2.0, 4.0], [2.0, 3.0], [3.0, 3.5], [4.0, 1.0]])
+    assert non_dominated(points).tolist() == [0, 2, 4]
+
+
+TUNING = """
+preset = "zhang_yan_2024"
+[run]
+duration = 0.3
+method = "euler"
+[tune]
+parameters = ["controller.k1", { path = "controller.K2", low = 0.6, high = 30.0, tied = true }]
+iterations = 4
+runs = 4
+report_runs = 64
+risk = "cvar"
+level = 0.75
+[[objective]]
+kind = "tracking"
+[[objective]]
+kind = "peak_torque"
+weight = 0.5
+[[requirement]]
+kind = "margin_above"
+limit = 0.02
+[perturbations]
+"plant.mass[1]" = { factor = { uniform = [0.7, 1.3] } }
+"""
+
+
+def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_path, capsys):
+    from iblf_jax.cli import main
+
+    file = tmp_path / "tune.toml"
+    file.write_text(TUNING)
+    assert main(["tune", str(file), "--out", str(tmp_path / "out"), "--quiet"]) in (0, 1)
+    text = capsys.readouterr().out
+    assert "requirement margin > 0.02 rad" in text
+    assert "fresh runs" in text
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"scenario.toml", "tuning.json", "report.txt", "tuning.png"}
+    loaded = ij.load_tuning(tmp_path / "out" / "tuning.json")
+    assert str(loaded.report) in text
+    tuned = ij.load_scenario(tmp_path / "out" / "scenario.toml")
+    np.testing.assert_array_equal(tuned.controller.K2, loaded.scenario.controller.K2)
+    assert loaded.values["controller.K2"].shape == (2,)
+    assert loaded.names[-1] == "controller.K2"
+    file.write_text(TUNING.replace("margin_above", "margin_abve"))
+    assert main(["tune", str(file), "--quiet"]) == 2
+    assert "requirement[0].kind" in capsys.readouterr().err
+
+
+def test_figures(paper):
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT)
+    figure = best.plot(points=3)
+    assert len(figure.axes) == 6
+    a, b, loss = best.landscape("controller.k1[0]", "controller.K2[1]", points=3, span=0.2)
+    assert loss[1, 1] == pytest.approx(best.report.changes[0].after, rel=1e-9)
+    assert a[1] == best.tuned[0]
+    assert b[1] == best.tuned[3]
+    with pytest.raises(ValueError, match="landscape"):
+        best.landscape("controller.k1[0]", "controller.o[0]")
+    front = ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.effort()), points=2, iterations=2, **SHORT)
+    assert front.plot().axes
