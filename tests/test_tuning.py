@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.metrics import STANDARD
+from iblf_jax.metrics import standard
 from iblf_jax.rollout import run as plain_run
 from iblf_jax.rollout import start
 from iblf_jax.scenario import canonical
@@ -215,8 +215,8 @@ def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
     np.testing.assert_allclose(best.values["controller.K2"], np.asarray(best.scenario.controller.K2))
     assert "one nominal run" in str(best.report)
     assert best.report.improved
-    again = ij.simulate(best.scenario, metrics=STANDARD, **SHORT).metrics
-    before = ij.simulate(paper, metrics=STANDARD, **SHORT).metrics
+    again = ij.simulate(best.scenario, metrics=standard(), **SHORT).metrics
+    before = ij.simulate(paper, metrics=standard(), **SHORT).metrics
     assert best.report.changes[1].after == pytest.approx(float(again.ise.sum() / before.ise.sum()), rel=1e-9)
 
 
@@ -235,11 +235,11 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
     wanted = objectives.tracking() + objectives.peak_torque_below(12.0)
     best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
-    assert 11.0 < float(np.max(ij.simulate(best.scenario, metrics=STANDARD, **SHORT).metrics.peak_torque)) < 12.0
+    assert 11.0 < float(np.max(ij.simulate(best.scenario, metrics=standard(), **SHORT).metrics.peak_torque)) < 12.0
 
 
 def plain_status(scenario):
-    return jax.jit(lambda s: plain_run(s, STANDARD, jnp.asarray(1e-3), steps=300, record_every=None, method="euler").status)(scenario)
+    return jax.jit(lambda s: plain_run(s, standard(), jnp.asarray(1e-3), steps=300, record_every=None, method="euler").status)(scenario)
 
 
 class Cliff:
