@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -113,7 +114,7 @@ def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str =
     return dataclasses.replace(scenario, bounds=bounds_.Bounds(lower=lower, upper=upper))
 
 
-PRESETS = {
+PRESETS: dict[str, Callable[..., Scenario]] = {
     "zhang_yan_2024": zhang_yan_2024,
     "zhang_yan_2024_saturated": zhang_yan_2024_saturated,
     "zhang_yan_2024_funnel": zhang_yan_2024_funnel,
