@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
 
 
 def zhang_yan_2024_saturated(
-    *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (7.2, 1.5), kind: str = "hard"
+    *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (7.2, 1.5), edge: str = "hard"
 ) -> Scenario:
     """The paper's simulation with a torque limit below the peak that the law asks for (13.8, 16.3 N m).
 
@@ -112,15 +113,15 @@ def zhang_yan_2024_saturated(
     Args:
       law, reading: as `zhang_yan_2024`.
       limit: largest torque, one number or one a joint [N m].
-      kind: "hard", or "smooth" for gradients.
+      edge: "hard", or "smooth" for gradients.
 
     Raises:
-      ValueError: an unknown law, reading or kind; a limit that is not positive.
+      ValueError: an unknown law, reading or edge; a limit that is not positive.
 
     Source: this package; the paper leaves saturation to future work.
     """
     scenario = zhang_yan_2024(law=law, reading=reading)
-    return dataclasses.replace(scenario, controller=Saturated(law=scenario.controller, limit=limit, kind=kind))
+    return dataclasses.replace(scenario, controller=Saturated(law=scenario.controller, limit=limit, edge=edge))
 
 
 def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str = "corrected") -> Scenario:
@@ -144,7 +145,7 @@ def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str =
     return dataclasses.replace(scenario, bounds=bounds_.Bounds(lower=lower, upper=upper))
 
 
-PRESETS = {
+PRESETS: dict[str, Callable[..., Scenario]] = {
     "zhang_yan_2024": zhang_yan_2024,
     "printed_gap": printed_gap,
     "zhang_yan_2024_saturated": zhang_yan_2024_saturated,

@@ -45,6 +45,11 @@ BARRIERS = {
     "integral_wide_guard": barriers.Integral(guard=0.05),
     "log": barriers.Log(),
     "log_p3": barriers.Log(p=3),
+    "tan": barriers.Tan(),
+    "state": barriers.State(),
+    "prescribed_performance": barriers.PrescribedPerformance(),
+    "mapping": barriers.Mapping(),
+    "quadratic": barriers.Quadratic(),
 }
 
 OBSERVERS = {
@@ -52,14 +57,21 @@ OBSERVERS = {
     "printed": observers.Printed(kf=[20.0, 10.0]),
     "printed_matched": observers.Printed(kf=20.0, eta0=[0.1, -0.2], start="matched"),
     "momentum": observers.Momentum(kf=[20.0, 10.0]),
+    "extended_state": observers.ExtendedState(bandwidth=[40.0, 30.0]),
+    "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
 }
 
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"),
+    "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
+    "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=[10.0, 12.0]),
+    "pd_gravity": controllers.PDGravity(Kp=60.0, Kd=[20.0, 10.0]),
+    "saturated": controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]),
+    "saturated_smooth": controllers.Saturated(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"),
 }
 
-FOLDS = {type(fold).__name__: fold for fold in metrics.standard()}
+FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), metrics.AboveGravity())}
 
 FAMILIES = {
     "robot": (ROBOTS, robots.MEMBERS, ij.testing.check_robot),

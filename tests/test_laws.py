@@ -58,33 +58,63 @@ def test_the_funnel_is_kept_by_its_own_law():
     assert bool(jnp.all(tubes[0].upper <= tubes[1].upper))
 
 
+NO_DISTURBANCE = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
+# Other values in the same structure: nothing compiles anew.
+
+
+def walls(lower, upper):
+    return {"bounds.lower.offset": lower, "bounds.upper.offset": upper, "bounds.lower.amplitude": 0.0, "bounds.upper.amplitude": 0.0}
+
+
 def test_computed_torque_gives_the_error_equation_that_it_promises():
-    scenario = ij.presets.zhang_yan_2024(law="computed_torque")
-    scenario = dataclasses.replace(scenario, disturbance=ij.disturbances.Nothing(), observer=observers.NoObserver())
-    run = ij.simulate(scenario, duration=2.0, dt=1e-3)
+    blind = NO_DISTURBANCE | {"observer.kf": 1e-12}
+    run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="computed_torque"), blind), **PAPER)
     w, t = 5.0, run.t[:, None]  # Kp = 25, Kd = 10: double pole at -5
     e0, de0 = run.e1[0], run.dq[0] - run.dq_d[0]
     np.testing.assert_allclose(run.e1, (e0 + (de0 + w * e0) * t) * jnp.exp(-w * t), atol=1e-9)
 
 
 def test_pd_holds_a_reference_at_rest():
-    scenario = ij.presets.zhang_yan_2024(law="pd")
-    rest = ij.references.Sinusoid(offset=[0.5, 0.6], amplitude=0.0)
-    walls = ij.bounds.Bounds(ij.bounds.Constant(0.1), ij.bounds.Constant(1.0))
-    scenario = dataclasses.replace(scenario, reference=rest, bounds=walls, disturbance=ij.disturbances.Nothing())
-    run = ij.simulate(scenario, duration=8.0, dt=1e-3)
+    rest = NO_DISTURBANCE | walls(0.1, 1.0) | {"reference.offset": [0.5, 0.6], "reference.amplitude": 0.0}
+    run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="pd"), rest), **PAPER)
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 1e-8
-    np.testing.assert_allclose(run.tau[-1], scenario.model.gravity(run.q[-1]), atol=1e-6)
+    np.testing.assert_allclose(run.tau[-1], run.scenario.model.gravity(run.q[-1]), atol=1e-6)
 
 
-def test_backstepping_without_barrier_is_the_limit_of_the_state_barrier():
-    wide = ij.bounds.Bounds(ij.bounds.Constant(-1e5), ij.bounds.Constant(1e5 + 1.0))
-    runs = [
-        ij.simulate(dataclasses.replace(ij.presets.zhang_yan_2024(law=law), bounds=wide), duration=1.0, dt=1e-3)
-        for law in ("backstepping", "state", "mapping")
-    ]
+def test_backstepping_without_barrier_is_the_limit_of_state_and_mapping():
+    wide = walls(-1e5, 1e5 + 1.0)
+    laws = ("backstepping", "state", "mapping")
+    runs = [ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law=law), wide), **PAPER) for law in laws]
     for run in runs[1:]:
         np.testing.assert_allclose(run.q, runs[0].q, atol=2e-5)
+
+
+@pytest.mark.parametrize("law", ij.presets.LAWS)
+def test_every_system_goes_through_a_scenario_file(law, tmp_path):
+    scenario = ij.presets.zhang_yan_2024(law=law, reading="corrected")
+    limited = controllers.Saturated(law=scenario.controller, limit=[7.2, 1.5], edge="smooth")
+    scenario = dataclasses.replace(scenario, controller=limited, observer=observers.ExtendedState(bandwidth=30.0))
+    ij.save_scenario(scenario, tmp_path / "scenario.toml")
+    again = ij.load_scenario(tmp_path / "scenario.toml")
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    jax.tree.map(np.testing.assert_array_equal, again, scenario)
+
+
+@pytest.mark.parametrize("law", ij.presets.LAWS)
+def test_a_start_at_the_wall_stays_finite_in_float32(law):
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(law=law), {"initial.q": [1.0399, 0.8999], "initial.dq": 1.0})
+    scenario = ij.astype(scenario, "float32")
+
+    def speed(scenario):
+        state = initial_state(scenario)
+        return evaluate(scenario, jnp.zeros((), jnp.float32), state)
+
+    (slope, sample), tangent = jax.jit(lambda s: jax.jvp(speed, (s,), (jax.tree.map(jnp.ones_like, s),)))(scenario)
+    for part in jax.tree.leaves((slope, sample, tangent)):
+        assert part.dtype in (jnp.float32, bool, jax.dtypes.float0)
+        assert part.dtype == jax.dtypes.float0 or bool(jnp.all(jnp.isfinite(part)))
+    if law not in ("backstepping", "computed_torque", "pd"):
+        assert bool(jnp.all(sample.tau < 0))
 
 
 # ------------------------------------------------------------------------------------------------------------- adaptive RBF
@@ -102,10 +132,8 @@ def test_adaptive_weights_stay_below_their_bound():
 
 
 def test_adaptive_weights_are_bounded_under_a_large_disturbance():
-    scenario = ij.presets.zhang_yan_2024(law="adaptive_rbf")
-    push = ij.disturbances.Sinusoids(amplitude=[8.0, 3.0], frequency=5.0)
-    strong = dataclasses.replace(scenario, disturbance=push, controller=controllers.AdaptiveRBF(k1=2.0, K2=20.0, sigma=0.5))
-    run = ij.simulate(strong, **PAPER)
+    strong = {"disturbance.acceleration_amplitude": 20.0, "disturbance.acceleration_frequency": 5.0, "controller.sigma": 0.5}
+    run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="adaptive_rbf"), strong), **PAPER)
     norms = jnp.sqrt(jnp.sum(run.controller_state**2, axis=1))
     assert bool(jnp.all(norms <= 8.0 * jnp.max(jnp.abs(run.e2), axis=0) / 0.5))
 
@@ -200,13 +228,13 @@ def test_a_limit_below_gravity_keeps_nothing(saturated_runs):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_smooth_limit(dtype):
-    scenario = ij.astype(ij.presets.zhang_yan_2024_saturated(kind="smooth"), dtype)
+    scenario = ij.astype(ij.presets.zhang_yan_2024_saturated(edge="smooth"), dtype)
     law = scenario.controller
     tau = jnp.asarray([0.0, 1e-30, 0.5, 0.999, 1.0, 1.001, 2.0, 1e8, 1e30], dtype)
 
     def limited(x):
         fixed = _Fixed(tau=jnp.stack([x, -x]))
-        wrapped = controllers.Saturated(law=fixed, limit=jnp.ones(2, dtype), kind="smooth")
+        wrapped = controllers.Saturated(law=fixed, limit=jnp.ones(2, dtype), edge="smooth")
         return wrapped.command(jnp.zeros((), dtype), Q.astype(dtype), DQ.astype(dtype), jnp.zeros(2, dtype), scenario.setting, ())[0].tau
 
     value, slope = jax.vmap(limited)(tau), jax.vmap(jax.jacfwd(limited))(tau)
@@ -217,7 +245,7 @@ def test_smooth_limit(dtype):
     np.testing.assert_allclose(slope[:, 0], ((1 + np.asarray(tau, np.longdouble) ** 8) ** -1.125).astype(float), rtol=1e-5, atol=1e-30)
     assert bool(jnp.all(jnp.isfinite(jax.vmap(jax.jacrev(limited))(tau))))
     assert bool(jnp.all(jnp.abs(value) <= 1.0))
-    assert law.kind == "smooth"
+    assert law.edge == "smooth"
 
 
 @ij.component
@@ -256,7 +284,7 @@ def test_paths_reach_through_a_wrapper():
 
 def test_a_wrapper_in_a_wrapper_keeps_both_fields_apart():
     scenario = ij.presets.zhang_yan_2024_saturated()
-    twice = dataclasses.replace(scenario, controller=controllers.Saturated(law=scenario.controller, limit=50.0, kind="smooth"))
+    twice = dataclasses.replace(scenario, controller=controllers.Saturated(law=scenario.controller, limit=50.0, edge="smooth"))
     values = {p.path: p.value for p in ij.parameters(twice)}
     np.testing.assert_array_equal(values["controller.limit"], [50.0, 50.0])
     np.testing.assert_array_equal(values["controller.law.limit"], [7.2, 1.5])
@@ -284,7 +312,7 @@ def test_new_limits_and_gains_do_not_recompile():
 def test_saturation_says_what_is_wrong():
     law = controllers.PDGravity(Kp=1.0, Kd=1.0)
     with pytest.raises(ValueError, match="hard"):
-        controllers.Saturated(law=law, limit=1.0, kind="soft")
+        controllers.Saturated(law=law, limit=1.0, edge="soft")
     with pytest.raises(ValueError, match="> 0"):
         controllers.Saturated(law=law, limit=0.0)
     with pytest.raises(ValueError, match=r"Saturated\.law"):
@@ -318,14 +346,15 @@ def test_extended_state_observer_obeys_its_error_equation():
 def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_forms():
     scenario = ij.presets.zhang_yan_2024(reading="corrected")
     push = ij.disturbances.Sinusoids(amplitude=0.0, frequency=1.0, offset=[1.0, -0.5])
-    runs = [
-        ij.simulate(dataclasses.replace(scenario, disturbance=push, observer=observer), duration=2.0, dt=1e-3)
-        for observer in (observers.ExtendedState(bandwidth=40.0), observers.ExtendedState(l1=80.0, l2=1600.0))
-    ]
-    np.testing.assert_allclose(runs[0].disturbance_estimate[-1], [1.0, -0.5], atol=1e-8)
-    np.testing.assert_allclose(runs[0].q, runs[1].q, rtol=1e-12)
-    assert "observer.bandwidth" in [p.path for p in ij.parameters(runs[0].scenario)]
-    assert "observer.l2" in [p.path for p in ij.parameters(runs[1].scenario)]
+    forms = [observers.ExtendedState(bandwidth=40.0), observers.ExtendedState(l1=80.0, l2=1600.0)]
+    one, other = (dataclasses.replace(scenario, disturbance=push, observer=form) for form in forms)
+    run = ij.simulate(one, duration=2.0, dt=1e-3)
+    np.testing.assert_allclose(run.disturbance_estimate[-1], [1.0, -0.5], atol=1e-8)
+    states = [initial_state(s)._replace(observer=observers.extended_state.ExtendedStateValues(Q, DQ)) for s in (one, other)]
+    rates = [rate(s, jnp.zeros(()), state) for s, state in zip((one, other), states, strict=True)]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), *rates)
+    assert "observer.bandwidth" in [p.path for p in ij.parameters(one)]
+    assert "observer.l2" in [p.path for p in ij.parameters(other)]
     for wrong in ({}, {"l1": 1.0}, {"bandwidth": 1.0, "l1": 1.0, "l2": 1.0}):
         with pytest.raises(ValueError, match="bandwidth"):
             observers.ExtendedState(**wrong)

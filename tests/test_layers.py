@@ -1,7 +1,7 @@
 """The layers of the package, held by its imports: they go down only.
 
     6 outside     presets  scenario_file  io  codec  plain  plotting/  cli/  testing/
-    5 studies     _monte_carlo  _sweep  tuning/
+    5 studies     _compare  _comparison  _monte_carlo  _sweep  tuning/
     4 judgement   certificates
     3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  rollout  lowering/
     2 the law     barriers/  observers/  controllers/
@@ -28,7 +28,7 @@ LAYERS = {
     2: ("barriers", "observers", "controllers"),
     3: ("integrators", "scenario", "closed_loop", "stability", "metrics", "results", "paths", "rollout", "lowering"),
     4: ("certificates",),
-    5: ("_monte_carlo", "_sweep", "tuning"),
+    5: ("_compare", "_comparison", "_monte_carlo", "_sweep", "tuning"),
     6: ("presets", "scenario_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
 }
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}

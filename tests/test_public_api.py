@@ -15,7 +15,7 @@ import iblf_jax as ij
 PROMISED = [
     *("simulate", "recommended_dt", "Scenario", "Initial", "Rollout", "Metrics", "Status", "SimulationError", "SimulationWarning"),
     *("parameters", "with_parameters", "astype", "component", "leaf", "static", "robots", "references", "bounds", "disturbances"),
-    *("barriers", "observers", "controllers", "metrics", "presets", "testing"),
+    *("compare", "Comparison", "barriers", "observers", "controllers", "metrics", "presets", "testing"),
 ]
 
 HEAVY = ("matplotlib", "optax", "xarray", "pandas", "scipy", "zarr", "tqdm", "mujoco", "IPython", "hypothesis")
@@ -71,7 +71,7 @@ def test_all_lists_what_exists(module):
 
 
 def test_entry_points_document_arguments_returns_and_errors():
-    for function in (ij.simulate, ij.with_parameters):
+    for function in (ij.simulate, ij.with_parameters, ij.compare):
         for part in ("Args:", "Returns:", "Raises:"):
             assert part in function.__doc__, (function.__name__, part)
         for name in inspect.signature(function).parameters:

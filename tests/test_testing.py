@@ -132,8 +132,11 @@ def test_an_undeclared_jump_is_found():
         ({"value": lambda self, tube, q: -jnp.log(1 - tube.xi(q) ** 2)}, ("value is not finite at xi",)),
         ({"virtual_velocity": lambda self, tube, q, k1, o: tube.dq_d + k1 * (q - tube.q_d)}, ("V1 grows",)),
         ({"virtual_velocity": lambda self, tube, q, k1, o: tube.dq_d - k1 * (q - tube.q_d)[::-1]}, ("virtual_velocity mixes joints",)),
+        ({"decay_rate": lambda self, k1: 10.0 * k1}, ("decay_rate V1 reaches", "Claim a smaller rate")),
+        ({"decay_rate": lambda self, k1: k1[0]}, ("decay_rate(k1) has shape ()",)),
+        ({"xi_bound": lambda self, V, tube: 0.5 * ij.barriers.Integral.xi_bound(self, V, tube)}, ("beyond xi_bound",)),
     ],
-    ids=["outward", "no-guard", "wrong-sign", "mixed"],
+    ids=["outward", "no-guard", "wrong-sign", "mixed", "rate-too-large", "rate-of-no-joint", "bound-too-small"],
 )
 def test_broken_barriers(methods, words):
     rejects(ij.testing.check_barrier, changed(ij.barriers.Integral, uses_o=True, **methods)(), *words)

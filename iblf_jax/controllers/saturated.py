@@ -15,7 +15,7 @@ from iblf_jax import checks
 from iblf_jax.controllers._base import Command, Controller, Setting, State
 from iblf_jax.pytree import Leaf, component, leaf, static
 
-KINDS = ("hard", "smooth")
+EDGES = ("hard", "smooth")
 SHARPNESS = 8
 """Even exponent of the smooth limit: at half the limit it takes off 0.05 %, at the limit 8 %."""
 
@@ -31,13 +31,13 @@ class Saturated:
     law: Controller
     limit: Leaf = leaf("N m", sign="positive")
     """Largest torque of each joint."""
-    kind: str = static(default="hard")
+    edge: str = static(default="hard")
     wraps: ClassVar[str] = "law"
 
     def check(self) -> None:
-        """Raises ValueError for something that is not a law, or an unknown kind."""
+        """Raises ValueError for something that is not a law, or an unknown edge."""
         checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
-        checks.one_of("Saturated.kind", self.kind, KINDS)
+        checks.one_of("Saturated.edge", self.edge, EDGES)
 
     def advice(self) -> list[str]:
         """The wrapped law's."""
@@ -51,7 +51,7 @@ class Saturated:
         """The wrapped law's command with its torque limited; `saturated` says where it asked for more than the limit."""
         command, rate = self.law.command(t, q, dq, f_hat, setting, state)
         asked = command.tau
-        tau = jnp.clip(asked, -self.limit, self.limit) if self.kind == "hard" else self.limit * _smooth_clip(asked / self.limit)
+        tau = jnp.clip(asked, -self.limit, self.limit) if self.edge == "hard" else self.limit * _smooth_clip(asked / self.limit)
         return command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)), rate
 
 

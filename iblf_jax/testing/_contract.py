@@ -51,12 +51,12 @@ class Findings:
 
 
 @contextmanager
-def examine(member: Any, family: str, protocol: type) -> Iterator[Findings]:
-    """Float64 inside, the findings raised at the end; stops at once if the object cannot be looked at any further."""
+def examine(member: Any, family: str, protocol: type, optional: tuple[str, ...] = ()) -> Iterator[Findings]:
+    """Float64 inside, the findings raised at the end; stops at once if the object lacks anything but what is optional."""
     findings = Findings(member, family)
     with jax.enable_x64(True):
         _is_component(findings, member)
-        _has_members(findings, member, protocol)
+        _has_members(findings, member, protocol, optional)
         findings.stop_if_any()
         yield findings
     findings.stop_if_any()
@@ -85,9 +85,9 @@ def _is_component(findings: Findings, member: Any) -> None:
         findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", mend)
 
 
-def _has_members(findings: Findings, member: Any, protocol: type) -> None:
+def _has_members(findings: Findings, member: Any, protocol: type, optional: tuple[str, ...]) -> None:
     for name, value in vars(protocol).items():
-        if name.startswith("_"):
+        if name.startswith("_") or name in optional:
             continue
         if not hasattr(member, name):
             text = (inspect.getdoc(value) or "").split("\n")[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.barriers import Barrier
+from iblf_jax.barriers._base import CLAIMS
 from iblf_jax.bounds import Tube
 from iblf_jax.presets import zhang_yan_2024
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
@@ -22,7 +24,8 @@ TIMES = (0.0, 1.0, 2.5, 4.0)
 def check_barrier(barrier: Any) -> None:
     """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays along alpha.
 
-        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the wall
+        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the wall,
+        s alpha + dV1/dt <= -decay_rate V1,   |xi| <= xi_bound(V1), where it claims them
 
     Args:
       barrier: an instance.
@@ -30,9 +33,10 @@ def check_barrier(barrier: Any) -> None:
     Raises:
       ContractError: lists what does not hold, with the mend.
     """
-    with examine(barrier, "Barrier", Barrier) as findings:
+    with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
         guard, uses_o = barrier.guard, barrier.uses_o
-        findings.require(isinstance(guard, float) and 0 < guard < 1, f"guard is {guard!r}", "It must be a static float between 0 and 1")
+        mend = "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
+        findings.require(isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf), f"guard is {guard!r}", mend)
         findings.require(isinstance(uses_o, bool), f"uses_o is {uses_o!r}", "It must be a bool of the class, uses_o: ClassVar[bool]")
         findings.stop_if_any()
         barrier = in_dtype(barrier, "float64")
@@ -51,10 +55,12 @@ def check_barrier(barrier: Any) -> None:
             return dict(zip(calls, named, strict=True))
 
         probe(findings, outputs, barrier, (tube, q, k1, o))
+        _joints_apart(findings, barrier, tube, q, k1, o)
         for t in TIMES:
             tube = setting.tube(jnp.asarray(t))
-            _at_every_xi(findings, _numbers(barrier, setting, jnp.asarray(t), k1, o, jnp.asarray(XI)), guard)
-        _joints_apart(findings, barrier, tube, q, k1, o)
+            numbers = _numbers(barrier, setting, jnp.asarray(t), k1, o, jnp.asarray(XI))
+            _at_every_xi(findings, numbers, guard)
+            _claims(findings, barrier, tube, k1, numbers, guard)
 
 
 @jax.jit
@@ -115,6 +121,22 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     inside = np.abs(xi) < 1 - 2 * guard
     growth = float(np.max(got["decay"][inside]))
     findings.require(growth <= 1e-9, f"V1 grows at rate {growth:.3g} along q' = alpha", "alpha must make slope . alpha + dV1/dt negative")
+
+
+def _claims(findings: Findings, barrier: Any, tube: Tube, k1: jax.Array, numbers: dict[str, jax.Array], guard: float) -> None:
+    """What the barrier promises of V1, if it promises anything."""
+    xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "V1", "decay"))
+    inside = np.abs(xi) < min(1 - 2 * guard, 1.0)
+    rate = getattr(barrier, "decay_rate", lambda k1: None)(k1)
+    if rate is not None:
+        has_shape(findings, "decay_rate(k1)", rate, (2,))
+        excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
+        findings.require(excess <= 1e-9, f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha", "Claim a smaller rate, or None")
+    bound = getattr(barrier, "xi_bound", lambda V, tube: None)
+    if bound(jnp.asarray(V1[0]), tube) is not None:
+        claimed = np.asarray(jax.vmap(lambda V: bound(V, tube))(jnp.asarray(V1)))
+        kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]
+        findings.require(np.all(kept), "|xi| is beyond xi_bound(V1, tube)", "It must hold wherever V1 <= V; return None for no claim")
 
 
 def _joints_apart(findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any) -> None:

@@ -57,7 +57,7 @@ def samples(rng: np.random.Generator) -> Sample:
         return size * np.sin(8 * (1 + speed) * t[:, None] + phase) + rng.uniform(-0.1, 0.1, (LENGTH, 2)) * size
 
     q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
-    numbers = {name: wave(1.0) for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate")}
+    numbers = {name: wave(1.0) for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")}
     sides = {"lower": np.full((LENGTH, 2), 0.2), "upper": np.full((LENGTH, 2), 0.85)}
     k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
     numbers |= sides | {"q": q_d + e1, "e1": e1, "xi": e1 / k, "q_d": q_d, "tau": tau, "V": np.abs(wave(1.0))[:, 0], "t": t, "dt": dt}
