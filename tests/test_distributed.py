@@ -32,7 +32,8 @@ def job(compiled, tmp_path, words, more=((), ()), devices="2"):
     """Starts two processes."""
     address = free_address()
     return [
-        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i]) for i in (0, 1)
+        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i])
+        for i in (0, 1)
     ]
 
 
