@@ -260,8 +260,9 @@ def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
     command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "sweep.zarr")]
     done = subprocess.run(command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
-    assert "StoreError" in done.stderr
+    assert "StoreWriteError" in done.stderr
     assert "no space left" in done.stderr
+    assert list(tmp_path.iterdir()) == [], "half a store was left behind"
 
 
 # -------------------------------------------------------------------------------------------------------- killed, interrupted
