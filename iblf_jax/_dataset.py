@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import xarray
 
 RUN = "run"
-DRAWN = "drawn "
+DRAWN = "drawn_"
 """Begins the name of a drawn parameter in flat data."""
 
 
@@ -84,8 +84,8 @@ def _coordinates(config: dict[str, Any]) -> dict[str, Any]:
             found[path] = (place["along"], values, attributes)
             continue
         if path == place["along"]:
-            found[path] = (path, np.arange(len(values)), {"description": f"number of the value, see '{path} values'"})
-            path = f"{path} values"
+            found[path] = (path, np.arange(len(values)), {"description": f"number of the value, see '{path}_values'"})
+            path = f"{path}_values"
         found[path] = ((place["along"], *own_dims(path, values.shape[1:], config["joints"])), values, attributes)
     return found
 

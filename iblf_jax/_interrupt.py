@@ -14,12 +14,13 @@ class Interrupted(KeyboardInterrupt):
 class CtrlC:
     """While this context is open, the first Ctrl-C only sets `asked`; the second one interrupts as usual.
 
-    Signals reach the main thread only; elsewhere this does nothing.
+    Signals reach the main thread only; elsewhere, and where somebody else handles or ignores them, this does nothing.
     """
 
     def __init__(self, active: bool = True):
         self.asked = False
-        self._active = active and threading.current_thread() is threading.main_thread()
+        ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        self._active = active and ours
 
     def __enter__(self) -> CtrlC:
         if self._active:

@@ -106,7 +106,6 @@ def to_xarray(study: Study) -> xarray.Dataset:
     import iblf_jax
 
     n = study.scenario.n
-    units = {p.path: p.unit for p in parameters(study.scenario)}
     variables: dict[str, Any] = {}
     for name, values in study.metrics.items():
         variables[name] = (
@@ -120,8 +119,7 @@ def to_xarray(study: Study) -> xarray.Dataset:
     variables["fastest_mode"] = ("run", study.fastest_mode, {"units": "1/s"})
     coordinates: dict[str, Any] = {"run": np.arange(study.runs)}
     for path, values in study.samples.items():
-        plain = path.replace("robot", "plant", 1) if path.startswith("robot") else path
-        unit = units.get(plain, units.get(plain.partition("[")[0], ""))
+        unit = study.parameter_unit(path)
         coordinates[path] = (
             ("run", *own_dims(path, values.shape[1:], n)),
             values,

@@ -162,6 +162,7 @@ def _variables(setup: Setup, config: dict[str, Any]) -> dict[str, Variable]:
     shapes = _flat(jax.eval_shape(lambda *x: _execute(*x, program=setup.program), setup.shared, setup.lanes(np.arange(block_size()))))
     units = {name: unit for fold in setup.shared.folds for name, unit in fold.units.items()}
     units |= {"status": "1", "fastest_mode": "1/s"} | {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
+    shapes = {name: shapes[name] for name in {n: None for n in units if n in shapes} | shapes}
     return {
         name: Variable(x.shape[1:], str(x.dtype), own_dims(name.removeprefix(DRAWN), x.shape[1:], config["joints"]), units.get(name, ""))
         for name, x in shapes.items()

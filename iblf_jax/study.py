@@ -10,6 +10,7 @@ statistics always, are counted, and the answer says so.
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,13 +18,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax import _statistics, _summaries, checks
+from iblf_jax import _statistics, _summaries, checks, paths
 from iblf_jax._blocks import Results, block_size, run_blocks
 from iblf_jax._setup import Setup
 from iblf_jax._statistics import Probability
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
-from iblf_jax.paths import with_parameters
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.rollout import trajectory
 from iblf_jax.scenario import Scenario
@@ -71,8 +71,11 @@ class Study:
     @classmethod
     def of(cls, setup: Setup, results: Results) -> Study:
         """The study with these results."""
-        metrics = Metrics(results.metrics, metric_units(setup.shared.folds))
-        return cls(setup.shared.cases.scenario, metrics, results.status, results.fastest_mode, results.samples, setup)
+        units = metric_units(setup.shared.folds)
+        order = {name: None for name, _ in units if name in results.metrics} | results.metrics  # theirs, not sorted as by jit
+        metrics = Metrics({name: results.metrics[name] for name in order}, units)
+        samples = {target.path: results.samples[target.path] for target in setup.program.targets}
+        return cls(setup.shared.cases.scenario, metrics, results.status, results.fastest_mode, samples, setup)
 
     @property
     def runs(self) -> int:
@@ -176,6 +179,12 @@ class Study:
         order = np.argsort(values if metric in _statistics.SMALLER_IS_WORSE else -values, kind="stable")
         return order[self.made[order]][:count]
 
+    def parameter_unit(self, path: str) -> str:
+        """SI unit of a drawn parameter, by the path of its leaf or of an entry."""
+        plain = paths.expand(path)[0]
+        known = {p.path: p.unit for p in paths.parameters(self.scenario)}
+        return known.get(plain, known.get(re.sub(r"(\[\d+\])+$", "", plain), ""))
+
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
         """Which runs a statistic is over, (N,) bool, and what to say about it."""
         used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
@@ -270,7 +279,7 @@ class Study:
             warnings.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.", stacklevel=2)
         program, shared = self.setup.program, self.setup.shared
         run = trajectory(
-            with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
+            paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
             shared.folds,
             shared.dt,
             steps=program.steps,

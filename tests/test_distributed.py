@@ -32,14 +32,16 @@ def job(compiled, tmp_path, words, more=((), ()), devices="2"):
     """Starts two processes."""
     address = free_address()
     return [
-        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i]) for i in (0, 1)
+        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i])
+        for i in (0, 1)
     ]
 
 
-def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path):
+@pytest.mark.parametrize("devices", ["1", pytest.param("2", marks=pytest.mark.slow)])
+def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path, devices):
     path = tmp_path / "sweep.zarr"
     words = ("--store", str(path))
-    survivor, victim = job(compiled, tmp_path, words, (("--slow", "1.0"), ("--die-after", "2")), devices="1")
+    survivor, victim = job(compiled, tmp_path, words, (("--slow", "1.0"), ("--die-after", "2")), devices)
     victim.communicate(timeout=300)
     assert victim.returncode == -signal.SIGKILL
     begin = time.monotonic()
@@ -49,7 +51,7 @@ def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, 
     assert "another process was lost" in errors
     assert "start the same command again" in errors
     assert 0 < ij.load_sweep(path).attrs["computed_cases"] < 6 * cases.RUNS
-    both = job(compiled, tmp_path, words)
+    both = job(compiled, tmp_path, words, devices=devices)
     for process in both:
         _, errors = process.communicate(timeout=300)
         assert process.returncode == 0, errors

@@ -94,7 +94,7 @@ def test_designs_and_vectors():
 
 def test_vectors_in_a_grid_and_a_point_that_cannot_work():
     found = once(grid={"controller.K2": [[10.0, 20.0], [30.0, 40.0]], "initial.q": [0.8, 2.0]})
-    assert found["controller.K2 values"].values.tolist() == [[10, 20], [30, 40]]
+    assert found["controller.K2_values"].values.tolist() == [[10, 20], [30, 40]]
     assert found.margin.sizes == {"controller.K2": 2, "initial.q": 2, "joint": 2}
     assert np.all(found.status.sel({"initial.q": 0.8}) == 0)
     assert np.all(found.status.sel({"initial.q": 2.0}) & int(ij.Status.BOUND_VIOLATED)), "a flag, not an error"
@@ -260,8 +260,9 @@ def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
     command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "sweep.zarr")]
     done = subprocess.run(command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
-    assert "StoreError" in done.stderr
+    assert "StoreWriteError" in done.stderr
     assert "no space left" in done.stderr
+    assert list(tmp_path.iterdir()) == [], "half a store was left behind"
 
 
 # -------------------------------------------------------------------------------------------------------- killed, interrupted

@@ -48,14 +48,15 @@ def run(args: argparse.Namespace) -> int:
 
 def report(study: Study) -> str:
     """What a study found, as text."""
+    import numpy as np
+
+    from iblf_jax._statistics import one_number
     from iblf_jax.cli._common import number
 
-    quantiles = study.quantiles()
     rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
-    for name, values in quantiles.items():
-        if "joint" in values.dims:
-            values = values.min("joint") if name in ("margin", "xi_margin") else values.max("joint")
-        rows.append([str(name), values.attrs.get("units", quantiles[name].attrs["units"]), *(number(x) for x in values.values)])
+    for name in study.metrics if study.made.any() else ():
+        levels = np.quantile(one_number(study.metrics, name)[study.made], (0.05, 0.5, 0.95), method="inverted_cdf")
+        rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
     worst = study.worst(5)
     lines = [repr(study), "", table(rows), "", f"worst runs (smallest margin first): {', '.join(map(str, worst))}"]
     found = study.correlations(["margin"]).correlation.sel(metric="margin")
