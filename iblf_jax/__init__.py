@@ -15,6 +15,7 @@ from iblf_jax import references as references
 from iblf_jax import robots as robots
 from iblf_jax.io import load_rollouts as load_rollouts
 from iblf_jax.io import save_rollouts as save_rollouts
+from iblf_jax.lowering.explain import explain as explain
 from iblf_jax.paths import parameters as parameters
 from iblf_jax.paths import with_parameters as with_parameters
 from iblf_jax.pytree import astype as astype
