@@ -45,20 +45,56 @@ def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
     return L
 
 
+def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]:
+    """L (rows below its unit diagonal) and 1/D with L D L^T = matrix; NaN where a pivot is not positive.
+
+    Without roots, and with one division a row: on a processor that steps many robots at once these cost as much as all the rest.
+    """
+    lower: list[list[jax.Array]] = []
+    scaled: list[list[jax.Array]] = []
+    inverse: list[jax.Array] = []
+    for i in range(matrix.shape[-1]):
+        lower.append([])
+        scaled.append([])
+        for j in range(i):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest = rest - scaled[i][k] * lower[j][k]
+            scaled[i].append(rest)
+            lower[i].append(rest * inverse[j])
+        pivot = matrix[i, i]
+        for k in range(i):
+            pivot = pivot - scaled[i][k] * lower[i][k]
+        inverse.append(1.0 / jnp.where(pivot > 0, pivot, jnp.nan))
+    return lower, inverse
+
+
+@jax.custom_jvp
 def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """X with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side."""
-    n = matrix.shape[-1]
-    L = cholesky(matrix)
+    """x with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side.
+
+    A matrix that is not positive definite gives NaN.  The derivative is that of the equation, dx = matrix^-1 (drhs - dmatrix x), with
+    the same factors.
+    """
+    lower, inverse = _factors(matrix)
+    n = len(inverse)
     y: list[jax.Array] = []
     for i in range(n):
         rest = rhs[i]
         for k in range(i):
-            rest = rest - L[i][k] * y[k]
-        y.append(rest / L[i][i])
+            rest = rest - lower[i][k] * y[k]
+        y.append(rest)
     x: list[jax.Array] = [jnp.zeros(())] * n
     for i in reversed(range(n)):
-        rest = y[i]
+        rest = y[i] * inverse[i]
         for k in range(i + 1, n):
-            rest = rest - L[k][i] * x[k]
-        x[i] = rest / L[i][i]
+            rest = rest - lower[k][i] * x[k]
+        x[i] = rest
     return jnp.stack(x)
+
+
+@solve_spd.defjvp
+def _solve_spd_jvp(primals, tangents):
+    (matrix, rhs), (matrix_dot, rhs_dot) = primals, tangents
+    x = solve_spd(matrix, rhs)
+    return x, solve_spd(matrix, rhs_dot - matvec(matrix_dot, x))

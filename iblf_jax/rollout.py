@@ -19,7 +19,7 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.bounds import NARROWEST, tube_at
-from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state, rate
+from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
 from iblf_jax.integrators import step, tableau
 from iblf_jax.metrics import Fold, as_folds
 from iblf_jax.one_function import as_one_function
@@ -90,9 +90,9 @@ def _keep_if(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _observe(scenario: Scenario, folds, t, dt, carry: Carry):
+def _observe(scenario: Scenario, folds, t, dt, carry: Carry, loop=evaluate):
     """Evaluates the loop at t and folds the sample in; returns the rate of the state, the sample and the new carry."""
-    slope, sample = evaluate(scenario, t, carry.state, dt)
+    slope, sample = loop(scenario, t, carry.state, dt)
     accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, carry.accumulators, strict=True))
     near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
     here = Nearest(near, t, jax.lax.stop_gradient(carry.state))
@@ -100,11 +100,11 @@ def _observe(scenario: Scenario, folds, t, dt, carry: Carry):
     return slope, sample, Carry(carry.state, accumulators, carry.status | sample_status(sample), nearest)
 
 
-def advance(scenario: Scenario, folds, method: str, dt, carry: Carry, index) -> tuple[Carry, Sample]:
-    """One step of the time loop: observe, integrate, freeze what runs away."""
+def advance(scenario: Scenario, folds, method: str, dt, carry: Carry, index, loop=evaluate) -> tuple[Carry, Sample]:
+    """One step of the time loop: observe, integrate, freeze what runs away.  `loop` stands for `closed_loop.evaluate`."""
     t = index.astype(dt.dtype) * dt
-    slope, sample, carry = _observe(scenario, folds, t, dt, carry)
-    stepped = step(method, partial(rate, scenario), t, carry.state, dt, slope)
+    slope, sample, carry = _observe(scenario, folds, t, dt, carry, loop)
+    stepped = step(method, lambda t, state: loop(scenario, t, state)[0], t, carry.state, dt, slope)
     sound = is_sound(stepped) & (carry.status & int(Status.NOT_FINITE) == 0)
     state = _keep_if(sound, stepped, carry.state)
     return carry._replace(state=state, status=carry.status | flag(~sound, Status.NOT_FINITE)), sample

@@ -62,6 +62,8 @@ class Batch(NamedTuple):
     leaves: Leaves
     dtype: Any
     runs: int
+    sparse: bool = False
+    """For steps that hold derivatives."""
 
     def whole(self, lane):
         """(scenario, folds, dt) of one run, from its leaves."""
@@ -72,7 +74,7 @@ class Batch(NamedTuple):
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
         step = make(self.leaves.treedef, self.leaves.is_lane, treedef, *options)
-        program = lowered(step, np.dtype(self.dtype), Shapes.of(self.leaves.shared), Shapes.of(self.leaves.lane, 1), shapes)
+        program = lowered(step, np.dtype(self.dtype), Shapes.of(self.leaves.shared), Shapes.of(self.leaves.lane, 1), shapes, self.sparse)
         return program, shapes, treedef
 
     def advance(self, make: Callable, carry: Any, steps: int, every: int | None, *options) -> tuple[Any, jax.Array]:

@@ -1,7 +1,7 @@
 """Constant folding, and identities that hold for every floating-point number, NaN and infinities included.
 
 x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN, and a run that is not finite must
-be seen to be so.
+be seen to be so.  (Programs of derivatives, `Builder.sparse`, are the exception: their values are those of the plain program.)
 """
 
 from __future__ import annotations
@@ -81,6 +81,8 @@ def _mul(b: Builder, args, kind):
     for one, other in (args, args[::-1]):
         if b.value(one) == 1:
             return other
+        if b.sparse and b.value(one) == 0 and kind == "f":
+            return one
         if b.value(one) == -1:
             return b.emit("neg", other, kind=kind)
         if b.nodes[one].op == "neg":
@@ -91,7 +93,7 @@ def _mul(b: Builder, args, kind):
 def _div(b: Builder, args, kind):
     x, y = args
     value = b.value(y)
-    if value == 1:
+    if value == 1 or (b.sparse and b.value(x) == 0):
         return x
     if kind == "f" and value and math.isfinite(value) and abs(math.frexp(value)[0]) == 0.5 and abs(math.frexp(value)[1]) < 100:
         return b.emit("mul", x, b.constant(1 / value, "f"), kind=kind)

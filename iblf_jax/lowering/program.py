@@ -43,8 +43,10 @@ class Node(NamedTuple):
 class Builder:
     """Makes nodes; equal ones are made once."""
 
-    def __init__(self, dtype) -> None:
+    def __init__(self, dtype, *, sparse: bool = False) -> None:
+        """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such a zero says "does not depend"."""
         self.dtype = np.dtype(dtype)
+        self.sparse = sparse
         self.nodes: list[Node] = []
         self._known: dict[tuple, int] = {}
 

@@ -79,15 +79,17 @@ class Shapes(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes) -> Program:
+def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes, sparse: bool = False) -> Program:
     """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, samples)`.
+
+    `sparse`: for steps that hold derivatives, see `Builder`.
 
     Raises:
       UnsupportedError: the step holds something that a scalar program cannot express.
     """
     index = jax.ShapeDtypeStruct((), jnp.int32)
     jaxpr, shapes = jax.make_jaxpr(step, return_shape=True)(shared.structs(), lane.structs(), carry.structs(), index)
-    b = Builder(dtype)
+    b = Builder(dtype, sparse=sparse)
     operands, read = [], []
     for op, group in (("shared", shared), ("lane", lane), ("carry", carry)):
         count = 0
