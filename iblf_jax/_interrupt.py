@@ -37,4 +37,4 @@ class CtrlC:
         self.asked = True
         import sys
 
-        print("\nCtrl-C: stopping after the unit at hand; again to stop at once.", file=sys.stderr)
+        sys.stderr.write("\nCtrl-C: stopping after the unit at hand; again to stop at once.\n")

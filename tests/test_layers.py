@@ -26,14 +26,23 @@ LAYERS = {
     0: ("pytree", "linalg", "checks", "status", "one_function"),
     1: ("robots", "references", "bounds", "disturbances"),
     2: ("barriers", "observers", "controllers"),
-    3: ("integrators", "scenario", "closed_loop", "stability", "metrics", "results", "paths", "rollout", "lowering"),
+    3: ("integrators", "scenario", "closed_loop", "stability", "metrics", "results", "paths", "rollout", "derivatives", "lowering"),
     4: ("certificates",),
-    5: ("_compare", "_comparison", "_monte_carlo", "_sweep", "tuning"),
-    6: ("presets", "scenario_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
+    5: (
+        *("_compare", "_comparison", "_monte_carlo", "_sweep", "_sensitivity", "study", "store", "distributions", "distributed", "tuning"),
+        *("_blocks", "_config", "_dataset", "_designs", "_draws", "_interrupt", "_points", "_progress", "_setup"),
+        *("_statistics", "_summaries"),
+    ),
+    6: ("presets", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
 }
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
 
-ONLY_IN = {"matplotlib": ("plotting",), "optax": ("tuning",), "argparse": ("cli",), "xarray": ("io", "_sweep", "_monte_carlo")}
+ONLY_IN = {
+    "matplotlib": ("plotting",),
+    "optax": ("tuning",),
+    "argparse": ("cli",),
+    "xarray": ("io", "study", "_sweep", "_dataset", "_summaries", "_sensitivity", "cli", "plotting"),
+}
 """Library -> the modules that may use it, inside functions too."""
 
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -115,8 +124,9 @@ def calls(source: str, name: str) -> list[int]:
 
 
 def test_time_is_scanned_in_one_place():
-    """lax.scan is a loop over time; the power iteration of `stability` and the checkers' own scans are not runs."""
-    allowed = {"rollout", "lowering", "stability", "testing"}
+    """lax.scan is a loop over time; `derivatives` steps the same `rollout.advance` with tangents; the power iteration of `stability` and
+    the checkers' own scans are not runs."""
+    allowed = {"rollout", "lowering", "derivatives", "stability", "testing"}
     users = {module_of(p) for p, text in SOURCES.items() if calls(text, "jax.lax.scan") or calls(text, "lax.scan")}
     assert users <= allowed, users - allowed
 

@@ -234,7 +234,8 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
     """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just so."""
     wanted = objectives.tracking() + objectives.peak_torque_below(12.0)
     best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
-    assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
+    assert best.report.verdicts[0].before.count == 1
+    assert best.report.passed, best.report
     assert 11.0 < float(np.max(ij.simulate(best.scenario, metrics=standard(), **SHORT).metrics.peak_torque)) < 12.0
 
 

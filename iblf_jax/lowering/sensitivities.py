@@ -111,7 +111,8 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
     def numbers(flat, eps, t, dt):
         slope, sample = evaluate(directions.moved(scenario, eps), t, unravel(flat), dt)
         flags = {name: getattr(sample, name) for name in FLAGS}
-        return ravel_pytree((slope, sample._replace(**dict.fromkeys(FLAGS, ()))))[0], flags
+        unflagged: dict[str, Any] = dict.fromkeys(FLAGS, ())
+        return ravel_pytree((slope, sample._replace(**unflagged)))[0], flags
 
     @jax.custom_jvp
     def floats(flat, eps, t, dt):
@@ -129,7 +130,13 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
     def loop(moved, t, state, dt=0.0):
         dt = jnp.asarray(dt, t.dtype)
         slope, sample = jax.eval_shape(lambda: evaluate(scenario, t, state, dt))
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (slope, sample._replace(**dict.fromkeys(FLAGS, ()))))
+        zeros = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype),
+            (
+                slope,
+                sample._replace(**dict.fromkeys(FLAGS, ())),  # type: ignore[arg-type]
+            ),
+        )
         flat = ravel_pytree(state)[0]
         slope, sample = ravel_pytree(zeros)[1](floats(flat, eps, t, dt))
         return slope, sample._replace(**numbers(*jax.lax.stop_gradient((flat, eps, t, dt)))[1])

@@ -17,13 +17,13 @@ from iblf_jax.plotting._figures import torques as torques
 from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
 from iblf_jax.plotting._figures import velocity_errors as velocity_errors
 from iblf_jax.plotting._overview import overview as overview
-from iblf_jax.plotting._tuning import pareto as pareto
-from iblf_jax.plotting._tuning import tuning as tuning
 from iblf_jax.plotting._studies import bands as bands
 from iblf_jax.plotting._studies import histograms as histograms
 from iblf_jax.plotting._studies import scatter as scatter
 from iblf_jax.plotting._studies import study_overview as study_overview
 from iblf_jax.plotting._sweeps import heat_map as heat_map
 from iblf_jax.plotting._sweeps import parallel as parallel
+from iblf_jax.plotting._tuning import pareto as pareto
+from iblf_jax.plotting._tuning import tuning as tuning
 from iblf_jax.plotting.animation import animate as animate
 from iblf_jax.plotting.comparison import comparison as comparison
