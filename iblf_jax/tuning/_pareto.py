@@ -5,7 +5,7 @@ Point j minimises a weighted sum of the logarithms of the two objectives,
     w_j log a + (1 - w_j) log b,      w_j evenly between 0 and 1 (ends left out),
 
 which does not depend on their scales and reaches further into a front that is not convex than a weighted sum does.  Every trial of
-every point is a candidate: the front is what no other one beats in both.
+every point that kept its bounds is a candidate: the front is what no other one beats in both.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -117,16 +118,17 @@ def pareto(
     began = time.perf_counter()
     pair = _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method}
-    problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, "log")
+    problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, scalarisation="log", mode="forward")
     if len(problem.box.z) > FORWARD_MOST:
         raise checks.fail("parameters", f"{len(problem.box.z)} numbers", f"at most {FORWARD_MOST} for a front", "Tie or leave out some.")
     points = checks.positive_integer("points", points)
-    z = np.repeat(way_in(problem, problem.box.z[None], seed), points, axis=0)
+    z = np.repeat(problem.box.z[None], points, axis=0)
     share = np.linspace(1 - MOST_WEIGHT, MOST_WEIGHT, points) if points > 1 else np.array([0.5])
     lanes = problem.lanes(z)._replace(weights=jnp.asarray(np.stack([share, 1 - share], axis=1), problem.shared.dt.dtype))
     loop = Loop(
         Evaluator(problem.plan, problem.shared, lanes, "forward"), make_method("newton", problem.box, iterations, tolerance, 0.1), z
     )
+    loop.rescue = partial(way_in, problem, seed)
     with bar(progress, iterations) as shown:
         loop.run(iterations, tolerance=tolerance, patience=iterations, on_step=lambda _: shown.update(1))
     return _front(problem, loop, time.perf_counter() - began)
@@ -143,9 +145,11 @@ def _pair(objectives: Any) -> Objective:
 
 def _front(problem, loop: Loop, seconds: float) -> Front:
     history = {name: np.stack(x) for name, x in loop.history.items()}
-    kept = history["sound"] & (np.max(np.maximum(history["excess"], 0.0), axis=-1, initial=0.0) <= 0)
+    kept = history["sound"] & (history["margin"] > 0) & (np.max(np.maximum(history["excess"], 0.0), axis=-1, initial=0.0) <= 0)
     if not np.any(kept):
-        raise checks.fail("objectives", "no trial that keeps the requirements", "at least one", "Loosen them, or tune to them first.")
+        raise checks.fail(
+            "objectives", "no trial that keeps bounds and requirements", "at least one", "Loosen them, or tune to them first."
+        )
     tried, z = history["terms"][kept], history["z"][kept]
     front = non_dominated(tried)
     blocks, start = problem.plan.blocks, problem.shared.cases.scenario

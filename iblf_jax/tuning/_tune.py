@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,13 @@ from iblf_jax._progress import bar
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import SimulationWarning, simulate
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
-from iblf_jax.tuning.objectives import Objective, complete
+from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete
 from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, value
-from iblf_jax.tuning.quantities import Quantities
+from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, Slope, gradient, slope, value
 from iblf_jax.tuning.result import Setup, TuneResult
 from iblf_jax.tuning.robust import Risk, as_risk
 
@@ -106,12 +104,13 @@ def tune(
     """
     began = time.perf_counter()
     timing = {"duration": duration, "dt": dt, "method": method}
-    problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing)
+    problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing, mode=mode)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     iterations, starts = checks.positive_integer("iterations", iterations), checks.positive_integer("starts", starts)
-    z = way_in(problem, starting_points(problem.box, starts, seed), seed)
+    z = starting_points(problem.box, starts, seed)
     evaluator = Evaluator(problem.plan, problem.shared, problem.lanes(z), mode)
     loop = Loop(evaluator, make_method(optimiser, problem.box, iterations, tolerance, learning_rate), z, resample=resample)
+    loop.rescue = partial(way_in, problem, seed)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, iterations if optimiser == "adam" else 0)
     mark = fingerprint(problem.plan, problem.shared, options)
     if checkpoint is not None and Path(checkpoint).exists():
@@ -158,7 +157,9 @@ class Problem:
         return Lane(np.asarray(z, dtype), index, weights, lam, mu)
 
 
-def build(scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, scalarisation: str = "sum") -> Problem:
+def build(
+    scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, *, scalarisation="sum", mode="auto"
+) -> Problem:
     """Checks what `tune` and its relatives were asked for."""
     tableau(timing["method"])
     steps = checks.whole_steps(timing["duration"], timing["dt"])
@@ -169,17 +170,18 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
         raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
     blocks, box = layout(scenario, parameters, timing["dt"], timing["method"])
 
-    def exact_at_start(quantities):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", SimulationWarning)  # an infeasible start is what `way_in` is for
-            run = simulate(scenario, metrics=(Quantities(quantities),), record_every=steps, **timing)
-        return run.metrics["tuning_exact"]
-
-    objective = complete(objective, exact_at_start)
-    shares = tuple(float(r.allowed) for r in objective.requirements)
-    objective, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (objective, by_path, timing["dt"]))
+    goal = checked(objective)
+    ones = complete(goal, np.ones(len(goal.terms)))
+    shares = tuple(float(r.allowed) for r in goal.requirements)
+    ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
     plan_ = Plan(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation)
-    return Problem(plan_, Shared(Cases(scenario, by_path, jax.random.key(seed)), objective, step), box, runs)
+    problem = Problem(plan_, Shared(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
+    if not is_complete(goal):
+        derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient
+        start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), plan=plan_).value.exact[0])
+        goal = complete(goal, start[: len(goal.terms)])
+        problem.shared = problem.shared._replace(objective=jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
+    return problem
 
 
 def choose(mode: str, optimiser: str, size: int, resample: bool) -> tuple[str, str]:
@@ -211,22 +213,21 @@ def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
     return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
 
 
-def way_in(problem: Problem, z: np.ndarray, seed: int) -> np.ndarray:
-    """The starting points, or better ones where the first leaves its bounds or cannot be integrated.
+def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarray | None:
+    """Better starting points where the first one leaves its bounds or cannot be integrated, else None.
 
     Past the wall the motion is chaotic, and its gradient points nowhere.  So SCREENED points of the box are looked at, values
     only, and the starts are those that break the requirements and the bounds least.
     """
-    first = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(z[:1]), plan=problem.plan))
-    if first.sound[0] and first.margin[0] > 0:
-        return z
+    if found.value.sound[0] and found.value.margin[0] > 0:
+        return None
     rng = np.random.default_rng([seed, 2])
     low = np.where(np.isfinite(problem.box.low), problem.box.low, problem.box.z - 3 * SPREAD)
     high = np.where(np.isfinite(problem.box.high), problem.box.high, problem.box.z + 3 * SPREAD)
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
-    found = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), plan=problem.plan))
-    broken = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-found.margin, 0.0)
-    order = np.lexsort((found.objective, broken, ~found.sound))
+    seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), plan=problem.plan))
+    broken = np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
+    order = np.lexsort((seen.objective, broken, ~seen.sound))
     return points[order[: len(z)]]
 
 

@@ -7,7 +7,8 @@ A term is a smooth number of a run over its scale, so that terms are comparable:
 
     plain   weight value / scale                 above   weight softplus(sharpness (value - limit) / scale) / sharpness
 
-`scale` and `limit`, where they are not given, are the value at the gains that tuning starts from.  A requirement holds where
+`scale` and `limit`, where they are not given, are the value at the gains that tuning starts from (its mean over perturbed
+runs).  A requirement holds where
 
     g = (value - limit) / scale < 0        (its sign turned for "above" requirements);
 
@@ -20,6 +21,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.pytree import component, leaf, static
@@ -111,34 +113,41 @@ class Objective:
         return jnp.stack(found) if found else jnp.zeros((0,), smooth.dtype)
 
 
-def complete(objective: Any, exact_at_start) -> Objective:
-    """The objective with every missing scale and limit set to the value at the start.
-
-    Args:
-      objective: as the user composed it.
-      exact_at_start: function (quantities) -> their exact values at the start, (K,).
-    """
+def checked(objective: Any) -> Objective:
+    """The objective that the user composed, if it is one; ValueError otherwise."""
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
     if not isinstance(objective, Objective) or not objective.terms:
         raise checks.fail("objective", objective, "an objective with at least one term", "Such as ij.objectives.tracking().")
-    if all(t.scale is not None and (t.limit is not None or t.shape == "plain") for t in objective.terms):
-        return objective
-    start = exact_at_start(tuple(t.quantity for t in objective.terms))
+    return objective
+
+
+def is_complete(objective: Objective) -> bool:
+    """Whether no scale or limit is missing."""
+    return all(t.scale is not None and (t.limit is not None or t.shape == "plain") for t in objective.terms)
+
+
+def complete(objective: Objective, start: Any) -> Objective:
+    """The objective with every missing scale and limit set to the value at the start.
+
+    Args:
+      objective: as the user composed it.
+      start: the exact values of the terms' quantities at the start, (n_terms,).
+    """
     terms = tuple(_completed(t, x) for t, x in zip(objective.terms, start, strict=True))
     return Objective(terms, objective.requirements)
 
 
-def _completed(t: Term, x: jax.Array) -> Term:
+def _completed(t: Term, x: Any) -> Term:
     missing = t.scale is None or (t.limit is None and t.shape == "above")
-    if missing and not (bool(jnp.isfinite(x)) and float(abs(x)) > 0):
+    if missing and not (np.isfinite(x) and abs(x) > 0):
         raise checks.fail(f"{t.name}: its value at the start", x, "a finite number other than 0", "Give the term a scale of its own.")
     scale = abs(x) if t.scale is None else t.scale
     limit = x if t.limit is None and t.shape == "above" else t.limit
     quantity = t.quantity
     if isinstance(quantity, Peak) and t.scale is None:
         quantity = Peak(scale, quantity.signal, quantity.joints, quantity.after, quantity.smoothing)
-    return Term(quantity, t.weight, scale, limit, t.sharpness, shape=t.shape, name=t.name)
+    return Term(quantity, t.weight, scale, limit, t.sharpness, t.shape, t.name)
 
 
 def _plain(name: str, quantity: Quantity, scale: Any) -> Objective:

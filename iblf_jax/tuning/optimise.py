@@ -5,7 +5,7 @@ Requirements are driven in by an augmented Lagrangian: whenever a start has sett
     lam <- max(0, lam + mu G),     mu <- 5 mu where the largest G has not fallen to a quarter,
 
 so a start that breaks them finds its way in while the penalty stays finite everywhere.  The best so far is the one with the lowest
-objective among those that keep the requirements, or, while none does, the one that breaks them least.
+objective among those that keep the requirements and the bounds, or, while none does, the one that breaks them least.
 
 A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
 from there and gives the same numbers, bit by bit, as one that was not.
@@ -95,6 +95,8 @@ class Loop:
             "best_excess": np.full((starts, count), np.nan),
         }
         self.history: dict[str, list[np.ndarray]] = {}
+        self.rescue: Callable[[np.ndarray, Slope], np.ndarray | None] = lambda z, found: None
+        """Called with the first step's points and what they gave; better starting points, or None."""
 
     def run(self, iterations: int, *, tolerance: float, patience: int, on_step: Callable[[Loop], None]) -> str:
         """Steps until done; returns why it stopped."""
@@ -120,7 +122,10 @@ class Loop:
         improved = self._keep_best(z, found, tolerance)
         state["stale"] = np.asarray(0) if improved else state["stale"] + 1
         self._record(z, found)
-        for s in range(len(z)):
+        better = self.rescue(z, found) if int(state["iteration"]) == 0 else None
+        if better is not None:
+            state["method"] = self.method.init(better)
+        for s in range(len(z) if better is None else 0):
             self._outer(s, found)
         state["iteration"] = state["iteration"] + 1
 
@@ -130,7 +135,7 @@ class Loop:
             if not found.value.sound[s]:
                 continue
             excess = found.value.exact_excess[s]
-            broken = float(np.max(np.maximum(excess, 0.0), initial=0.0))
+            broken = float(np.max(np.maximum(excess, 0.0), initial=0.0)) + max(-float(found.value.margin[s]), 0.0)
             key = (broken, float(found.value.objective[s]))
             old = state["best_key"][s]
             if not np.isfinite(key[1]) or key >= tuple(old):

@@ -84,6 +84,8 @@ class Value(NamedTuple):
     margin: Any
     """The smallest margin of all runs [rad]."""
     sound: Any
+    exact: Any
+    """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the margin."""
 
 
 class Slope(NamedTuple):
@@ -152,6 +154,7 @@ def _value(plan: Plan, shared: Shared, lane: Lane, smooth, exact, status) -> Val
         _excesses(plan, shared.objective, exact),
         -jnp.max(exact[:, -1]),
         sound,
+        jnp.mean(exact, axis=0),
     )
 
 
