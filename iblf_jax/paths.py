@@ -135,7 +135,9 @@ def get(scenario: Scenario, path: str) -> Any:
 
 def _entry(part: Any, index: int) -> Any:
     """Part or entry `index`; unlike an array of JAX, which takes the nearest entry, it raises IndexError beyond the ends."""
-    size = len(part) if isinstance(part, tuple | list) else jnp.shape(part)[0]
+    if not isinstance(part, tuple | list | jax.Array | np.ndarray):
+        raise TypeError(part)
+    size = len(part) if isinstance(part, tuple | list) else part.shape[0]
     if not -size <= index < size:
         raise IndexError(index)
     return part[index]

@@ -1,0 +1,128 @@
+"""The checker for barriers: the contract is `iblf_jax.barriers.Barrier`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.barriers import Barrier
+from iblf_jax.bounds import Tube
+from iblf_jax.presets import zhang_yan_2024
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
+
+XI = (-40.0, -3.0, -1.0 - 1e-9, -1.0, -1.0 + 1e-9, -0.9, -0.3, -1e-9, 0.0, 1e-9, 0.3, 0.9, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 3.0, 40.0)
+"""Where every barrier is looked at, in xi: far outside, on and about the wall, inside, on and about zero."""
+
+TIMES = (0.0, 1.0, 2.5, 4.0)
+
+
+def check_barrier(barrier: Any) -> None:
+    """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays along alpha.
+
+        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the wall
+
+    Args:
+      barrier: an instance.
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(barrier, "Barrier", Barrier) as findings:
+        guard, uses_o = barrier.guard, barrier.uses_o
+        findings.require(isinstance(guard, float) and 0 < guard < 1, f"guard is {guard!r}", "It must be a static float between 0 and 1")
+        findings.require(isinstance(uses_o, bool), f"uses_o is {uses_o!r}", "It must be a bool of the class, uses_o: ClassVar[bool]")
+        findings.stop_if_any()
+        barrier = in_dtype(barrier, "float64")
+        setting = in_dtype(zhang_yan_2024(), "float64").setting
+        k1, o = jnp.asarray([2.0, 3.0]), jnp.asarray([0.1, 0.2]) if uses_o else None
+        tube = setting.tube(jnp.asarray(1.0))
+        q = tube.q_d + jnp.asarray([0.2, -0.15])
+        calls: dict[str, tuple] = {"value(tube, q)": (barrier.value, (tube, q)), "slope(tube, q)": (barrier.slope, (tube, q))}
+        calls["virtual_velocity(tube, q, k1, o)"] = (barrier.virtual_velocity, (tube, q, k1, o))
+        for label, (call, args) in calls.items():
+            has_shape(findings, label, shape_of(findings, label, call, *args), (2,))
+        findings.stop_if_any()
+
+        def outputs(barrier, tube, q, k1, o):
+            named = (barrier.value(tube, q), barrier.slope(tube, q), barrier.virtual_velocity(tube, q, k1, o))
+            return dict(zip(calls, named, strict=True))
+
+        probe(findings, outputs, barrier, (tube, q, k1, o))
+        for t in TIMES:
+            tube = setting.tube(jnp.asarray(t))
+            _at_every_xi(findings, _numbers(barrier, setting, jnp.asarray(t), k1, o, jnp.asarray(XI)), guard)
+        _joints_apart(findings, barrier, tube, q, k1, o)
+
+
+@jax.jit
+def _numbers(barrier: Any, setting: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array) -> dict[str, jax.Array]:
+    """The barrier at every xi, with its derivatives by q in both modes, and the rate of V1 along q' = alpha."""
+
+    def at(xi):
+        tube: Tube = setting.tube(t)
+        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+
+        def functions(q):
+            return barrier.value(tube, q), barrier.slope(tube, q), barrier.virtual_velocity(tube, q, k1, o)
+
+        ones = jnp.ones_like(q)
+        (V1, slope, alpha), forward = jax.jvp(functions, (q,), (ones,))
+        pull = jax.vjp(functions, q)[1]
+        one_by_one = jnp.eye(3)[:, :, None] * ones
+        reverse = jax.vmap(pull)(tuple(one_by_one[:, i] for i in range(3)))[0]
+        rate = jax.jvp(lambda t, q: barrier.value(setting.tube(t), q), (t, q), (jnp.ones_like(t), alpha))[1]
+        return {
+            "V1": V1,
+            "slope": slope,
+            "alpha": alpha,
+            "xi": tube.xi(q),
+            "decay": rate,
+            **{f"d{name}": x for name, x in zip(("V1", "slope", "alpha"), forward, strict=True)},
+            **{f"r{name}": x for name, x in zip(("V1", "slope", "alpha"), reverse, strict=True)},
+        }
+
+    return jax.vmap(at)(xi)
+
+
+def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float) -> None:
+    got = {name: np.asarray(value) for name, value in numbers.items()}
+    xi = np.asarray(XI)[:, None] + 0 * got["xi"]
+    words = {"V1": "value", "slope": "slope", "alpha": "virtual_velocity"}
+    mend = "Evaluate at barriers._base.guarded_error; mind removable singularities at e1 = 0 (double jnp.where)"
+    for prefix, text in (("", ""), ("d", "the forward derivative of "), ("r", "the reverse derivative of ")):
+        for name, word in words.items():
+            bad = ~np.isfinite(got[prefix + name])
+            where = f"xi = {xi[bad][0]:.12g}" if np.any(bad) else ""
+            findings.require(not np.any(bad), f"{text}{word} is not finite at {where}", mend)
+        findings.stop_if_any()
+    zero = np.abs(xi) == 0
+    findings.require(np.all(np.abs(got["V1"][zero]) < 1e-12), "V1 is not 0 at e1 = 0", "Subtract its value there")
+    findings.require(np.all(np.abs(got["slope"][zero]) < 1e-12), "the slope is not 0 at e1 = 0")
+    findings.require(
+        np.all(got["V1"] >= 0), "V1 is negative somewhere", "A Lyapunov function is >= 0; beyond the guard go on along the tangent"
+    )
+    inward = np.sign(xi) * got["slope"] >= 0
+    findings.require(np.all(inward), "the slope points outward somewhere", "tau = ... - slope must push back, beyond the wall too")
+    # On the edge of the guard both one-sided derivatives are right, so the points within 1e-3 of it are left out.
+    clear = np.abs(np.abs(xi) - (1 - guard)) > 1e-3 * guard
+    off = np.abs(got["dV1"] - got["slope"]) / np.maximum(1.0, np.abs(got["slope"]))
+    worst = float(np.max(off[clear]))
+    mend = "Beyond the guard V1 must go on along its tangent: V1(e) + slope(e) (e1 - e)"
+    findings.require(worst < 1e-8, f"the slope is not dV1/dq (relative error {worst:.2g})", mend)
+    inside = np.abs(xi) < 1 - 2 * guard
+    growth = float(np.max(got["decay"][inside]))
+    findings.require(growth <= 1e-9, f"V1 grows at rate {growth:.3g} along q' = alpha", "alpha must make slope . alpha + dV1/dt negative")
+
+
+def _joints_apart(findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any) -> None:
+    """No joint's barrier depends on another joint."""
+    for label, function in (
+        ("value", lambda q: barrier.value(tube, q)),
+        ("slope", lambda q: barrier.slope(tube, q)),
+        ("virtual_velocity", lambda q: barrier.virtual_velocity(tube, q, k1, o)),
+    ):
+        J = np.asarray(jax.jacfwd(function)(q))
+        findings.require(np.all(np.diag(np.diag(J)) == J), f"{label} mixes joints", "It is written joint by joint; the law needs it so")

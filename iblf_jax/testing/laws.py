@@ -1,0 +1,130 @@
+"""The checker for tracking laws: the contract is `iblf_jax.controllers.Controller`."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.controllers import Command, Controller
+from iblf_jax.presets import zhang_yan_2024
+from iblf_jax.rollout import simulate
+from iblf_jax.scenario import Scenario
+from iblf_jax.status import Status
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+
+XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
+"""Where the law is asked for a torque, in xi: a run may get anywhere, and must stay finite there."""
+
+SHORT_RUN = 0.1
+"""s."""
+
+
+def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
+    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite at the wall, a short closed loop.
+
+    Args:
+      law: an instance.
+      scenario: the surroundings to try it in; the paper's simulation if not given.
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(law, "Controller", Controller) as findings:
+        base = in_dtype(zhang_yan_2024() if scenario is None else scenario, "float64")
+        try:
+            base = in_dtype(dataclasses.replace(base, controller=law), "float64")
+        except ValueError as error:
+            findings.add(f"it does not go into a Scenario ({error})")
+            findings.stop_if_any()
+        for dtype in ("float64", "float32"):
+            _structure(findings, in_dtype(base, dtype))
+        findings.stop_if_any()
+        t = jnp.asarray(0.7)
+        tube = base.setting.tube(t)
+        q, dq = tube.q_d + 0.3 * tube.k_u, tube.dq_d - 0.2
+        f_hat = jnp.linspace(0.1, 0.2, base.n)
+
+        def outputs(law, t, q, dq, f_hat, setting):
+            command, rate = law.command(t, q, dq, f_hat, setting, law.init(q, dq, setting))
+            named = {f"its state's rate, leaf {i}": x for i, x in enumerate(jax.tree.leaves(rate))}
+            return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1, **named}
+
+        probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.setting))
+        _at_the_wall(findings, base)
+        findings.stop_if_any()
+        _closed_loop(findings, in_dtype(base, "float32"))
+
+
+def _structure(findings: Findings, scenario: Scenario) -> None:
+    law, setting, q, dq = scenario.controller, scenario.setting, scenario.initial.q, scenario.initial.dq
+    t, kind = jnp.zeros((), q.dtype), f" ({q.dtype})"
+    state = shape_of(findings, "init(q, dq, setting)" + kind, law.init, q, dq, setting)
+    if state is None:
+        return
+    label = "command(t, q, dq, f_hat, setting, state)" + kind
+    answer = shape_of(findings, label, law.command, t, q, dq, jnp.zeros_like(q), setting, state)
+    if answer is None:
+        return
+    if not (isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)):
+        findings.add(f"{label} gives {type(answer).__name__}", "It must be a pair (Command, rate of the state)")
+        return
+    command, rate = answer
+    for name in ("tau", "alpha", "V1"):
+        ok = has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape)
+        mend = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
+        if ok:
+            got = getattr(command, name).dtype
+            findings.require(got == q.dtype, f"Command.{name} is {got} for {q.dtype} arguments", mend)
+    for name in ("guard_active", "saturated"):
+        has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape, jnp.bool_)
+    same_structure(findings, "the rate that command returns" + kind, rate, state)
+
+
+def _at_the_wall(findings: Findings, scenario: Scenario) -> None:
+    """Torque, V1 and their derivatives in both modes are finite wherever a run may get."""
+
+    @jax.jit
+    def numbers(scenario, xis):
+        def at(xi):
+            law, setting, t = scenario.controller, scenario.setting, jnp.asarray(0.7)
+            tube = setting.tube(t)
+
+            def functions(law, q, dq):
+                state = law.init(scenario.initial.q, scenario.initial.dq, setting)
+                command = law.command(t, q, dq, jnp.zeros_like(q), setting, state)[0]
+                return command.tau, command.alpha, command.V1
+
+            point = (law, tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l), tube.dq_d)
+            values, forward = jax.jvp(functions, point, jax.tree.map(jnp.ones_like, point))
+            reverse = jax.vjp(functions, *point)[1](jax.tree.map(jnp.ones_like, values))
+            return values, forward, reverse
+
+        return jax.vmap(at)(xis)
+
+    values, forward, reverse = numbers(scenario, jnp.asarray(XI))
+    mend = "Near and past the wall hold the slope (barriers._base.guarded_error); a run that fails must stay finite"
+    for label, tree in (("the command", values), ("its forward derivative", forward), ("its reverse derivative", reverse)):
+        finite = np.all([np.all(np.isfinite(np.asarray(x).reshape(len(XI), -1)), axis=1) for x in jax.tree.leaves(tree)], axis=0)
+        where = ", ".join(f"{xi:g}" for xi, ok in zip(XI, finite, strict=True) if not ok)
+        findings.require(np.all(finite), f"{label} is not finite at xi = {where}", mend)
+    findings.require(np.all(np.asarray(values[2]) >= 0), "V1 is negative somewhere", "It is a Lyapunov function; zeros if the law has none")
+
+
+def _closed_loop(findings: Findings, scenario: Scenario) -> None:
+    """A short run in float32, where a state that changes its type is an error."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            run = simulate(scenario, duration=SHORT_RUN, dt=1e-3, record_every=10, metrics=())
+    except (TypeError, ValueError) as error:
+        findings.add(f"it does not run in a closed loop ({type(error).__name__}: {str(error).splitlines()[0]})")
+        return
+    lost = int(run.status) & int(Status.NOT_FINITE) and not int(run.status) & int(Status.STEP_TOO_LARGE)
+    findings.require(not lost, f"the arm ran away within {SHORT_RUN} s of the closed loop", "Look at the signs of the feedback")
+    finite = all(np.all(np.isfinite(x)) for x in (run.q, run.dq, run.tau, run.V))
+    findings.require(finite, "the closed loop gave numbers that are not finite")

@@ -1,0 +1,117 @@
+"""The checker for metrics: the contract is `iblf_jax.metrics.Fold`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.closed_loop import Sample
+from iblf_jax.metrics import Fold
+from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of
+
+LENGTH = 40
+
+
+def check_fold(fold: Any) -> None:
+    """Checks a metric: the accumulator's structure, names and units, derivatives, float32, no NaN.
+
+    Args:
+      fold: an instance.
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(fold, "Fold", Fold) as findings:
+        units = fold.units
+        ok = hasattr(units, "items") and all(isinstance(x, str) for pair in units.items() for x in pair)
+        findings.require(ok, f"units is {units!r}", 'It must be a dict from name to SI unit, {"rmse": "rad"}')
+        fold = in_dtype(fold, "float64")
+        for dtype in ("float64", "float32"):
+            _structure(findings, *in_dtype((fold, samples(np.random.default_rng(4))), dtype))
+        findings.stop_if_any()
+
+        def outputs(fold, moving, flags):
+            return _folded(fold, samples_from(moving, flags))
+
+        some = samples(np.random.default_rng(4))
+        moving = {k: v for k, v in some._asdict().items() if jnp.issubdtype(v.dtype, jnp.floating)}
+        flags = {k: v for k, v in some._asdict().items() if k not in moving}
+        result = jax.jit(_folded)(fold, some)
+        for name, value in result.items():
+            findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
+        finite = {name for name, value in result.items() if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)}
+        probe(findings, lambda fold, moving: {k: v for k, v in outputs(fold, moving, flags).items() if k in finite}, fold, (moving,))
+        _at_rest(findings, fold, some)
+
+
+def samples(rng: np.random.Generator) -> Sample:
+    """A made-up run of two joints, (LENGTH, ...), all its numbers apart from each other."""
+    t = np.arange(LENGTH) * 0.01
+    dt = np.where(np.arange(LENGTH) < LENGTH - 1, 0.01, 0.0)
+
+    def wave(size):
+        phase, speed = rng.uniform(0, 6, (2, 1, 2))
+        return size * np.sin(8 * (1 + speed) * t[:, None] + phase) + rng.uniform(-0.1, 0.1, (LENGTH, 2)) * size
+
+    q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
+    numbers = {name: wave(1.0) for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate")}
+    sides = {"lower": np.full((LENGTH, 2), 0.2), "upper": np.full((LENGTH, 2), 0.85)}
+    k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
+    numbers |= sides | {"q": q_d + e1, "e1": e1, "xi": e1 / k, "q_d": q_d, "tau": tau, "V": np.abs(wave(1.0))[:, 0], "t": t, "dt": dt}
+    flags = {name: rng.uniform(size=(LENGTH, 2)) < 0.3 for name in ("guard_active", "saturated")}
+    return samples_from({k: jnp.asarray(v) for k, v in numbers.items()}, {k: jnp.asarray(v) for k, v in flags.items()})
+
+
+def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> Sample:
+    """A Sample from its floating-point parts and its flags."""
+    return Sample(**numbers, **flags)
+
+
+def _folded(fold: Any, samples: Sample) -> dict[str, jax.Array]:
+    first = jax.tree.map(lambda x: x[0], samples)
+    acc, _ = jax.lax.scan(lambda acc, sample: (fold.update(acc, sample), None), fold.init(first), samples)
+    return fold.finish(acc)
+
+
+def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
+    first = jax.tree.map(lambda x: x[0], samples)
+    kind = f" ({first.t.dtype})"
+    acc = shape_of(findings, "init(sample)" + kind, fold.init, first)
+    if acc is None:
+        return
+    after = shape_of(findings, "update(acc, sample)" + kind, fold.update, acc, first)
+    same_structure(findings, "update(acc, sample)" + kind, after, acc)
+    result = shape_of(findings, "finish(acc)" + kind, fold.finish, acc)
+    if result is None:
+        return
+    if findings.require(isinstance(result, dict), f"finish(acc) gives {type(result).__name__}", "It must be a dict from name to array"):
+        mend = "Every name needs a unit, and every unit a name"
+        findings.require(set(result) == set(fold.units), f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}", mend)
+
+
+def _at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
+    """On a run without any error or torque, nothing is NaN, and nor is any derivative."""
+    rest = jax.tree.map(lambda x: jnp.zeros_like(x), samples)._replace(
+        t=samples.t, dt=samples.dt, lower=samples.lower, upper=samples.upper, q=samples.q_d, q_d=samples.q_d
+    )
+    moving = {k: v for k, v in rest._asdict().items() if jnp.issubdtype(v.dtype, jnp.floating)}
+    flags = {k: v for k, v in rest._asdict().items() if k not in moving}
+
+    @jax.jit
+    def both(fold, moving):
+        def floats(fold, moving):
+            result = _folded(fold, samples_from(moving, flags))
+            return {k: v for k, v in result.items() if jnp.issubdtype(v.dtype, jnp.floating)}
+
+        values, pull = jax.vjp(floats, fold, moving)
+        finite = {k: jnp.where(jnp.isfinite(v), jnp.ones_like(v), 0.0) for k, v in values.items()}
+        return values, pull(finite)
+
+    values, gradient = both(fold, moving)
+    for name, value in values.items():
+        findings.require(not np.any(np.isnan(value)), f"{name} is NaN on a run without any error", "Guard divisions and roots by zero")
+    clean = all(not np.any(np.isnan(x)) for x in jax.tree.leaves(gradient))
+    findings.require(clean, "its derivative is NaN on a run without any error", "sqrt(0) has no derivative: use a double jnp.where")

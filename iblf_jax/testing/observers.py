@@ -1,0 +1,72 @@
+"""The checker for disturbance observers: the contract is `iblf_jax.observers.Observer`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.observers import Observer
+from iblf_jax.presets import customary_two_link
+from iblf_jax.scenario import fit_joints
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+
+
+def check_observer(observer: Any, *, model: Any = None) -> None:
+    """Checks an observer: shapes, the state's structure, derivatives, float32, and a hundred steps of a scan.
+
+    Args:
+      observer: an instance.
+      model: the robot that it knows; the customary two-link arm if not given.
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(observer, "Observer", Observer) as findings:
+        model = in_dtype(customary_two_link() if model is None else model, "float64")
+        n, t = model.n, jnp.asarray(0.7)
+        fitted = fit_joints(in_dtype(observer, "float64"), n, "observer")
+        q, dq, tau = jnp.asarray(np.random.default_rng(3).uniform(-1, 1, (3, n)))
+        for dtype in ("float64", "float32"):
+            _structure(findings, *in_dtype((fitted, t, q, dq, tau, model), dtype))
+        findings.stop_if_any()
+
+        def outputs(observer, t, q, dq, tau, model):
+            state = observer.init(q, 0.5 * dq, model)
+            rate = observer.derivative(t, q, dq, tau, model, state)
+            named = {f"derivative, leaf {i}": x for i, x in enumerate(jax.tree.leaves(rate))}
+            return {"estimate": observer.estimate(t, q, dq, model, state), **named}
+
+        probe(findings, outputs, fitted, (t, q, dq, tau, model))
+        for dtype in ("float64", "float32"):
+            _scan(findings, *in_dtype((fitted, t, q, dq, tau, model), dtype))
+
+
+def _structure(findings: Findings, observer, t, q, dq, tau, model) -> None:
+    n, kind = model.n, f" ({q.dtype})"
+    state = shape_of(findings, "init(q, dq, model)" + kind, observer.init, q, dq, model)
+    if state is None:
+        return
+    label = "estimate(t, q, dq, model, state)" + kind
+    has_shape(findings, label, shape_of(findings, label, observer.estimate, t, q, dq, model, state), (n,))
+    label = "derivative(t, q, dq, tau, model, state)" + kind
+    same_structure(findings, label, shape_of(findings, label, observer.derivative, t, q, dq, tau, model, state), state)
+
+
+def _scan(findings: Findings, observer, t, q, dq, tau, model) -> None:
+    """Euler steps at a standstill: the state keeps its structure and stays finite."""
+
+    def step(state, _):
+        rate = observer.derivative(t, q, dq, tau, model, state)
+        state = jax.tree.map(lambda x, dx: x + 1e-3 * dx, state, rate)
+        return state, observer.estimate(t, q, dq, model, state)
+
+    try:
+        state, estimates = jax.jit(lambda: jax.lax.scan(step, observer.init(q, dq, model), length=100))()
+    except TypeError as error:
+        findings.add(f"its state does not keep its type in a scan ({str(error).splitlines()[0]})")
+        return
+    finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, estimates)))
+    findings.require(finite, "its state is not finite after 0.1 s at a standstill with a constant torque", "Look at the signs of its rate")

@@ -1,0 +1,110 @@
+"""The checker for robots: the contract is `iblf_jax.robots.Robot`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.robots import Robot, coriolis_from_mass_matrix, mass_matrix_rate
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
+
+TOLERANCE = 1e-9
+"""Relative, float64: closed forms and automatic differentiation agree to rounding."""
+
+
+def check_robot(robot: Any, *, q: Any = None) -> None:
+    """Checks a robot: shapes, derivatives, float32; M positive definite, M' - 2 C skew, G = dU/dq, J = d tip/dq.
+
+        M = M^T > 0,   x^T (M' - 2 C) x = 0,   C(q, v) v = M' v - 1/2 d/dq (v^T M v),   G = dU/dq
+
+    Args:
+      robot: an instance.
+      q: configurations to look at, (m, n) [rad or m]; random ones if not given.
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(robot, "Robot", Robot) as findings:
+        n = robot.n
+        findings.require(isinstance(n, int) and n >= 1, f"n is {n!r}", "It must be the number of joints, a Python int")
+        findings.require(hasattr(robot, "payload"), "it has no leaf `payload`", "Add a point mass at the tip [kg], 0 by default")
+        findings.stop_if_any()
+        robot = in_dtype(robot, "float64")
+        rng = np.random.default_rng(1)
+        points = jnp.asarray(rng.uniform(-2, 2, (4, n)) if q is None else np.atleast_2d(np.asarray(q, float)))
+        _shapes(findings, robot, points[0])
+        findings.stop_if_any()
+
+        def outputs(robot, q, v, u):
+            return {
+                "mass_matrix(q)": robot.mass_matrix(q),
+                "coriolis(q, v, u)": robot.coriolis(q, v, u),
+                "gravity(q)": robot.gravity(q),
+                "potential(q)": robot.potential(q),
+                "tip(q)": robot.tip(q),
+                "jacobian(q)": robot.jacobian(q),
+                "skeleton(q)": robot.skeleton(q),
+            }
+
+        v, u = jnp.asarray(rng.normal(size=(2, n)))
+        probe(findings, outputs, robot, (points[0], v, u))
+        numbers = jax.jit(jax.vmap(_identities, in_axes=(None, 0, None, None)))(robot, points, v, u)
+        _physics(findings, {name: np.asarray(value) for name, value in numbers.items()})
+
+
+def _shapes(findings: Findings, robot: Any, q: Any) -> None:
+    n = robot.n
+    tip = shape_of(findings, "tip(q)", robot.tip, q)
+    if tip is not None:
+        findings.require(tip.shape in ((2,), (3,)), f"tip(q) has shape {tip.shape}", "It must be (2,) or (3,)")
+    d = tip.shape[0] if tip is not None and tip.shape in ((2,), (3,)) else 2
+    methods = {
+        "mass_matrix(q)": (robot.mass_matrix, (q,), (n, n)),
+        "coriolis(q, v, u)": (robot.coriolis, (q, q, q), (n,)),
+        "gravity(q)": (robot.gravity, (q,), (n,)),
+        "potential(q)": (robot.potential, (q,), ()),
+        "jacobian(q)": (robot.jacobian, (q,), (d, n)),
+        "skeleton(q)": (robot.skeleton, (q,), (n + 1, d)),
+    }
+    for label, (method, args, shape) in methods.items():
+        has_shape(findings, label, shape_of(findings, label, method, *args), shape)
+
+
+def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[str, jax.Array]:
+    """Quantities of the robot next to what they should equal."""
+    M = robot.mass_matrix(q)
+    C = jax.vmap(lambda e: robot.coriolis(q, v, e), out_axes=1)(jnp.eye(robot.n))
+    N = mass_matrix_rate(robot, q, v) - 2.0 * C
+    return {
+        "M": M,
+        "asymmetry": M - M.T,
+        "skew": N + N.T,
+        "skew_scale": jnp.max(jnp.abs(C)),
+        "linear": robot.coriolis(q, v, u) - C @ u,
+        "christoffel": robot.coriolis(q, v, v) - coriolis_from_mass_matrix(robot.mass_matrix, q, v, v),
+        "gravity": robot.gravity(q) - jax.grad(robot.potential)(q),
+        "gravity_scale": jnp.max(jnp.abs(robot.gravity(q))),
+        "jacobian": robot.jacobian(q) - jax.jacfwd(robot.tip)(q),
+        "tip": robot.skeleton(q)[-1] - robot.tip(q),
+    }
+
+
+def _physics(findings: Findings, got: dict[str, np.ndarray]) -> None:
+    def small(name, scale, problem, mend):
+        size = float(np.max(np.abs(got[name])))
+        findings.require(size <= TOLERANCE * max(1.0, float(scale)), f"{problem} (by {size:.2g})", mend)
+
+    scale = np.max(np.abs(got["M"]))
+    motion = max(np.max(np.abs(got["skew_scale"])), scale)
+    small("asymmetry", scale, "M(q) is not symmetric", "Build it symmetric")
+    lowest = float(np.min(np.linalg.eigvalsh(0.5 * (got["M"] + np.swapaxes(got["M"], 1, 2)))))
+    findings.require(lowest > 0, f"M(q) is not positive definite (lowest eigenvalue {lowest:.3g})", "Give every joint some inertia")
+    small("linear", motion, "coriolis(q, v, u) is not linear in u", "It is C(q, v) u, not C(q, v) v")
+    small("christoffel", motion, "coriolis(q, v, v) does not follow from M(q)", "Use iblf_jax.robots.from_energy to derive it")
+    small("skew", motion, "M' - 2 C is not skew-symmetric", "Use the Christoffel symbols: iblf_jax.robots.from_energy")
+    small("gravity", np.max(got["gravity_scale"]), "gravity(q) is not dU/dq of potential(q)", "Look at signs and heights")
+    small("jacobian", 1.0, "jacobian(q) is not d tip/dq", "Use iblf_jax.robots.from_energy")
+    small("tip", 1.0, "the last row of skeleton(q) is not tip(q)", "skeleton is base, joints, tip")

@@ -1,0 +1,133 @@
+"""The checkers for references, sides of the bounds, and disturbances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.bounds import Side
+from iblf_jax.disturbances import Disturbance
+from iblf_jax.presets import customary_two_link
+from iblf_jax.references import Reference
+from iblf_jax.scenario import fit_joints
+from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, joints_of, probe, shape_of
+
+
+def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A function of time with its first and second derivative, by jvp."""
+
+    def first(t):
+        return jax.jvp(function, (t,), (jnp.ones_like(t),))
+
+    (value, rate), (_, second) = jax.jvp(first, (t,), (jnp.ones_like(t),))
+    return value, rate, second
+
+
+def _smooth_in_time(findings: Findings, label: str, function: Any, duration: float) -> None:
+    """Value, rate and second rate are finite, the first two without jumps, on [0, duration]."""
+    times = jnp.linspace(0.0, duration, 401)
+    value, rate, second = jax.jit(jax.vmap(lambda t: rates(function, t)))(times)
+    for name, numbers in ((label, value), (f"the rate of {label}", rate), (f"the second rate of {label}", second)):
+        bad = np.flatnonzero(~np.all(np.isfinite(np.asarray(numbers).reshape(times.size, -1)), axis=1))
+        where = f"t = {float(times[bad[0]]):g} s" if bad.size else ""
+        findings.require(bad.size == 0, f"{name} is not finite at {where}", "The law differentiates it twice; mind sqrt, division and clip")
+    findings.stop_if_any()
+    for name, part in ((label, 0), (f"the rate of {label}", 1)):
+        jump = find_jump(lambda t, part=part: rates(function, t)[part], 0.0, duration)
+        at = "" if jump is None else f"{jump:.6g}"
+        findings.require(jump is None, f"{name} jumps at t = {at} s", "It must be twice differentiable: blend the pieces smoothly")
+
+
+def check_reference(reference: Any, *, n: int | None = None, duration: float = 20.0) -> None:
+    """Checks a reference: shape, derivatives, float32, and q_d, q_d', q_d" finite, the first two continuous.
+
+    Args:
+      reference: an instance.
+      n: number of joints; found from its leaves if not given.
+      duration: stretch of time to look at [s].
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(reference, "Reference", Reference) as findings:
+        t = jnp.asarray(0.3217 * duration)
+        fitted = fit_joints(in_dtype(reference, "float64"), joints_of(reference) if n is None else n, "reference")
+        got = shape_of(findings, "position(t)", fitted.position, t)
+        expected = got.shape if n is None and got is not None and len(got.shape) == 1 else (n or joints_of(reference),)
+        has_shape(findings, "position(t)", got, expected)
+        findings.stop_if_any()
+        probe(
+            findings,
+            lambda r, t: dict(zip(("position(t)", "its rate", "its second rate"), rates(r.position, t), strict=True)),
+            fitted,
+            (t,),
+        )
+        _smooth_in_time(findings, "position(t)", fitted.position, duration)
+
+
+def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> None:
+    """Checks one side of the bounds: shape, derivatives, float32, and the bound with its rates finite and continuous.
+
+    Args:
+      side: an instance.
+      n: number of joints; found from its leaves if not given.
+      duration: stretch of time to look at [s].
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(side, "Side", Side) as findings:
+        n = joints_of(side) if n is None else n
+        t = jnp.asarray(0.3217 * duration)
+        fitted = fit_joints(in_dtype(side, "float64"), n, "side")
+        q_d = jnp.linspace(0.3, 0.7, n)
+        has_shape(findings, "at(t, q_d)", shape_of(findings, "at(t, q_d)", fitted.at, t, q_d), (n,))
+        findings.stop_if_any()
+
+        def along(side, t, q_d):
+            return side.at(t, q_d + 0.1 * jnp.sin(t))
+
+        def outputs(side, t, q_d):
+            bound = rates(lambda t: along(side, t, q_d), t)
+            return dict(zip(("at(t, q_d)", "its rate", "its second rate"), bound, strict=True))
+
+        probe(findings, outputs, fitted, (t, q_d))
+        _smooth_in_time(findings, "at(t, q_d)", lambda t: along(fitted, t, q_d), duration)
+
+
+def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None, duration: float = 20.0) -> None:
+    """Checks a disturbance: shapes, derivatives, float32, and that every jump is declared in `jump_times`.
+
+    Args:
+      disturbance: an instance.
+      plant: robot that it acts on; the customary two-link arm if not given.
+      model: what the law knows of it; the plant if not given.
+      duration: stretch of time to look at [s].
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    with examine(disturbance, "Disturbance", Disturbance) as findings:
+        plant = in_dtype(customary_two_link() if plant is None else plant, "float64")
+        model = plant if model is None else in_dtype(model, "float64")
+        n, t = plant.n, jnp.asarray(0.3217 * duration)
+        fitted = fit_joints(in_dtype(disturbance, "float64"), n, "disturbance")
+        rng = np.random.default_rng(2)
+        q, dq = jnp.asarray(rng.uniform(-1, 1, (2, n)))
+        label = "torque(t, q, dq, plant, model)"
+        has_shape(findings, label, shape_of(findings, label, fitted.torque, t, q, dq, plant, model), (n,))
+        jumps = shape_of(findings, "jump_times()", fitted.jump_times)
+        if jumps is not None:
+            has_shape(findings, "jump_times()", jumps, (jumps.shape[0],) if getattr(jumps, "ndim", 0) else (0,))
+        findings.stop_if_any()
+        probe(findings, lambda d, *args: {label: d.torque(*args)}, fitted, (t, q, dq, plant, model))
+        known = np.asarray(fitted.jump_times(), float)
+        findings.require(np.all(np.isfinite(known)), f"jump_times() has {known}", "Give finite times, or an empty array")
+        findings.stop_if_any()
+        jump = find_jump(lambda t: fitted.torque(t, q, dq, plant, model), 0.0, duration, tuple(known))
+        at = "" if jump is None else f"{jump:.6g}"
+        mend = "Return that time in jump_times(): the envelopes of Theorem 2 restart there"
+        findings.require(jump is None, f"the torque jumps at t = {at} s, which jump_times() does not say", mend)

@@ -1,0 +1,64 @@
+"""Settings of all tests: float64, a compilation cache on disk, no display, and the compiled runs that many tests share."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import hypothesis
+import jax
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".jax_cache"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+hypothesis.settings.register_profile("default", deadline=None, max_examples=100, derandomize=bool(os.environ.get("CI")))
+hypothesis.settings.load_profile("default")
+
+import iblf_jax as ij
+
+PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
+"""The paper's run on the grid of the reference data; used wherever the length does not matter, so that it compiles once."""
+
+SHORT = {"duration": 0.5, "dt": 1e-3}
+"""A run with every step recorded; used wherever the length does not matter, so that it compiles once."""
+
+
+@pytest.fixture(scope="session")
+def paper() -> ij.Scenario:
+    """The paper's scenario as printed."""
+    return ij.presets.zhang_yan_2024()
+
+
+@pytest.fixture(scope="session")
+def paper_run(paper) -> ij.Rollout:
+    """The paper's run, 20 s."""
+    return ij.simulate(paper, **PAPER)
+
+
+@pytest.fixture(scope="session")
+def short_run(paper) -> ij.Rollout:
+    """The first half second, every step recorded."""
+    return ij.simulate(paper, **SHORT)
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> dict[str, np.ndarray]:
+    """The paper's run by an independent program (SciPy DOP853, rtol 1e-12)."""
+    with np.load(ROOT / "tests" / "data" / "paper_reference.npz") as data:
+        return dict(data)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Random numbers, the same ones in every test."""
+    return np.random.default_rng(0)

@@ -1,0 +1,308 @@
+"""Bad input is a ValueError that names the field, the value and the mend; a doubtful one is a warning."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from decimal import Decimal
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import SHORT
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+
+ARM = {"mass": [2.0, 0.85], "length": [0.35, 0.31], "centre": [0.2, 0.15], "inertia": [0.06, 0.02]}
+
+
+def refuses(call, *words):
+    """The call raises ValueError with all these words in it."""
+    with pytest.raises(ValueError, match=r"(?s)\w+.*: got .*, expected .+") as caught:
+        call()
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+BAD_NUMBERS = {
+    "nan": (float("nan"), "finite"),
+    "infinity": (np.inf, "finite"),
+    "zero": (0.0, "> 0"),
+    "negative": (-1.0, "> 0"),
+    "one-negative": ([1.0, -1.0], "> 0"),
+    "string": ("2.0", "number"),
+    "numpy-string": (np.str_("2"), "number"),
+    "none": (None, "number"),
+    "bool": (True, "real numbers"),
+    "complex": (1.0 + 2.0j, "real numbers"),
+    "complex-array": (np.ones(2, complex), "real numbers"),
+    "dict": ({"a": 1.0}, "number"),
+    "set": ({1.0}, "number"),
+    "ragged": ([[1.0], [1.0, 2.0]], "rectangular"),
+    "list-with-none": ([1.0, None], "number"),
+    "list-with-string": ([1.0, "2"], "number"),
+    "matrix": (np.ones((2, 2)), "(n,)"),
+    "object-array": (np.asarray([object()]), "numbers"),
+    "decimal": (Decimal("2.0"), "numbers"),
+    "huge-int": (10**400, "numbers"),
+    "function": (np.sin, "number"),
+    "class": (robots.TwoLink, "number"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_NUMBERS)
+def test_numbers_of_a_component(case):
+    value, word = BAD_NUMBERS[case]
+    refuses(lambda: controllers.Backstepping(k1=value, K2=20.0), "Backstepping.k1", word)
+    refuses(lambda: robots.TwoLink(**(ARM | {"mass": value})), "TwoLink.mass", word)
+    refuses(lambda: observers.Momentum(kf=value), "Momentum.kf", word)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [2, 2.0, np.float32(2), np.float64(2), np.int8(2), np.asarray(2.0), jnp.asarray(2), Fraction(2), [2, 2], (2.0, 2), np.full(2, 2)],
+)
+def test_numbers_that_are_fine(value):
+    if isinstance(value, Fraction):
+        refuses(lambda: controllers.Backstepping(k1=value, K2=20.0), "Backstepping.k1")
+        return
+    k1 = controllers.Backstepping(k1=value, K2=20.0).k1
+    assert jnp.issubdtype(k1.dtype, jnp.floating)
+    np.testing.assert_array_equal(k1, 2.0)
+
+
+COMPONENTS = {
+    "two-link-of-three": (lambda: robots.TwoLink(**(ARM | {"mass": [1.0, 1.0, 1.0]})), "TwoLink.mass", "(2,)"),
+    "chain-sizes": (lambda: robots.PlanarChain(mass=[1.0, 1.0], length=[1.0], centre=0.1, inertia=0.1), "PlanarChain.length", "(2,)"),
+    "chain-of-scalars": (lambda: robots.PlanarChain(mass=1.0, length=1.0, centre=0.1, inertia=0.1), "PlanarChain.mass", "how many"),
+    "chain-of-none": (lambda: robots.PlanarChain(mass=[], length=[], centre=[], inertia=[]), "PlanarChain.mass", "at least one"),
+    "payload-array": (lambda: robots.TwoLink(**ARM, payload=[1.0, 2.0]), "TwoLink.payload", "one number"),
+    "reading": (lambda: controllers.Backstepping(2.0, 20.0, reading="exact"), "Backstepping.reading", "'printed', 'corrected'"),
+    "reading-array": (lambda: controllers.Backstepping(2.0, 20.0, reading=np.asarray(["printed"])), "reading", "hashable"),
+    "barrier-name": (lambda: controllers.Backstepping(2.0, 20.0, barrier="integral"), "Backstepping.barrier", "barriers.Integral()"),
+    "barrier-class": (lambda: controllers.Backstepping(2.0, 20.0, barrier=barriers.Log), "Backstepping.barrier", "brackets"),
+    "barrier-number": (lambda: controllers.Backstepping(2.0, 20.0, barrier=3), "Backstepping.barrier", "Integral()"),
+    "barrier-none": (lambda: controllers.Backstepping(2.0, 20.0, barrier=None), "Backstepping.barrier", "component"),
+    "guard": (lambda: barriers.Integral(guard=1.5), "Integral.guard", "between 0 and 1"),
+    "guard-zero": (lambda: barriers.Log(guard=0.0), "Log.guard", "positive"),
+    "guard-word": (lambda: barriers.Log(guard="small"), "Log.guard", "positive"),
+    "p-zero": (lambda: barriers.Log(p=0), "Log.p", ">= 1"),
+    "p-half": (lambda: barriers.Log(p=1.5), "Log.p", "whole"),
+    "p-bool": (lambda: barriers.Log(p=True), "Log.p", "whole"),
+    "observer-start": (lambda: observers.Printed(kf=20.0, start="cold"), "Printed.start", "'matched'"),
+    "side-number": (lambda: bounds.Bounds(0.1, 0.9), "Bounds.lower", "Constant(value)"),
+    "side-none": (lambda: bounds.Bounds(bounds.Constant(0.1), None), "Bounds.upper", "component"),
+    "friction-width": (lambda: disturbances.Friction(width=0.0), "Friction.width", "> 0"),
+    "friction-negative": (lambda: disturbances.Friction(viscous=-0.1), "Friction.viscous", ">= 0"),
+    "sum-of-numbers": (lambda: disturbances.Sum((1.0, 2.0)), "Sum.parts", "tuple of disturbances"),
+    "sum-of-one": (lambda: disturbances.Sum(disturbances.Friction()), "Sum.parts", "brackets"),
+    "sum-of-words": (lambda: disturbances.Sum(("friction",)), "Sum.parts[0]", "Disturbance"),
+    "spline-order": (lambda: references.WaypointSpline((0.0, 0.0), [[0.0], [1.0]]), "WaypointSpline.times", "increasing"),
+    "spline-words": (lambda: references.WaypointSpline(("a", "b"), [[0.0], [1.0]]), "WaypointSpline.times", "increasing"),
+    "spline-rows": (lambda: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0], [2.0]]), "WaypointSpline.waypoints", "row"),
+    "spline-list": (lambda: references.WaypointSpline([0.0, 1.0], [[0.0], [1.0]]), "WaypointSpline.times", "tuple"),
+    "quintic": (lambda: references.Quintic(0.0, 1.0, duration=-2.0), "Quintic.duration", "> 0"),
+    "preset-law": (lambda: ij.presets.zhang_yan_2024(law="tangent"), "law", "'integral', 'log'"),
+    "preset-reading": (lambda: ij.presets.zhang_yan_2024(reading=None), "reading", "'printed'"),
+    "dtype-int": (lambda: ij.astype(ij.presets.zhang_yan_2024(), "int32"), "dtype", "float32"),
+    "dtype-word": (lambda: ij.astype(ij.presets.zhang_yan_2024(), "double-double"), "dtype", "float32"),
+}
+
+
+@pytest.mark.parametrize("case", COMPONENTS)
+def test_components(case):
+    call, *words = COMPONENTS[case]
+    refuses(call, *words)
+
+
+def with_part(**parts):
+    return lambda: ij.simulate(dataclasses.replace(ij.presets.zhang_yan_2024(), **parts), **SHORT)
+
+
+TUBE = ij.presets.zhang_yan_2024().bounds
+CHAIN3 = robots.PlanarChain(mass=[1.0, 1.0, 1.0], length=0.3, centre=0.1, inertia=0.1)
+SCENARIOS = {
+    "plant-none": (with_part(plant=None), "Scenario.plant", "component"),
+    "plant-name": (with_part(plant="two_link"), "Scenario.plant", "robots"),
+    "plant-class": (with_part(plant=robots.TwoLink), "Scenario.plant", "brackets"),
+    "plant-is-a-bound": (with_part(plant=bounds.Constant(1.0)), "Scenario.plant", "lacks", "mass_matrix"),
+    "model-of-three": (with_part(model=CHAIN3), "Scenario.model", "3 joints", "2 joints"),
+    "plant-of-three": (with_part(plant=CHAIN3, model=CHAIN3), "got", "3 (one a joint)"),
+    "reference-class": (with_part(reference=references.Sinusoid), "Scenario.reference", "brackets"),
+    "reference-array": (with_part(reference=np.ones(2)), "Scenario.reference", "Reference"),
+    "reference-of-three": (
+        with_part(reference=references.WaypointSpline((0.0, 1.0), [[0.5] * 3, [0.6] * 3])),
+        "reference.position",
+        "(3,)",
+        "(2,)",
+    ),
+    "bounds-one-side": (with_part(bounds=bounds.Constant(0.1)), "Scenario.bounds", "Bounds(lower="),
+    "bounds-exchanged": (with_part(bounds=bounds.Bounds(TUBE.upper, TUBE.lower)), "bounds of joint 0", "lower < upper", "Exchange"),
+    "bounds-wrong-n": (with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)), "bounds.lower.value", "2 (one a joint)"),
+    "controller-object": (with_part(controller=object()), "Scenario.controller", "check_law"),
+    "controller-gains": (with_part(controller=[2.0, 20.0]), "Scenario.controller", "Controller"),
+    "observer-number": (with_part(observer=20.0), "Scenario.observer", "NoObserver()"),
+    "disturbance-list": (with_part(disturbance=[disturbances.Friction()]), "Scenario.disturbance", "Nothing()"),
+    "tip-force-in-space": (with_part(disturbance=disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])), "disturbance.torque", "(2,)"),
+    "initial-tuple": (with_part(initial=(0.8, 0.8)), "Scenario.initial", "Initial(q="),
+    "initial-of-three": (with_part(initial=ij.Initial(q=[0.8, 0.8, 0.8])), "initial.q", "2 (one a joint)"),
+    "start-above": (with_part(initial=ij.Initial(q=[1.05, 0.8])), "initial.q[0]", "1.05", "(0.34, 1.04)", "Move the start"),
+    "start-on-the-bound": (with_part(initial=ij.Initial(q=[0.8, 0.9])), "initial.q[1]", "inside the bounds"),
+    "start-below": (with_part(initial=ij.Initial(q=[0.8, 0.1])), "initial.q[1]", "0.1"),
+    "start-too-fast": (with_part(initial=ij.Initial(q=0.8, dq=1e5)), "initial.dq", "10000"),
+    "reference-outside": (with_part(reference=references.Sinusoid(1.5, 0.1)), "reference of joint 0", "Assumption 2"),
+    "massless-link": (
+        with_part(plant=robots.TwoLink(mass=1.0, length=1.0, centre=0.0, inertia=0.0)),
+        "plant.mass_matrix",
+        "positive definite",
+    ),
+    "float16": (lambda: ij.simulate(ij.astype(ij.presets.zhang_yan_2024(), "float16"), **SHORT), "scenario", "float16", "float32"),
+    "not-a-scenario": (lambda: ij.simulate({"law": "integral"}, **SHORT), "scenario", "ij.presets"),
+    "not-a-scenario-dt": (lambda: ij.recommended_dt(None), "scenario", "ij.presets"),
+}
+
+
+@pytest.mark.parametrize("case", SCENARIOS)
+def test_scenarios(case):
+    call, *words = SCENARIOS[case]
+    refuses(call, *words)
+
+
+def test_nan_that_came_in_by_a_tree_map_is_found_with_its_path():
+    scenario = jax.tree.map(lambda x: x, ij.presets.zhang_yan_2024())
+    object.__setattr__(scenario.controller, "K2", jnp.asarray([20.0, jnp.nan]))
+    refuses(lambda: ij.simulate(scenario, **SHORT), "controller.K2", "finite")
+
+
+ARGUMENTS = {
+    "dt-zero": ({"dt": 0.0}, "dt", "positive"),
+    "dt-negative": ({"dt": -1e-3}, "dt", "positive"),
+    "dt-nan": ({"dt": float("nan")}, "dt", "positive"),
+    "dt-infinite": ({"dt": np.inf}, "dt", "positive"),
+    "dt-word": ({"dt": "1e-3"}, "dt", "positive"),
+    "dt-none": ({"dt": None}, "dt", "positive"),
+    "dt-array": ({"dt": np.asarray([1e-3])}, "dt", "positive"),
+    "dt-too-long": ({"dt": 1.0}, "duration", "whole number of steps"),
+    "dt-tiny": ({"dt": 1e-300}, "duration", "at most"),
+    "duration-zero": ({"duration": 0}, "duration", "positive"),
+    "duration-bool": ({"duration": True}, "duration", "positive"),
+    "duration-complex": ({"duration": 1j}, "duration", "positive"),
+    "duration-date": ({"duration": np.datetime64("2020")}, "duration", "positive"),
+    "duration-text": ({"duration": np.str_("1")}, "duration", "positive"),
+    "duration-huge": ({"duration": 10**400}, "duration", "positive"),
+    "duration-long": ({"duration": 1e300}, "duration", "at most", "Shorten"),
+    "duration-broken": ({"duration": 0.0105}, "duration", "0.0105", "whole number", "Take duration=0.01 or dt=0.00105"),
+    "too-many-samples": ({"duration": 1e6}, "record_every", "Take record_every="),
+    "record-zero": ({"record_every": 0}, "record_every", ">= 1"),
+    "record-half": ({"record_every": 1.5}, "record_every", "whole"),
+    "record-none": ({"record_every": None}, "record_every", "whole"),
+    "method": ({"method": "rk45"}, "method", "'euler', 'heun', 'rk4'"),
+    "method-none": ({"method": None}, "method", "'rk4'"),
+    "method-array": ({"method": np.asarray(["rk4", "x"])}, "method", "'rk4'"),
+    "method-list": ({"method": ["rk4"]}, "method", "'rk4'"),
+}
+
+
+@pytest.mark.parametrize("case", ARGUMENTS)
+def test_arguments_of_simulate(case, paper):
+    options, *words = ARGUMENTS[case]
+    refuses(lambda: ij.simulate(paper, **(SHORT | options)), *words)
+
+
+def test_a_duration_in_float32_is_taken_for_what_it_was(paper):
+    assert ij.simulate(paper, duration=np.float32(0.5), dt=np.float32(1e-3)).t.size == 501
+
+
+def test_a_traced_step_says_what_to_do(paper):
+    with pytest.raises(ValueError, match=r"dt: got a value that JAX is tracing.*static_argnames"):
+        jax.jit(lambda dt: ij.simulate(paper, duration=0.5, dt=dt).q)(1e-3)
+
+
+PATHS = {
+    "unknown": ("controller.K3", "controller.K2"),
+    "no-such-part": ("engine.power", "parameters(scenario)"),
+    "a-part": ("controller", "path"),
+    "static": ("controller.reading", "path"),
+    "beyond-the-end": ("plant.mass[2]", "plant.mass"),
+    "before-the-start": ("plant.mass[-3]", "plant.mass"),
+    "far-beyond": ("plant.mass[99999999999999999999]", "path"),
+    "into-a-number": ("plant.g[0]", "plant.g"),
+    "deep": ("plant.mass[0][0]", "plant.mass"),
+    "index-on-a-part": ("plant[0]", "path"),
+    "empty": ("", "names joined by dots"),
+    "dots": ("plant..mass", "names joined by dots"),
+    "leading-dot": (".plant.mass", "names joined by dots"),
+    "slice": ("plant.mass[0:1]", "names joined by dots"),
+    "space": ("plant. mass", "names joined by dots"),
+    "private": ("plant.__class__", "path"),
+    "number": (3, "names joined by dots"),
+    "none": (None, "names joined by dots"),
+    "tuple": (("plant", "mass"), "names joined by dots"),
+    "robot-alone": ("robot", "path"),
+}
+
+
+@pytest.mark.parametrize("case", PATHS)
+def test_paths(case, paper):
+    path, word = PATHS[case]
+    refuses(lambda: ij.with_parameters(paper, {path: 1.0}), "path", word)
+
+
+VALUES = {
+    "negative": ("plant.mass[1]", -1.0, "> 0"),
+    "zero": ("robot.mass", 0.0, "> 0"),
+    "nan": ("initial.q", float("nan"), "finite"),
+    "shape": ("controller.K2", [1.0, 2.0, 3.0], "(2,)"),
+    "shape-of-an-entry": ("controller.K2[0]", [1.0, 2.0], "()"),
+    "word": ("controller.K2", "20", "numbers"),
+    "none": ("controller.K2", None, "numbers"),
+    "bool": ("controller.K2", True, "real numbers"),
+    "complex": ("controller.K2", 1j, "real numbers"),
+    "part": ("controller.K2", barriers.Integral(), "numbers"),
+}
+
+
+@pytest.mark.parametrize("case", VALUES)
+def test_values(case, paper):
+    path, value, word = VALUES[case]
+    refuses(lambda: ij.with_parameters(paper, {path: value}), path.replace("robot", "plant"), word)
+
+
+def test_with_parameters_takes_a_mapping_and_a_scenario(paper):
+    refuses(lambda: ij.with_parameters(paper, [("controller.K2", 1.0)]), "values", "mapping")
+    refuses(lambda: ij.with_parameters("paper", {}), "scenario", "ij.presets")
+    refuses(lambda: ij.parameters(ij.Scenario), "scenario", "ij.presets")
+
+
+def test_with_parameters_changes_what_it_says_and_nothing_else(paper):
+    values = {"controller.K2": 30, "plant.mass[1]": 1.1, "robot.g": 1.62, "initial.q[-1]": 0.7}
+    other = ij.with_parameters(paper, values)
+    got = {p.path: np.asarray(p.value) for p in ij.parameters(other)}
+    expected = {p.path: np.array(p.value) for p in ij.parameters(paper)}
+    expected["controller.K2"][:] = 30
+    expected["plant.mass"][1] = 1.1
+    expected["initial.q"][1] = 0.7
+    expected["plant.g"] = expected["model.g"] = np.asarray(1.62)
+    for path, value in expected.items():
+        np.testing.assert_array_equal(got[path], value, err_msg=path)
+    assert float(paper.plant.mass[1]) == 0.85
+    assert jax.tree.structure(other) == jax.tree.structure(paper)
+
+
+def test_every_parameter_can_be_written_back_by_its_path(paper):
+    table = {p.path: p.value for p in ij.parameters(paper)}
+    again = ij.with_parameters(paper, table)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(paper), strict=True))
+
+
+def test_a_warning_points_at_the_callers_line(paper):
+    weak = ij.with_parameters(paper, {"controller.K2": 0.4})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ij.simulate(weak, **SHORT)
+    advice = [w for w in caught if "Theorem 2" in str(w.message)]
+    assert len(advice) == 1
+    assert advice[0].filename == __file__

@@ -1,0 +1,158 @@
+"""The layers of the package, held by its imports: they go down only.
+
+    6 outside     presets  scenario_file  io  codec  plain  plotting/  cli/  testing/
+    5 studies     _monte_carlo  _sweep  tuning/
+    4 judgement   certificates
+    3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  rollout  lowering/
+    2 the law     barriers/  observers/  controllers/
+    1 the world   robots/  references  bounds  disturbances
+    0 ground      pytree  linalg  checks  status
+
+An import inside a function may go up: that is how `run.plot()` finds matplotlib when it is asked for a picture.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+PACKAGE = ROOT / "iblf_jax"
+
+LAYERS = {
+    0: ("pytree", "linalg", "checks", "status", "one_function"),
+    1: ("robots", "references", "bounds", "disturbances"),
+    2: ("barriers", "observers", "controllers"),
+    3: ("integrators", "scenario", "closed_loop", "stability", "metrics", "results", "paths", "rollout", "lowering"),
+    4: ("certificates",),
+    5: ("_monte_carlo", "_sweep", "tuning"),
+    6: ("presets", "scenario_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
+}
+LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
+
+ONLY_IN = {"matplotlib": ("plotting",), "optax": ("tuning",), "argparse": ("cli",), "xarray": ("io", "_sweep", "_monte_carlo")}
+"""Library -> the modules that may use it, inside functions too."""
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+SOURCES = {path: path.read_text() for path in FILES}
+
+
+def module_of(path: Path) -> str:
+    """The top-level module or folder of a file, "" for the package's own __init__."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return "" if parts == ("__init__",) else parts[0]
+
+
+def imports(source: str, *, at_the_top: bool) -> set[str]:
+    """Full names of what a file imports, at its top only or anywhere; not what only type checkers see."""
+    found: set[str] = set()
+
+    def visit(node):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports name the package in full"
+            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if for_types or (at_the_top and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)):
+            return
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(source))
+    return found
+
+
+def edges(source: str) -> set[str]:
+    """Top-level modules of the package that a file imports at its top."""
+    names = [name.split(".") for name in imports(source, at_the_top=True)]
+    return {parts[1] for parts in names if parts[0] == "iblf_jax" and len(parts) > 1}
+
+
+def upward(module: str, source: str) -> set[str]:
+    """The modules of a higher layer that a file of `module` imports at its top."""
+    return {name for name in edges(source) if LAYER_OF.get(name, -1) > LAYER_OF[module]}
+
+
+def test_every_module_has_a_layer():
+    unknown = {module_of(path) for path in FILES} - set(LAYER_OF) - {""}
+    assert not unknown, f"say in which layer {unknown} belongs: tests/test_layers.py"
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if module_of(p)], ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_down_only(path):
+    up = upward(module_of(path), SOURCES[path])
+    assert not up, f"{path.name} is in layer {LAYER_OF[module_of(path)]} and imports {up} from above"
+
+
+def test_no_cycle_between_modules():
+    graph: dict[str, set[str]] = {}
+    for path in FILES:
+        if module_of(path):
+            graph.setdefault(module_of(path), set()).update(edges(SOURCES[path]) & set(LAYER_OF) - {module_of(path)})
+
+    def reach(module, seen=()):
+        assert module not in seen, f"a cycle: {' -> '.join([*seen, module])}"
+        for name in graph.get(module, ()):
+            reach(name, (*seen, module))
+
+    for module in graph:
+        reach(module)
+
+
+@pytest.mark.parametrize("library", ONLY_IN)
+def test_libraries_stay_in_their_place(library):
+    users = {module_of(p) for p, text in SOURCES.items() if any(x.split(".")[0] == library for x in imports(text, at_the_top=False))}
+    assert users <= set(ONLY_IN[library]), f"{library} belongs to {ONLY_IN[library]}, not to {users - set(ONLY_IN[library])}"
+
+
+def calls(source: str, name: str) -> list[int]:
+    """Lines that use an attribute chain such as jax.lax.scan or jax.config.update."""
+    return [node.lineno for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute) and ast.unparse(node) == name]
+
+
+def test_time_is_scanned_in_one_place():
+    """lax.scan is a loop over time; the power iteration of `stability` and the checkers' own scans are not runs."""
+    allowed = {"rollout", "lowering", "stability", "testing"}
+    users = {module_of(p) for p, text in SOURCES.items() if calls(text, "jax.lax.scan") or calls(text, "lax.scan")}
+    assert users <= allowed, users - allowed
+
+
+def test_the_session_is_left_alone():
+    """jax.config belongs to the user; only the command line, a program of its own, sets it."""
+    users = {module_of(p) for p, text in SOURCES.items() if calls(text, "jax.config")}
+    assert users <= {"cli", "__main__"}
+
+
+def test_no_prints_and_no_star_imports():
+    for path, text in SOURCES.items():
+        assert "import *" not in text, path
+        if module_of(path) != "cli":
+            tree = ast.walk(ast.parse(text))
+            assert not [n for n in tree if isinstance(n, ast.Call) and ast.unparse(n.func) == "print"], path
+
+
+def test_files_open_with_what_they_are_for():
+    for path, text in SOURCES.items():
+        assert ast.get_docstring(ast.parse(text)), f"{path} has no docstring"
+
+
+def test_no_leftovers():
+    for path, text in SOURCES.items():
+        assert not re.search(r"\b(TODO|FIXME|XXX|HACK)\b", text), path
+        assert not re.search(r"/(home|Users|work|opt)/\w", text), path
+
+
+def test_these_tests_can_fail():
+    assert upward("bounds", "from iblf_jax.rollout import simulate") == {"rollout"}
+    assert upward("bounds", "import iblf_jax.rollout") == {"rollout"}
+    assert upward("bounds", "from iblf_jax import rollout") == {"rollout"}
+    assert upward("results", "def plot(self):\n    from iblf_jax import plotting") == set()
+    assert upward("results", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from iblf_jax import plotting") == set()
+    assert upward("rollout", "from iblf_jax.bounds import Tube") == set()
+    assert imports("def f():\n    import optax.losses", at_the_top=False) == {"optax.losses"}
+    assert calls("import jax\nx = jax.lax.scan(f, 0, None)\njax.config.update('a', 1)", "jax.lax.scan") == [2]
+    assert calls("import jax\njax.config.update('a', 1)", "jax.config") == [2]

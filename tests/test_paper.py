@@ -1,0 +1,87 @@
+"""The paper's simulation against an independent program (SciPy DOP853, rtol 1e-12), and the numbers that it must show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import PAPER
+
+import iblf_jax as ij
+
+VARIANTS = [(law, reading) for law in ("integral", "log") for reading in ("printed", "corrected")]
+both = pytest.mark.parametrize(("law", "reading"), VARIANTS)
+
+
+def reference_of(data, law, reading):
+    prefix = f"{'iblf' if law == 'integral' else 'log'}_{reading}."
+    return {key.removeprefix(prefix): value for key, value in data.items() if key.startswith(prefix)}
+
+
+def largest(a, b):
+    return float(np.max(np.abs(np.asarray(a, float) - b)))
+
+
+@both
+def test_all_four_variants_at_one_millisecond(reference_data, law, reading):
+    run, ref = ij.simulate(ij.presets.zhang_yan_2024(law=law, reading=reading), **PAPER), reference_of(reference_data, law, reading)
+    assert run.ok
+    np.testing.assert_allclose(run.t, reference_data["t"], atol=1e-12)
+    assert largest(run.q, ref["q"]) <= 1e-7
+    assert largest(run.tau, ref["tau"]) <= 5e-4
+    assert largest(run.e1, ref["e1"]) <= 1e-7
+    assert largest(run.xi, ref["xi"]) <= 1e-6
+    assert largest(run.dq, ref["dq"]) <= 1e-5
+    assert largest(run.e2, ref["e2"]) <= 1e-5
+    assert largest(run.disturbance_estimate, ref["f_hat"]) <= 1e-5
+    assert largest(run.disturbance, ref["f"]) <= 1e-5
+    assert largest(run.observer_state, ref["eta"]) <= 1e-5
+    assert largest(run.V, ref["V2"]) <= 1e-6
+
+
+@both
+def test_torque_at_half_a_millisecond(reference_data, law, reading):
+    scenario, ref = ij.presets.zhang_yan_2024(law=law, reading=reading), reference_of(reference_data, law, reading)
+    run = ij.simulate(scenario, duration=20.0, dt=5e-4, record_every=20)
+    assert largest(run.tau, ref["tau"]) <= 2e-5
+    assert largest(run.q, ref["q"]) <= 1e-8
+
+
+@both
+def test_float32(reference_data, law, reading):
+    scenario = ij.astype(ij.presets.zhang_yan_2024(law=law, reading=reading), "float32")
+    run = ij.simulate(scenario, **PAPER)
+    assert run.q.dtype == np.float32
+    assert run.ok
+    assert largest(run.q, reference_of(reference_data, law, reading)["q"]) <= 1e-4
+
+
+def test_what_the_paper_shows(paper_run):
+    """Section 5 of the theory page: the numbers of the paper's own law."""
+    xi, e1 = np.abs(np.asarray(paper_run.xi)), np.abs(np.asarray(paper_run.e1))
+    assert np.max(xi) == pytest.approx(0.6154, abs=5e-5)
+    assert np.max(xi) == xi[0, 1]
+    np.testing.assert_allclose(paper_run.metrics.settling_time, [0.99, 0.71], atol=5e-3)
+    late = np.max(e1[np.asarray(paper_run.t) >= 10.0], axis=0)
+    assert np.all(late <= [8.9e-5 * 1.01, 1.7e-5 * 1.03])
+    np.testing.assert_allclose(np.max(np.abs(paper_run.tau), axis=0), [13.5, 16.3], atol=0.05)
+    np.testing.assert_allclose(paper_run.metrics.peak_torque, [13.8, 16.3], atol=0.05)
+    assert float(paper_run.V[0]) == pytest.approx(0.966, abs=5e-4)
+
+
+def test_the_papers_words_hold(paper_run):
+    """Both laws keep the bounds; the integral one settles earlier, and its e2 overshoots more."""
+    log = ij.simulate(ij.presets.zhang_yan_2024(law="log"), **PAPER)
+    np.testing.assert_allclose(log.metrics.settling_time, [1.07, 0.83], atol=1e-2)
+    for run in (paper_run, log):
+        assert np.all(np.asarray(run.metrics.margin) > 0)
+    assert np.all(np.asarray(paper_run.metrics.settling_time) < np.asarray(log.metrics.settling_time))
+
+    def overshoot(run):
+        e2 = np.asarray(run.e2)
+        return np.max(-np.sign(e2[0]) * e2, axis=0)
+
+    assert np.all(overshoot(paper_run) > overshoot(log))
+
+
+def test_printed_and_corrected_are_not_the_same(reference_data):
+    assert largest(reference_data["iblf_printed.q"], reference_data["iblf_corrected.q"]) > 1e-5

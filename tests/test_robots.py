@@ -1,0 +1,138 @@
+"""Robots against independent sources: the closed form, kinetic energy from positions, energy balance, the identities of C."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import integrators
+from iblf_jax.robots import PlanarChain, TwoLink, mass_matrix_rate
+
+
+def random_links(n, rng):
+    mass, length = rng.uniform(0.5, 2, n), rng.uniform(0.2, 0.5, n)
+    inertia = mass * length**2 / 12
+    return {"mass": mass, "length": length, "centre": length * rng.uniform(0.3, 0.7, n), "inertia": inertia, "payload": rng.uniform(0, 1)}
+
+
+@jax.jit
+def everything(robot, q, v, u):
+    return (
+        robot.mass_matrix(q),
+        robot.coriolis(q, v, u),
+        robot.gravity(q),
+        robot.potential(q),
+        robot.tip(q),
+        robot.jacobian(q),
+        robot.skeleton(q),
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_chain_of_two_is_the_closed_form(seed):
+    rng = np.random.default_rng(seed)
+    links = random_links(2, rng)
+    q, v, u = rng.uniform(-3, 3, (3, 2))
+    for a, b in zip(everything(PlanarChain(**links), q, v, u), everything(TwoLink(**links), q, v, u), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 7])
+def test_mass_rate_minus_two_c_is_skew(n, rng):
+    robot = PlanarChain(**random_links(n, rng))
+
+    @jax.jit
+    def symmetric_part(q, v):
+        C = jax.vmap(lambda e: robot.coriolis(q, v, e), out_axes=1)(jnp.eye(n))
+        N = mass_matrix_rate(robot, q, v) - 2 * C
+        return N + N.T, jnp.linalg.eigvalsh(robot.mass_matrix(q))
+
+    for _ in range(5):
+        S, modes = symmetric_part(rng.uniform(-3, 3, n), rng.normal(size=n))
+        assert np.max(np.abs(S)) <= 1e-12 * max(1.0, float(modes[-1]))
+        assert modes[0] > 0
+
+
+def test_closed_form_is_skew_too(rng):
+    robot = TwoLink(**random_links(2, rng))
+    for _ in range(20):
+        q, v, x = rng.uniform(-3, 3, (3, 2))
+        N = np.asarray(mass_matrix_rate(robot, q, v)) @ x - 2 * np.asarray(robot.coriolis(q, v, x))
+        assert abs(x @ N) <= 1e-12
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_kinetic_and_potential_energy_from_positions(n, rng):
+    """1/2 q'^T M q' = sum 1/2 m |velocity of the centre|^2 + 1/2 I omega^2, from where the centres are."""
+    links = random_links(n, rng)
+    robot = PlanarChain(**links)
+    q, v = rng.uniform(-3, 3, (2, n))
+
+    def centres(q):
+        theta = np.cumsum(q)
+        joints = np.concatenate([[0j], np.cumsum(links["length"] * np.exp(1j * theta))])
+        return np.append(joints[:-1] + links["centre"] * np.exp(1j * theta), joints[-1])
+
+    masses = np.append(links["mass"], links["payload"])
+    speed = (centres(q + 1e-6 * v) - centres(q - 1e-6 * v)) / 2e-6
+    kinetic = 0.5 * masses @ np.abs(speed) ** 2 + 0.5 * links["inertia"] @ np.cumsum(v) ** 2
+    assert 0.5 * v @ np.asarray(robot.mass_matrix(q)) @ v == pytest.approx(kinetic, rel=1e-8)
+    assert float(robot.potential(q)) == pytest.approx(9.81 * masses @ centres(q).imag, rel=1e-12)
+    np.testing.assert_allclose(robot.tip(q), [centres(q)[-1].real, centres(q)[-1].imag], atol=1e-12)
+
+
+def test_lumped_parameters_of_the_customary_arm():
+    p = ij.presets.customary_two_link().lumped()
+    np.testing.assert_allclose(p, [0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175], rtol=1e-12)
+
+
+def test_energy_of_a_falling_arm_is_kept_and_friction_takes_it(rng):
+    """No torque: dE/dt = 0 along the motion, and with viscous friction dE/dt = -viscous |q'|^2, by RK4 over a second."""
+    robot = TwoLink(**random_links(2, rng))
+
+    @jax.jit
+    def fall(viscous):
+        def slope(t, x):
+            q, v, _ = x
+            force = -viscous * v - robot.coriolis(q, v, v) - robot.gravity(q)
+            return v, jnp.linalg.solve(robot.mass_matrix(q), force), viscous * v @ v
+
+        def one(x, i):
+            return integrators.step("rk4", slope, i * 1e-3, x, 1e-3, slope(i * 1e-3, x)), None
+
+        x0 = (jnp.asarray([0.3, -0.4]), jnp.asarray([0.5, 1.0]), jnp.zeros(()))
+        x1, _ = jax.lax.scan(one, x0, jnp.arange(1000))
+        energy = [0.5 * v @ robot.mass_matrix(q) @ v + robot.potential(q) for q, v, _ in (x0, x1)]
+        return energy[1] - energy[0], x1[2]
+
+    for viscous in (0.0, 0.3):
+        gained, lost = fall(viscous)
+        assert float(gained) == pytest.approx(-float(lost), abs=1e-7)
+    assert float(lost) > 0.1
+
+
+def test_payload_hangs_at_the_tip(rng):
+    """A payload m adds J^T m J to M and -J^T (0, -m g) to G."""
+    links = random_links(3, rng) | {"payload": 0.0}
+    empty, loaded = PlanarChain(**links), PlanarChain(**(links | {"payload": 0.6}))
+    q = jnp.asarray(rng.uniform(-3, 3, 3))
+    J = np.asarray(empty.jacobian(q))
+    np.testing.assert_allclose(loaded.mass_matrix(q) - empty.mass_matrix(q), 0.6 * J.T @ J, atol=1e-12)
+    np.testing.assert_allclose(loaded.gravity(q) - empty.gravity(q), J.T @ [0, 0.6 * 9.81], atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 7])
+def test_small_algebra_against_numpy(n, rng):
+    from iblf_jax.linalg import cholesky, solve_spd
+
+    A = rng.normal(size=(n, n))
+    A = A @ A.T + 0.1 * np.eye(n)
+    b = rng.normal(size=n)
+    np.testing.assert_allclose(jax.jit(solve_spd)(A, b), np.linalg.solve(A, b), rtol=1e-9)
+    L = np.linalg.cholesky(A)
+    for i, row in enumerate(cholesky(jnp.asarray(A))):
+        np.testing.assert_allclose(row, L[i, : i + 1], rtol=1e-10)
+    assert np.all(np.isnan(solve_spd(jnp.asarray(-A), b)))

@@ -1,0 +1,143 @@
+"""What goes wrong in a run is flagged, with the physics in the message, and every number stays finite."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from conftest import PAPER, SHORT
+
+import iblf_jax as ij
+from iblf_jax.status import FAILED, Status, describe
+
+
+def quiet(scenario, **options) -> ij.Rollout:
+    """A run whose warnings are not looked at."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return ij.simulate(scenario, **(SHORT | options))
+
+
+def all_finite(run) -> bool:
+    may_be_infinite = ("settling_time", "first_violation_time")
+    arrays = [getattr(run, f) for f in ("q", "dq", "tau", "e1", "e2", "xi", "alpha", "disturbance", "disturbance_estimate", "V")]
+    arrays += [v for k, v in run.metrics.items() if k not in may_be_infinite]
+    return all(np.all(np.isfinite(x)) for x in arrays)
+
+
+@pytest.fixture(scope="module")
+def thrown(paper):
+    """A start so near the upper bound of joint 0, 1.04, and so fast, that it leaves it."""
+    return ij.with_parameters(paper, {"initial.q": [1.02, 0.8], "initial.dq": [30.0, 0.0]})
+
+
+def test_a_good_run_is_ok(short_run):
+    assert short_run.ok
+    assert int(short_run.status) == Status.OK
+    assert describe(int(short_run.status)) == "ok"
+
+
+def test_violation_with_joint_and_time(thrown):
+    run = quiet(thrown)
+    assert int(run.status) & Status.BOUND_VIOLATED
+    assert int(run.status) & Status.GUARD_ACTIVE
+    outside = ~np.all((np.asarray(run.q) > run.lower) & (np.asarray(run.q) < run.upper), axis=1)
+    first = np.flatnonzero(outside)[0]
+    assert float(run.metrics.first_violation_time) == pytest.approx(float(run.t[first]))
+    assert int(run.metrics.first_violation_joint) == 0
+    assert float(run.metrics.margin[0]) == pytest.approx(np.min((run.upper - run.q)[:, 0]))
+    assert float(run.metrics.margin[0]) < 0
+    assert all_finite(run)
+    with pytest.warns(ij.SimulationWarning, match=r"Joint 0 left its bounds first, at t = 0\.0"):
+        ij.simulate(thrown, **SHORT)
+    with pytest.raises(ij.SimulationError, match=r"bound was violated.*Joint 0"):
+        ij.simulate(thrown, **SHORT, throw=True)
+
+
+def test_the_guard_alone_is_not_a_failure(paper):
+    near = ij.with_parameters(paper, {"initial.q": [1.0399, 0.8]})  # the upper bound of joint 0 is 1.04
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = ij.simulate(near, **SHORT)
+    assert int(run.status) == Status.GUARD_ACTIVE
+    assert not Status(int(run.status)) & FAILED
+    assert all_finite(run)
+
+
+def test_a_step_too_large_is_found_and_a_step_that_works_is_named(paper):
+    stiff = ij.with_parameters(paper, {"controller.K2": 200.0})
+    run = quiet(stiff)
+    assert int(run.status) & Status.STEP_TOO_LARGE
+    assert int(run.status) & Status.NOT_FINITE
+    assert all_finite(run)
+    with pytest.warns(ij.SimulationWarning, match=r"fastest mode .* 1/s, so rk4 is stable up to dt = .* Take dt=0\.0001"):
+        ij.simulate(stiff, **SHORT)
+    with pytest.raises(ij.SimulationError, match="time step is too large"):
+        ij.simulate(stiff, **SHORT, throw=True)
+    dt = ij.recommended_dt(stiff, duration=SHORT["duration"])
+    assert dt == 1e-4
+    assert ij.simulate(stiff, duration=500 * dt, dt=dt).ok
+
+
+def test_recommended_dt_and_the_measured_mode(paper, short_run):
+    """About K2 / lambda_min(M0): 850 to 1010 1/s on the paper's run."""
+    assert ij.recommended_dt(paper) == 1e-3
+    assert ij.recommended_dt(ij.with_parameters(paper, {"controller.K2": 2.0})) > 1e-3
+    assert 800 < float(short_run.fastest_mode) < 1100
+
+
+def test_the_fastest_mode_is_the_spectral_radius(paper):
+    from jax.flatten_util import ravel_pytree
+
+    from iblf_jax.closed_loop import initial_state, rate
+    from iblf_jax.stability import fastest_mode
+
+    state = initial_state(paper)
+    flat, unravel = ravel_pytree(state)
+    jacobian = jax.jit(jax.jacfwd(lambda x: ravel_pytree(rate(paper, 0.0 * flat[0], unravel(x)))[0]))(flat)
+    radius = np.max(np.abs(np.linalg.eigvals(jacobian)))
+    assert float(fastest_mode(paper, 0.0 * flat[0], state)) == pytest.approx(radius, rel=0.05)
+
+
+def test_a_run_away_state_is_frozen_at_its_last_good_value(paper):
+    run = quiet(ij.with_parameters(paper, {"controller.K2": 150.0}))
+    assert int(run.status) & Status.NOT_FINITE
+    q = np.asarray(run.q)
+    moving = np.flatnonzero(np.any(np.diff(q, axis=0) != 0, axis=1))
+    assert moving[-1] < 400  # it stands still from somewhere on
+    np.testing.assert_array_equal(q[moving[-1] + 1 :], np.broadcast_to(q[-1], q[moving[-1] + 1 :].shape))
+    assert all_finite(run)
+    assert np.max(np.abs(run.dq)) < 1e4
+
+
+def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
+    """It touches the bound of joint 1 between recorded samples only, long after the start."""
+    close = dataclasses.replace(paper.bounds, upper=dataclasses.replace(paper.bounds.upper, offset=[0.9, 0.5 + 0.14 * np.sqrt(2) - 1e-7]))
+    scenario = dataclasses.replace(paper, bounds=close, initial=ij.Initial(q=[0.8, 0.6]))
+    with pytest.raises(ValueError, match=r"reference of joint 1: got .* inside the bounds .* at t = (5\.49|11\.78|18\.06).*Assumption 2"):
+        quiet(scenario, **PAPER)
+
+
+def test_nothing_raises_inside_jit_and_flags_come_back(thrown):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        status = jax.jit(lambda s: ij.simulate(s, **SHORT, throw=True).status)(thrown)
+    assert int(status) & Status.BOUND_VIOLATED
+
+
+def test_words_for_every_flag():
+    for flag in Status:
+        assert describe(int(flag)) != ""
+    assert describe(int(Status.BOUND_VIOLATED | Status.NOT_FINITE)).count(";") == 1
+
+
+def test_gains_below_the_theorem_are_advised_against(paper):
+    for path, name in (("controller.K2", "K2"), ("observer.kf", "kf")):
+        weak = ij.with_parameters(paper, {path: [20.0, 0.4]})
+        with pytest.warns(UserWarning, match=rf"{path} = .*Theorem 2 needs {name} > 1/2"):
+            ij.simulate(weak, **SHORT)
+        part = weak.controller if name == "K2" else weak.observer
+        assert jax.jit(lambda p: len(p.advice()))(part) == 0  # nothing to say about a number that is not known yet
