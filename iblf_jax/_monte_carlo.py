@@ -76,7 +76,7 @@ def monte_carlo(
 
     Source: design of this package.
     """
-    runs, chunk = checks.positive_integer("runs", runs), chunk and checks.positive_integer("chunk", chunk)
+    runs, chunk = checks.positive_integer("runs", runs), None if chunk is None else checks.positive_integer("chunk", chunk)
     replicates = check_sampler(sampler, runs, replicates)
     if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail(

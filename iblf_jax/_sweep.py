@@ -115,7 +115,7 @@ def sweep(
 
     Source: design of this package.
     """
-    runs, chunk = checks.positive_integer("runs", runs), chunk and checks.positive_integer("chunk", chunk)
+    runs, chunk = checks.positive_integer("runs", runs), None if chunk is None else checks.positive_integer("chunk", chunk)
     replicates, perturbations = check_sampler(sampler, runs, replicates), perturbations or {}
     if not perturbations and runs > 1:
         raise checks.fail("runs", runs, "1 without perturbations", "Without any all runs at a point are the same.")
