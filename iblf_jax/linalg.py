@@ -71,7 +71,7 @@ def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]
 
 @jax.custom_jvp
 def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """The x with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side.
+    """X with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side.
 
     A matrix that is not positive definite gives NaN.  The derivative is that of the equation, dx = matrix^-1 (drhs - dmatrix x), with
     the same factors.

@@ -202,7 +202,7 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
     lowering._told.clear()
 
     def run():
-        return jax.jit(lambda: lowering.run_batch(scenario, varied, STANDARD, jnp.asarray(DT), steps=3, method="euler"))()
+        return jax.jit(lambda: lowering.run_batch(scenario, varied, (), jnp.asarray(DT), steps=3, method="euler"))()
 
     with pytest.warns(lowering.BackendWarning, match="vmap.*'sort'"):
         outcome = run()

@@ -112,17 +112,17 @@ def test_results_do_not_depend_on_place_or_number_of_runs():
 
 @needs_compiler
 def test_a_run_that_fails_does_not_touch_the_others():
-    values = draws(20)
+    values = draws(5)
     good = batch(values=values)
     broken = {k: v.copy() for k, v in values.items()}
-    broken["plant.mass[1]"][3] = np.nan
-    broken["initial.q"][7] = 40.0
+    broken["plant.mass[1]"][1] = np.nan
+    broken["initial.q"][3] = 40.0
     found = batch(values=broken)
-    others = [i for i in range(20) if i not in (3, 7)]
+    others = [0, 2, 4]
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
         np.testing.assert_array_equal(x[others], y[others])
-    assert ij.Status.NOT_FINITE in ij.Status(int(found.status[3]))
-    assert ij.Status.BOUND_VIOLATED in ij.Status(int(found.status[7]))
+    assert ij.Status.NOT_FINITE in ij.Status(int(found.status[1]))
+    assert ij.Status.BOUND_VIOLATED in ij.Status(int(found.status[3]))
     np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
 
 
@@ -153,7 +153,7 @@ def test_forward_sensitivities():
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
 
     def pushed(backend):
-        return jax.jit(lambda s, v: lowering.run_batch_jvp(s, v, directions, standard(), dt, steps=60, method="rk4", backend=backend))(
+        return jax.jit(lambda s, v: lowering.run_batch_jvp(s, v, directions, standard()[:1], dt, steps=60, method="euler", backend=backend))(
             scenario, varied
         )
 

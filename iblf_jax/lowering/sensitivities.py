@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax import rollout
-from iblf_jax.closed_loop import LoopState, evaluate
+from iblf_jax.closed_loop import LoopState, Sample, evaluate
 from iblf_jax.lowering.batch import Executor, batch_of, critical_modes, verdicts
 from iblf_jax.lowering.step import Leaves
 from iblf_jax.paths import get, with_parameters
@@ -99,6 +99,11 @@ def _floats_and_rest(carry: rollout.Carry):
     return _floats(carry)[0], carry
 
 
+def without_flags(sample: Sample) -> Any:
+    """The numbers of a sample; its flags have no derivative."""
+    return {name: x for name, x in sample._asdict().items() if name not in FLAGS}
+
+
 def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopState) -> Callable:
     """`closed_loop.evaluate`, its Jacobian by state and directions worked out once and applied to every tangent.
 
@@ -111,8 +116,7 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
     def numbers(flat, eps, t, dt):
         slope, sample = evaluate(directions.moved(scenario, eps), t, unravel(flat), dt)
         flags = {name: getattr(sample, name) for name in FLAGS}
-        unflagged: dict[str, Any] = dict.fromkeys(FLAGS, ())
-        return ravel_pytree((slope, sample._replace(**unflagged)))[0], flags
+        return ravel_pytree((slope, without_flags(sample)))[0], flags
 
     @jax.custom_jvp
     def floats(flat, eps, t, dt):
@@ -130,16 +134,10 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
     def loop(moved, t, state, dt=0.0):
         dt = jnp.asarray(dt, t.dtype)
         slope, sample = jax.eval_shape(lambda: evaluate(scenario, t, state, dt))
-        zeros = jax.tree.map(
-            lambda x: jnp.zeros(x.shape, x.dtype),
-            (
-                slope,
-                sample._replace(**dict.fromkeys(FLAGS, ())),  # type: ignore[arg-type]
-            ),
-        )
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (slope, without_flags(sample)))
         flat = ravel_pytree(state)[0]
-        slope, sample = ravel_pytree(zeros)[1](floats(flat, eps, t, dt))
-        return slope, sample._replace(**numbers(*jax.lax.stop_gradient((flat, eps, t, dt)))[1])
+        slope, values = ravel_pytree(zeros)[1](floats(flat, eps, t, dt))
+        return slope, Sample(**values, **numbers(*jax.lax.stop_gradient((flat, eps, t, dt)))[1])
 
     return loop
 
