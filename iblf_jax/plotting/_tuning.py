@@ -51,22 +51,29 @@ def tuning(result: TuneResult, *, landscape: tuple[str, str] | None = None, poin
         show(axes, curves, QUANTITIES["q"], i, (0.0, setup.duration))
         axes.set_ylabel(_style.label(f"joint {i}", "rad"))
         if i == 0:
-            axes.legend(ncols=4, loc="upper right")
+            axes.legend(ncols=2, loc="lower right")
     axes.set_xlabel(_style.label("time $t$", "s"))
     figure.suptitle("Gain tuning")
     return figure
 
 
+def _accepted(result: TuneResult) -> np.ndarray:
+    """The steps of the winning start at which its loss fell below all before."""
+    loss = np.where(result.history["sound"], result.history["loss"], np.inf)[:, result.best_start]
+    before = np.minimum.accumulate(np.concatenate([[np.inf], loss[:-1]]))
+    found = np.flatnonzero(loss < before)
+    return found if len(found) else np.arange(1)
+
+
 def _progress(axes: Axes, result: TuneResult) -> None:
     history = result.history
-    steps = np.arange(1, len(history["evaluations"]) + 1)
-    for s in range(history["objective"].shape[1]):
-        values = np.where(history["sound"][:, s], history["objective"][:, s], np.nan)
-        style = _style.series(0) if s == result.best_start else _style.FAINT | {"color": _style.BOUND}
-        axes.plot(steps, values, marker=".", markersize=3, **style)
-    best = np.where(history["sound"], history["objective"], np.nan)
-    low, high = float(np.nanmin(best)), float(best[0, 0]) if np.isfinite(best[0, 0]) else float(np.nanmedian(best))
-    axes.set_ylim(low - 0.1 * abs(high - low) - 1e-12, high + 0.3 * abs(high - low) + 1e-12)
+    trials = np.where(history["sound"], history["objective"], np.nan)
+    steps = np.arange(1, len(trials) + 1)
+    axes.plot(steps, trials, linestyle="none", marker=".", markersize=3, color=_style.BOUND)
+    best = history["objective"][_accepted(result), result.best_start]
+    axes.step(_accepted(result) + 1, best, where="post", marker=".", **_style.series(0))
+    low, high = float(np.min(best)), float(np.max(best))
+    axes.set_ylim(low - 0.1 * (high - low) - 1e-12, high + 0.2 * (high - low) + 1e-12)
     axes.set_xlabel("step")
     axes.set_ylabel("objective")
 
@@ -80,13 +87,14 @@ def _margin(axes: Axes, result: TuneResult) -> None:
 
 
 def _gains(axes: Axes, result: TuneResult) -> None:
-    x = result.history["x"][:, result.best_start]
+    steps = _accepted(result)
+    x = result.history["x"][steps, result.best_start]
     for i, name in enumerate(result.names):
-        axes.plot(np.arange(1, len(x) + 1), x[:, i] / (abs(x[0, i]) or 1.0), label=name, **_style.series(i))
+        axes.plot(steps + 1, x[:, i] / (abs(x[0, i]) or 1.0), marker=".", markersize=3, label=name, **_style.series(i))
     if np.all(x / np.where(x[0] == 0, 1, x[0]) > 0):
         axes.set_yscale("log")
     axes.set_xlabel("step")
-    axes.set_ylabel("tried, relative to start")
+    axes.set_ylabel("gain, relative to start")
     if len(result.names) <= 8:
         axes.legend(fontsize=6.5, ncols=2)
 
@@ -98,7 +106,7 @@ def _landscape(axes: Axes, result: TuneResult, names: tuple[str, str], points: i
     levels = low + (np.nanquantile(filled, 0.8) - low) * np.linspace(0.0, 1.0, 12) ** 2
     if levels[-1] > low:
         axes.contourf(a, b, filled.T, levels=levels, cmap="cividis", extend="max")
-    here = [result.history["x"][:, result.best_start, result.names.index(name)] for name in names]
+    here = [result.history["x"][_accepted(result), result.best_start, result.names.index(name)] for name in names]
     axes.plot(*here, color="white", linewidth=0.8, marker=".", markersize=2)
     best = [result.tuned[result.names.index(name)] for name in names]
     axes.plot(*best, marker="*", color=_style.COLOURS[1], markersize=10)
