@@ -153,9 +153,9 @@ def test_forward_sensitivities():
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
 
     def pushed(backend):
-        return jax.jit(lambda s, v: lowering.run_batch_jvp(s, v, directions, standard()[:1], dt, steps=60, method="euler", backend=backend))(
-            scenario, varied
-        )
+        return jax.jit(
+            lambda s, v: lowering.run_batch_jvp(s, v, directions, standard()[:1], dt, steps=60, method="euler", backend=backend)
+        )(scenario, varied)
 
     outcome, tangents = pushed("native")
     reference, expected = pushed("vmap")
