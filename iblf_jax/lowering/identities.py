@@ -7,7 +7,8 @@ be seen to be so.  (Programs of derivatives, `Builder.sparse`, are the exception
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,17 +20,25 @@ def _reciprocal_root(x):
     return 1 / np.sqrt(x)
 
 
+def _erf(x):
+    return type(x)(math.erf(x))
+
+
+def _erfc(x):
+    return type(x)(math.erfc(x))
+
+
 def _logistic(x):
     return 1 / (1 + np.exp(-x))
 
 
-FUNCTIONS = {
+FUNCTIONS: dict[str, Callable[..., Any]] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "abs": np.abs, "max": np.maximum,
     "min": np.minimum, "sqrt": np.sqrt, "rsqrt": _reciprocal_root, "cbrt": np.cbrt, "sign": np.sign, "floor": np.floor, "ceil": np.ceil,
     "round_even": np.rint, "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
     "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh,
     "exp": np.exp, "exp2": np.exp2, "expm1": np.expm1, "log": np.log, "log1p": np.log1p, "pow": np.power, "atan2": np.arctan2,
-    "erf": math.erf, "erfc": math.erfc, "logistic": _logistic, "is_finite": np.isfinite,
+    "erf": _erf, "erfc": _erfc, "logistic": _logistic, "is_finite": np.isfinite,
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
     "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "rem": np.fmod,
 }  # fmt: skip
