@@ -173,7 +173,7 @@ REFUSALS = [
     (["reproduce", "--out", "file.toml"], "--out: got 'file.toml', expected a folder that can be written"),
     (["simulate"], "required: SCENARIO.toml|PRESET"),
     (["simulate", "none.toml"], "none.toml: no such file"),
-    (["simulate", "zhang_yan"], "Did you mean zhang_yan_2024?"),
+    (["simulate", "zhang_yan"], "Did you mean zhang_yan_2024"),
     (["simulate", "."], ".: no such file"),
     (["simulate", "file.toml"], "file.toml: contrller: got an unknown key"),
     (["simulate", "binary.toml"], "binary.toml: not a TOML file"),

@@ -30,6 +30,8 @@ SPECIAL = {
     "tip_force": lambda cls: cls(amplitude=[1.0, 2.0], frequency=2.0),
     "funnel": lambda cls: cls(initial=0.4, final=0.2, rate=1.0),
     "constant": lambda cls: cls(0.95),
+    "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
+    "extended_state": lambda cls: cls(bandwidth=40.0),
 }
 """Members whose fields do not fit together when each holds a small positive number."""
 

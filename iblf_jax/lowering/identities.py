@@ -20,12 +20,8 @@ def _reciprocal_root(x):
     return 1 / np.sqrt(x)
 
 
-def _erf(x):
-    return type(x)(math.erf(x))
-
-
-def _erfc(x):
-    return type(x)(math.erfc(x))
+_erf = np.vectorize(math.erf, otypes=[float])
+_erfc = np.vectorize(math.erfc, otypes=[float])
 
 
 def _logistic(x):
