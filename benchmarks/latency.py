@@ -2,7 +2,7 @@
 
     python benchmarks/latency.py [--quick] [--json FILE]
 
-Rows: LSODA at rtol 1e-6 on the loop in NumPy, LSODA on this package's own compiled vector field, and `simulate`.
+Rows: LSODA at rtol 1e-6 on the loop in NumPy, LSODA on this package's own compiled vector field, and `simulate` on its two backends.
 `import` is the time of `import iblf_jax` above `import jax`, each in a fresh process.
 """
 
@@ -90,9 +90,11 @@ def main() -> None:
         "LSODA, NumPy loop": lambda: lsoda(numpy_loop).y,
         "LSODA, compiled field": lambda: lsoda(lambda t, x: np.asarray(field(t, x))).y,
         "simulate, user's call": lambda: ij.simulate(scenario, duration=duration, dt=1e-3).q,
+        "simulate, backend='native'": lambda: ij.simulate(scenario, duration=duration, dt=1e-3, backend="native").q,
         "simulate, compiled": lambda: compiled(scenario, folds, dt),
     }
-    ij.simulate(scenario, duration=duration, dt=1e-3)
+    for backend in ("xla", "native"):
+        ij.simulate(scenario, duration=duration, dt=1e-3, backend=backend)
     best = interleaved(calls, repeats)
     reference = best["LSODA, NumPy loop"]
     rows = [[name, 1e3 * seconds, reference / seconds] for name, seconds in best.items()]

@@ -196,6 +196,20 @@ def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
     return (as_one_function(one) if alone else one)(scenario, folds, dt)
 
 
+@partial(jax.jit, static_argnames=("steps", "record_every", "method"))
+def _run_native(scenario, folds, dt, *, steps, record_every, method):
+    """`run` as a batch of one on the native backend, which falls back to the others by itself."""
+    from iblf_jax.lowering import run_batch
+
+    alone = {"initial.q": scenario.initial.q[None]}
+    options = {"steps": steps, "record_every": record_every, "method": method}
+    return jax.tree.map(lambda x: x[0], run_batch(scenario, alone, folds, dt, backend="native", **options))
+
+
+SINGLE_RUN_BACKENDS = ("xla", "native")
+"""How `simulate` can execute one run."""
+
+
 def simulate(
     scenario: Scenario,
     *,
@@ -205,6 +219,7 @@ def simulate(
     record_every: int = 1,
     metrics: Sequence[Fold] | None = None,
     throw: bool = False,
+    backend: str = "xla",
 ) -> Rollout:
     """Runs a scenario with a fixed step and returns everything that can be looked at.
 
@@ -221,6 +236,8 @@ def simulate(
       record_every: record every so-many-th step; metrics and status cover every step whatever is recorded.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
+      backend: "xla", or "native": the same program as generated code, several times faster once the system's compiler has built it
+        (seconds, once for a structure; kept on disk).  Inside your own `jit`, `vmap` or `grad` a run is always on xla.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -232,6 +249,7 @@ def simulate(
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
     tableau(method)
+    checks.one_of("backend", backend, SINGLE_RUN_BACKENDS)
     steps = checks.whole_steps(duration, dt)
     record_every = checks.positive_integer("record_every", record_every)
     if steps // record_every > MOST_SAMPLES:
@@ -240,16 +258,21 @@ def simulate(
     scenario = canonical(scenario)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype)
-    result = trajectory(scenario, folds, jnp.asarray(dt, dtype), steps=steps, method=method, record_every=record_every)
+    step_size = jnp.asarray(dt, dtype)
+    result = trajectory(scenario, folds, step_size, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
         _report(result, steps, throw)
     return result
 
 
-def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int) -> Rollout:
+def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "xla") -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     alone = checks.is_concrete((scenario, folds))
-    outcome = _run_compiled(scenario, folds, dt, steps=steps, record_every=record_every, method=method, alone=alone)
+    options = {"steps": steps, "record_every": record_every, "method": method}
+    if backend == "native" and alone:
+        outcome = _run_native(scenario, folds, dt, **options)
+    else:
+        outcome = _run_compiled(scenario, folds, dt, alone=alone, **options)
     arrays, controller_state, observer_state = outcome.records
     units = tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
     return Rollout(

@@ -212,3 +212,17 @@ def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(ToolchainError, match="not a directory of this user"):
         toolchain.cache_directory()
+
+
+def test_one_run_on_the_native_backend_is_the_run(paper):
+    """Records, metrics and status of `simulate(backend="native")` are those of xla; another value of a leaf builds nothing new."""
+    for scenario in (paper, ij.with_parameters(paper, {"controller.K2": 30.0, "plant.mass[1]": 1.1})):
+        one, other = (ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=7, backend=backend) for backend in ("xla", "native"))
+        np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(one.observer_state, other.observer_state, rtol=0, atol=1e-9)
+        assert int(one.status) == int(other.status) == 0
+        for name in one.metrics:
+            np.testing.assert_allclose(one.metrics[name], other.metrics[name], rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match="backend"):
+        ij.simulate(paper, duration=0.5, dt=1e-3, backend="fortran")
