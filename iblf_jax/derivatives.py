@@ -23,13 +23,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.one_function import as_one_function
+from iblf_jax.one_function import SMALL, as_one_function
 from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Carry, Outcome, advance, finish, start
 from iblf_jax.scenario import Scenario
-
-SMALL = 64
-"""Batches up to this size gain from being one machine function (see `one_function`)."""
 
 
 class Outer(NamedTuple):

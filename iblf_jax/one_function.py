@@ -15,6 +15,9 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
+SMALL = 64
+"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
+
 LARGEST = 1 << 13
 """Entries of the largest array of floating-point numbers that is computed inside.  (Records may be of any length: they are stacked and
 copied, not computed.)"""

@@ -109,14 +109,6 @@ def is_leaf_field(field: dataclasses.Field) -> bool:
     return bool(field.metadata.get("leaf"))
 
 
-def float_dtype(tree: Any) -> jax.typing.DTypeLike:
-    """The floating-point type that the numbers of a pytree share (the widest one, if they differ)."""
-    import jax.numpy as jnp
-
-    kinds = [jnp.result_type(x) for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
-    return jnp.result_type(*kinds) if kinds else jnp.result_type(float)
-
-
 def astype(tree: T, dtype: jax.typing.DTypeLike) -> T:
     """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`.
 

@@ -21,16 +21,13 @@ from iblf_jax import checks
 from iblf_jax.lowering import batch, native, sensitivities, xla
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
-from iblf_jax.one_function import as_one_function
+from iblf_jax.one_function import SMALL, as_one_function
 from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
 
 BACKENDS = ("auto", "vmap", "xla", "native")
 """How a batch can be executed; "auto" is native on CPU, else xla."""
-
-_SMALL = 64
-"""Runs up to which a batch on vmap gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
 
 
 class BackendWarning(UserWarning):
@@ -116,7 +113,7 @@ def run_batch(
 
     def plain():
         batched = jax.vmap(one)
-        return (as_one_function(batched) if min(map(len, varied.values())) <= _SMALL else batched)(dict(varied))
+        return (as_one_function(batched) if min(map(len, varied.values())) <= SMALL else batched)(dict(varied))
 
     return with_fallback(backend, run_on, plain)
 
