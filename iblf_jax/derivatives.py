@@ -41,7 +41,7 @@ class Outer(NamedTuple):
 
 
 class Tangents(NamedTuple):
-    """What `value_and_tangents` returns; B runs, D directions."""
+    """Values and tangents of a batch; B runs, D directions."""
 
     outcome: Outcome
     """Metrics and status, (B, ...)."""
@@ -68,7 +68,8 @@ def _joined(reals: list, others: list, how: Any) -> Any:
     return jax.tree.unflatten(structure, [next(from_reals) if r else next(from_others) for r in real])
 
 
-def _outer(folds, accumulators, sample) -> tuple[Outer, ...]:
+def outer_of(folds, accumulators, sample) -> tuple[Outer, ...]:
+    """What a sample adds to the curvature matrices of the folds that have them."""
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
         if hasattr(fold, "curvatures"):
@@ -113,7 +114,7 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
         before = assemble(reals, rest)
         after, sample = advance(here, folds, method, dt, before, index)
         new, others, _ = _split((after.state, after.accumulators))
-        outer = _outer(folds, before.accumulators, sample)
+        outer = outer_of(folds, before.accumulators, sample)
         factors = jax.lax.stop_gradient(tuple((jnp.broadcast_to(o.weight, o.vector.shape), o.decay) for o in outer))
         return (new, tuple(o.vector for o in outer)), ((others, after.status, after.nearest), factors)
 

@@ -58,7 +58,7 @@ REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "violation_p
 TABLES = ("tune", "objective", "requirement", "perturbations")
 ARGUMENTS = (
     *("runs", "seed", "resample", "optimiser", "mode", "starts", "iterations", "tolerance", "patience"),
-    *("learning_rate", "report_runs", "report_seed", "confidence"),
+    *("learning_rate", "backend", "report_runs", "report_seed", "confidence"),
 )
 """What [tune] may hold besides `parameters`, `risk` and `level`."""
 
@@ -163,7 +163,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     setup = result.setup
     numbers = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
-    plain = ("runs", "seed", "duration", "dt", "method", "report_runs", "report_seed", "confidence")
+    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence")
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),

@@ -15,8 +15,9 @@ import iblf_jax as ij
 from iblf_jax import lowering
 from iblf_jax.lowering import native, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
-from iblf_jax.metrics import standard
+from iblf_jax.metrics import as_folds, standard
 from iblf_jax.scenario import canonical
+from iblf_jax.tuning.quantities import Integral, Peak, Quantities
 
 
 def _has_compiler() -> bool:
@@ -152,16 +153,20 @@ def test_forward_sensitivities():
     directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
 
-    def pushed(backend):
-        return jax.jit(
-            lambda s, v: lowering.run_batch_jvp(s, v, directions, standard()[:1], dt, steps=60, method="euler", backend=backend)
-        )(scenario, varied)
+    folds = (*standard()[:1], *as_folds((Quantities((Integral(), Peak(10.0))),), jnp.float64))
 
-    outcome, tangents = pushed("native")
-    reference, expected = pushed("vmap")
+    def pushed(backend):
+        return jax.jit(lambda s, v: lowering.run_batch_jvp(s, v, directions, folds, dt, steps=60, method="euler", backend=backend))(
+            scenario, varied
+        )
+
+    outcome, tangents, products = pushed("native")
+    reference, expected, exact = pushed("vmap")
     assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
     assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
     assert tangents["rmse"].shape == (3, 3, 2)
+    assert_same(products, exact, 1e-10)
+    assert [x.shape for x in products] == [(3, 3, 3)] * 2
 
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):

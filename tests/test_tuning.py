@@ -264,6 +264,50 @@ def test_steps_that_are_not_finite_are_rejected(name):
     assert 0.9 < reached <= 1.0
 
 
+class Bowl:
+    """An evaluator of a narrow bent valley with its bottom at `BOTTOM`, not finite where z0 > 1."""
+
+    evaluations = 0
+    bottom = np.array([0.4, -0.3])
+
+    @staticmethod
+    def derive(shared, lanes):
+        def loss(z):
+            x = z - Bowl.bottom
+            return jnp.where(z[0] > 1, jnp.nan, x[0] ** 2 + 30 * (x[1] - x[0] ** 2) ** 2)
+
+        value, gradient = jax.vmap(jax.value_and_grad(loss))(lanes.z)
+        sound = jnp.isfinite(value)
+        empty = lanes.z[:, :0]
+        found = problem.Value(jnp.where(sound, value, jnp.inf), value, empty, empty, empty, value, sound, empty)
+        return problem.Slope(found, gradient, jnp.zeros((len(value), 2, 2)))
+
+    def row(self, s):
+        return None, problem.Lane(jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.zeros((1, 0)), jnp.ones(1))
+
+    def __call__(self, z):
+        return jax.tree.map(np.asarray, self.derive(None, self.row(0)[1]._replace(z=jnp.asarray(z))))
+
+
+def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
+    box = Box(np.array([-1.0, 2.0]), np.array([-3.0, -3.0]), np.array([3.0, 3.0]))
+    method, bowl = _tune.make_method("lbfgs", box, 60, 1e-12, 0.1), Bowl()
+    state = method.init(box.z[None])
+    for _ in range(40):
+        z, found = method.step(bowl, state)
+        assert found.value.sound[0]
+    np.testing.assert_allclose(z[0], Bowl.bottom, atol=1e-6)
+    assert state["settled"][0] and 10 < bowl.evaluations < 400
+
+
+@pytest.mark.slow
+def test_lbfgs_tunes_the_paper_as_well_as_newton(paper):
+    best = ij.tune(paper, GAINS, objective(), optimiser="lbfgs", iterations=40, **SHORT)
+    newton = ij.tune(paper, GAINS, objective(), iterations=30, **SHORT)
+    assert best.optimiser == "lbfgs"
+    assert best.objective < 1.01 * newton.objective
+
+
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
     assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["sound"][-1].all()

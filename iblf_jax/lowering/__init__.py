@@ -18,6 +18,7 @@ from typing import Any
 import jax
 
 from iblf_jax import checks
+from iblf_jax.derivatives import Tangents
 from iblf_jax.lowering import batch, native, sensitivities, xla
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
@@ -128,7 +129,7 @@ def run_batch_jvp(
     steps: int,
     method: str,
     backend: str = "auto",
-) -> tuple[Outcome, dict[str, jax.Array]]:
+) -> Tangents:
     """Values of a batch and their derivatives along P directions in the space of leaves, in one pass; call it inside `jit`.
 
     Args:
@@ -137,7 +138,8 @@ def run_batch_jvp(
         leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
 
     Returns:
-      The outcome, and name -> (batch, P, *shape) for every metric that is a float.
+      The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton matrices (batch, P, P) of the
+      folds that offer `curvature`.
 
     Raises:
       ValueError: an unknown backend or path.

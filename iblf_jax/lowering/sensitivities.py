@@ -1,7 +1,8 @@
 """Values and forward sensitivities of a batch, in one pass: the lowered jvp of the step, several tangents a run.
 
 Gains are few, so forward mode beats reverse mode and needs no memory along time; the numbers that all tangents share are computed
-once, because equal nodes of a scalar program are one node.
+once, because equal nodes of a scalar program are one node.  The Gauss-Newton products of folds that offer `curvature` (see
+`derivatives`) are summed up in the same pass, their upper triangle only.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax import rollout
 from iblf_jax.closed_loop import LoopState, Sample, evaluate
+from iblf_jax.derivatives import Tangents, outer_of, value_and_tangents
 from iblf_jax.lowering.batch import Executor, batch_of, critical_modes, verdicts
 from iblf_jax.lowering.step import Leaves
 from iblf_jax.paths import get, with_parameters
@@ -51,10 +53,12 @@ class Directions(NamedTuple):
 
 
 class Differentiated(NamedTuple):
-    """What goes from step to step: the carry, and P tangents of state and accumulators."""
+    """What goes from step to step: the carry, P tangents of state and accumulators, the products of each `Outer`."""
 
     carry: rollout.Carry
     tangents: list[jax.Array]
+    products: list[jax.Array]
+    """Upper triangles, row by row, (P (P + 1) / 2,) each."""
 
 
 def _floats(carry: rollout.Carry) -> tuple[list[jax.Array], Callable]:
@@ -145,17 +149,22 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
 @lru_cache(maxsize=64)
 def derivative_function(treedef, is_lane: tuple[bool, ...], carry_treedef, method: str, directions: Directions) -> Callable:
     """One step of value and tangents as a function of lists of leaves, for `lowered`."""
+    rows, columns = np.triu_indices(directions.tangents)
 
     def step(shared, lane, carry, index):
         scenario, folds, dt = Leaves(treedef, is_lane, [], []).together(shared, lane)
 
         def one(moved, carry, eps):
             loop = preaccumulated(scenario, directions, eps, carry.state)
-            return _floats_and_rest(rollout.advance(moved, folds, method, dt, carry, index, loop)[0])
+            after, sample = rollout.advance(moved, folds, method, dt, carry, index, loop)
+            outer = outer_of(folds, carry.accumulators, sample)
+            return (_floats(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
 
         before = jax.tree.unflatten(carry_treedef, carry)
-        _, tangents, carry = pushed(one, directions, scenario, before, dt.dtype)
-        return jax.tree.leaves(Differentiated(carry, tangents)), []
+        _, (tangents, pushed_vectors), (carry, factors) = pushed(one, directions, scenario, before, dt.dtype)
+        terms = zip(before.products, pushed_vectors, factors, strict=True)
+        products = [decay * N + jnp.sum(weight * y[rows] * y[columns], axis=-1) for N, y, (weight, decay) in terms]
+        return jax.tree.leaves(Differentiated(carry, tangents, products)), []
 
     return step
 
@@ -164,14 +173,16 @@ def _floats_of(metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
     return {name: x for name, x in metrics.items() if jnp.issubdtype(x.dtype, jnp.floating)}
 
 
-def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str):
+def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str) -> Tangents:
     """`run_batch_jvp` by a lowered step; raises as `batch.run`."""
     batch = batch_of(executor, scenario, varied, folds, dt)._replace(sparse=True)
+    count = sum(getattr(fold, "curvatures", 0) for fold in folds)
+    rows, columns = np.triu_indices(directions.tangents)
 
     def begin(lane):
         scenario, folds, dt = batch.whole(lane)
         _, tangents, carry = pushed(lambda s, *_: _floats_and_rest(rollout.start(s, folds, dt)), directions, scenario, None, dt.dtype)
-        return Differentiated(carry, tangents)
+        return Differentiated(carry, tangents, [jnp.zeros((len(rows),), dt.dtype)] * count)
 
     before = jax.vmap(begin, axis_size=batch.runs)(batch.leaves.lane)
     before, _ = batch.advance(derivative_function, before, steps, None, method, directions)
@@ -185,24 +196,18 @@ def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, fo
             return _floats_of(outcome.metrics), carry
 
         _, tangents, carry = pushed(metrics, directions, scenario, before, dt.dtype)
-        return carry, tangents
+        full = jnp.zeros((directions.tangents,) * 2, dt.dtype)
+        return carry, tangents, tuple(full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products)
 
-    carry, tangents = jax.vmap(end)(batch.leaves.lane, before)
-    return verdicts(batch, method, carry, critical_modes(batch._replace(sparse=False), steps, carry)), tangents
+    carry, tangents, products = jax.vmap(end)(batch.leaves.lane, before)
+    outcome = verdicts(batch, method, carry, critical_modes(batch._replace(sparse=False), steps, carry))
+    return Tangents(outcome, tangents, products)
 
 
-def plain_jvp(scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str):
-    """`run_batch_jvp` on plain vmap."""
-
-    def one(varied):
-        def metrics(eps):
-            moved = directions.moved(with_parameters(scenario, varied), eps)
-            outcome = rollout.run(moved, folds, dt, steps=steps, record_every=None, method=method)
-            return _floats_of(outcome.metrics), outcome
-
-        zero = jnp.zeros((directions.tangents,), dt.dtype)
-        along = jax.vmap(lambda unit: jax.jvp(metrics, (zero,), (unit,), has_aux=True), out_axes=(None, 0, None))
-        _, tangents, outcome = along(np.eye(directions.tangents, dtype=dt.dtype))
-        return outcome, tangents
-
-    return jax.vmap(one)(dict(varied))
+def plain_jvp(scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str) -> Tangents:
+    """`run_batch_jvp` on plain vmap: a leaf that moves becomes one that varies."""
+    runs = len(next(iter(varied.values())))
+    moving = {path: np.asarray(numbers, dt.dtype).reshape(shape) for path, shape, numbers in directions.items}
+    values = jax.vmap(lambda run: {path: get(with_parameters(scenario, run), path) for path in moving})(dict(varied))
+    along = {path: jnp.broadcast_to(x[:, None], (len(x), runs, *x.shape[1:])) for path, x in moving.items()}
+    return value_and_tangents(scenario, dict(varied) | values, along, folds, dt, steps=steps, method=method)

@@ -26,15 +26,16 @@ from iblf_jax import checks
 from iblf_jax._designs import check_seed
 from iblf_jax._draws import Cases, Target, draw, plan, sample_size
 from iblf_jax._progress import bar
-from iblf_jax.derivatives import value_and_tangents
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
+from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.status import Status
 from iblf_jax.tuning.quantities import Peak, Quantities
+from iblf_jax.tuning.tangents import by_coordinates
 
 FIRST_RATE, LAST_RATE = 0.5, 0.02
 """Steps in u, from the first to the last."""
@@ -104,6 +105,7 @@ def falsify(
     duration: float,
     dt: float = 1e-3,
     method: str = "rk4",
+    backend: str = "auto",
     starts: int = 16,
     iterations: int = 12,
     seed: int = 0,
@@ -119,6 +121,7 @@ def falsify(
       duration: length of a run [s], a whole number of steps.
       dt: time step [s].
       method: integrator.
+      backend: as `tune`.
       starts: attacks, each from its own random point, in one batch.
       iterations: steps of each attack.
       seed: fixes the starting points.
@@ -133,6 +136,7 @@ def falsify(
     Source: head of this module.
     """
     tableau(method)
+    checks.one_of("backend", backend, BACKENDS)
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
     targets, by_path = plan(scenario, sets, "sets")
@@ -143,7 +147,7 @@ def falsify(
     by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
     cases = Cases(scenario, by_path, jax.random.key(0))
     sizes = _Sizes(tuple(sample_size(targets, by_path).items()))
-    push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method)
+    push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method, backend=backend)
     u, best, history = np.random.default_rng([check_seed(seed), 3]).uniform(size=(starts, sizes.total)), None, []
     with bar(progress, iterations + 1) as shown:
         for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
@@ -177,14 +181,14 @@ def _made(cases: Cases, targets: tuple[Target, ...], sizes: _Sizes, u: jax.Array
     return draw(cases, targets, jnp.uint32(0), {}, sizes.split(u))[0]
 
 
-@partial(jax.jit, static_argnames=("targets", "sizes", "steps", "method"))
-def _push(cases: Cases, dt, u, *, targets, sizes, steps, method):
+@partial(jax.jit, static_argnames=("targets", "sizes", "steps", "method", "backend"))
+def _push(cases: Cases, dt, u, *, targets, sizes, steps, method, backend):
     """Smallest margin (S,) [rad], its gradient by u (S, d) and the status of each attack."""
     one: Any = jnp.ones_like(dt)
     fold = Quantities((Peak(one, "deficit", smoothing=one * SMOOTHING),))
     made = partial(_made, cases, targets, sizes)
     varied = jax.vmap(made)(u)
-    directions = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), jax.vmap(jax.jacfwd(made))(u))
-    found = value_and_tangents(cases.scenario, varied, directions, (fold,), dt, steps=steps, method=method)
+    slopes = jax.vmap(jax.jacfwd(made))(u)
+    found = by_coordinates(cases.scenario, varied, slopes, (fold,), dt, steps=steps, method=method, backend=backend)
     margin = -found.outcome.metrics["tuning_exact"][:, 0]
     return margin, -found.tangents["tuning_smooth"][:, :, 0], found.outcome.status

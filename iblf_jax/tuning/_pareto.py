@@ -93,6 +93,7 @@ def pareto(
     seed: int = 0,
     risk: str | Risk = "mean",
     method: str = "rk4",
+    backend: str = "auto",
     tolerance: float = 1e-5,
     progress: bool | None = None,
 ) -> Front:
@@ -101,7 +102,7 @@ def pareto(
         point j:  minimise w_j log a + (1 - w_j) log b
 
     Args:
-      scenario, parameters, duration, dt, perturbations, runs, seed, risk, method, tolerance: as `tune`.
+      scenario, parameters, duration, dt, perturbations, runs, seed, risk, method, backend, tolerance: as `tune`.
       objectives: two of `iblf_jax.objectives`, of one plain term each; requirements of either hold for all points.
       points: scalarisations, in one batch.
       iterations: steps of each at most.
@@ -117,7 +118,7 @@ def pareto(
     """
     began = time.perf_counter()
     pair = _pair(objectives)
-    timing = {"duration": duration, "dt": dt, "method": method}
+    timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, scalarisation="log", mode="forward")
     if len(problem.box.z) > FORWARD_MOST:
         raise checks.fail("parameters", f"{len(problem.box.z)} numbers", f"at most {FORWARD_MOST} for a front", "Tie or leave out some.")

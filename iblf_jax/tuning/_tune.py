@@ -19,6 +19,7 @@ from iblf_jax._draws import Cases, plan
 from iblf_jax._progress import bar
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
+from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.tuning.first_order import LBFGS, Adam
@@ -50,6 +51,7 @@ def tune(
     risk: str | Risk = "mean",
     resample: bool = False,
     method: str = "rk4",
+    backend: str = "auto",
     optimiser: str = "auto",
     mode: str = "auto",
     starts: int = 1,
@@ -80,6 +82,7 @@ def tune(
       risk: "mean", "worst", "cvar" or `cvar(level)`.
       resample: draw the runs anew at every step (adam only); the same ones for all steps otherwise.
       method: integrator.
+      backend: what values and forward mode run on, see `iblf_jax.lowering`: "auto", "native", "xla" or "vmap".  Reverse mode is plain XLA.
       optimiser: "newton" (Gauss-Newton in a trust region), "lbfgs", "adam", or "auto": newton where forward mode is used, else lbfgs, and
         adam where runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
@@ -103,7 +106,7 @@ def tune(
     Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
     """
     began = time.perf_counter()
-    timing = {"duration": duration, "dt": dt, "method": method}
+    timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing, mode=mode)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     iterations, starts = checks.positive_integer("iterations", iterations), checks.positive_integer("starts", starts)
@@ -135,6 +138,7 @@ def tune(
         float(duration),
         float(dt),
         method,
+        backend,
         checks.positive_integer("report_runs", report_runs),
         (seed + 1) % 2**32 if report_seed is None else check_seed(report_seed),
         confidence,
@@ -160,8 +164,9 @@ class Problem:
 def build(
     scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, *, scalarisation="sum", mode="auto"
 ) -> Problem:
-    """Checks what `tune` and its relatives were asked for."""
+    """Checks what `tune` and its relatives were asked for; `timing` is duration, dt, method and, if it is not "auto", backend."""
     tableau(timing["method"])
+    checks.one_of("backend", timing.get("backend", "auto"), BACKENDS)
     steps = checks.whole_steps(timing["duration"], timing["dt"])
     seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs), canonical(scenario)
     dtype = scenario.initial.q.dtype
@@ -174,7 +179,7 @@ def build(
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
-    plan_ = Plan(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation)
+    plan_ = Plan(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
     problem = Problem(plan_, Shared(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
     if not is_complete(goal):
         derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax._draws import Cases, Target, draw, merge
-from iblf_jax.derivatives import run_checkpointed, value_and_tangents
+from iblf_jax._draws import Cases, Target, draw, merge, same_place
+from iblf_jax.derivatives import run_checkpointed
 from iblf_jax.lowering import run_batch
 from iblf_jax.paths import with_parameters
 from iblf_jax.status import Status
@@ -29,6 +29,7 @@ from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import Block, values_at
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.robust import Risk, combine, worst_share
+from iblf_jax.tuning.tangents import by_coordinates
 
 FORWARD_MOST = 32
 """Up to so many numbers forward mode is used, above it reverse mode."""
@@ -48,6 +49,8 @@ class Plan(NamedTuple):
     """Share of the runs that G_r is taken over, for each requirement."""
     scalarisation: str = "sum"
     """"sum" of weighted terms, or "log": sum of weighted logarithms."""
+    backend: str = "auto"
+    """What values and forward mode run on; reverse mode is plain XLA."""
 
 
 class Shared(NamedTuple):
@@ -177,7 +180,7 @@ def value(shared: Shared, lanes: Lane, *, plan: Plan) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
     fold = fold_of(shared.objective, shared.dt.dtype)
     varied = _flat(_of_lanes(plan, shared, lanes))
-    outcome = run_batch(shared.cases.scenario, varied, fold, shared.dt, steps=plan.steps, method=plan.method)
+    outcome = run_batch(shared.cases.scenario, varied, fold, shared.dt, steps=plan.steps, method=plan.method, backend=plan.backend)
     smooth, exact, _ = (outcome.metrics[name].reshape(*lanes.index.shape, -1) for name in Quantities.units)
     status = outcome.status.reshape(lanes.index.shape)
     return jax.vmap(partial(_value, plan, shared))(lanes, smooth, exact, status)
@@ -189,9 +192,11 @@ def slope(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
     fold = fold_of(shared.objective, shared.dt.dtype)
     one = partial(_varied, plan, shared)
     jacobian = jax.vmap(jax.vmap(jax.jacfwd(one), in_axes=(None, 0)))(lanes.z, lanes.index)
-    directions = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), _flat(jacobian))
+    moving = {path: x for path, x in _flat(jacobian).items() if any(same_place(path, block.path) for block in plan.blocks)}
+    tied = [b.path for b in plan.blocks if b.size == 1 and not any(same_place(b.path, t.path) for t in plan.targets)]
     varied = _flat(_of_lanes(plan, shared, lanes))
-    found = value_and_tangents(shared.cases.scenario, varied, directions, fold, shared.dt, steps=plan.steps, method=plan.method)
+    options: dict[str, Any] = {"steps": plan.steps, "method": plan.method, "backend": plan.backend, "together": tied}
+    found = by_coordinates(shared.cases.scenario, varied, moving, fold, shared.dt, **options)
     parts = jax.tree.map(lambda x: x.reshape(*lanes.index.shape, *x.shape[1:]), (found.outcome, found.tangents, found.products))
     return jax.vmap(partial(_slope, plan, shared))(lanes, *parts)
 

@@ -136,13 +136,13 @@ class _Sample:
         self.exact, self.status, self.margin, self.made = exact, status, margin, made
 
 
-def _run(scenario: Scenario, objective: Objective, perturbations, runs: int, seed: int, timing: dict[str, Any]) -> _Sample:
+def _run(scenario: Scenario, objective: Objective, perturbations, runs: int, seed: int, timing: dict[str, Any], backend: str) -> _Sample:
     folds = (Quantities(objective.quantities), Margin())
     if not perturbations:
         run = simulate(scenario, metrics=folds, record_every=10**9, **timing)
         exact, margin = np.asarray(run.metrics["tuning_exact"])[None], np.min(np.asarray(run.metrics["margin"]))[None]
         return _Sample(exact, np.asarray(run.status)[None], margin, np.ones(1, bool))
-    study = monte_carlo(scenario, perturbations, runs=runs, seed=seed, metrics=folds, progress=False, **timing)
+    study = monte_carlo(scenario, perturbations, runs=runs, seed=seed, metrics=folds, progress=False, backend=backend, **timing)
     margin = np.asarray(study.metrics["margin"]).min(axis=1)
     return _Sample(np.asarray(study.metrics["tuning_exact"]), np.asarray(study.status), margin, np.asarray(study.made))
 
@@ -191,6 +191,7 @@ def make_report(
     risk: Risk,
     confidence: float,
     timing: dict[str, Any],
+    backend: str = "auto",
 ) -> Report:
     """Runs both scenarios on the same fresh draws and compares them.
 
@@ -202,8 +203,9 @@ def make_report(
       risk: how the objective combines runs.
       confidence: of the intervals.
       timing: duration, dt, method.
+      backend: what the fresh runs run on.
     """
-    samples = [_run(scenario, objective, perturbations, runs, seed, timing) for scenario in (before, after)]
+    samples = [_run(scenario, objective, perturbations, runs, seed, timing, backend) for scenario in (before, after)]
     both = samples[0].made & samples[1].made
     terms = [np.stack([np.asarray(t.value(jnp.asarray(s.exact[both, i]))) for i, t in enumerate(objective.terms)], axis=1) for s in samples]
     level = f" {risk.level:g}" if risk.kind == "cvar" else ""

@@ -23,9 +23,9 @@ from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
 
 
-@partial(jax.jit, static_argnames=("steps", "method"))
-def _slice(scenario, changes, folds, dt, *, steps, method):
-    return run_batch(scenario, changes, folds, dt, steps=steps, method=method)
+@partial(jax.jit, static_argnames=("steps", "method", "backend"))
+def _slice(scenario, changes, folds, dt, *, steps, method, backend):
+    return run_batch(scenario, changes, folds, dt, steps=steps, method=method, backend=backend)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,6 +41,7 @@ class Setup:
     duration: float
     dt: float
     method: str
+    backend: str
     report_runs: int
     report_seed: int
     confidence: float
@@ -126,6 +127,7 @@ class TuneResult:
             risk=setup.risk,
             confidence=setup.confidence,
             timing=timing,
+            backend=setup.backend,
         )
 
     def landscape(self, first: str, second: str, *, points: int = 13, span: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,7 +155,8 @@ class TuneResult:
         dtype = scenario.initial.q.dtype
         folds = as_folds((Quantities(setup.objective.quantities),), dtype)
         steps = checks.whole_steps(setup.duration, setup.dt)
-        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), steps=steps, method=setup.method)
+        options = {"steps": steps, "method": setup.method, "backend": setup.backend}
+        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), **options)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
         sound = np.asarray(outcome.status) & int(UNSOUND) == 0
         return a, b, np.where(sound, np.asarray(values), np.inf).reshape(points, points)
