@@ -133,7 +133,8 @@ def run_batch_jvp(
     """Values of a batch and their derivatives along P directions in the space of leaves, in one pass; call it inside `jit`.
 
     Args:
-      scenario, varied, folds, dt, steps, method, backend: as `run_batch`.
+      scenario, varied, folds, dt, steps, method: as `run_batch`.
+      backend: as `run_batch`; "auto" runs long programs (many joints, many directions), which take minutes to compile, on vmap.
       directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run: direction p moves each of these
         leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
 
@@ -148,6 +149,11 @@ def run_batch_jvp(
     options: dict[str, Any] = {"steps": steps, "method": method}
 
     def run_on(executor):
+        if backend == "auto" and not sensitivities.is_short(scenario, varied, along, folds, dt, method=method):
+            return plain()
         return sensitivities.lowered_jvp(executor, scenario, varied, along, folds, dt, **options)
 
-    return with_fallback(backend, run_on, lambda: sensitivities.plain_jvp(scenario, varied, along, folds, dt, **options))
+    def plain():
+        return sensitivities.plain_jvp(scenario, varied, along, folds, dt, **options)
+
+    return with_fallback(backend, run_on, plain)

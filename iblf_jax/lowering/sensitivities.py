@@ -19,10 +19,13 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax import rollout
 from iblf_jax.closed_loop import LoopState, Sample, evaluate
 from iblf_jax.derivatives import Tangents, outer_of, value_and_tangents
-from iblf_jax.lowering.batch import Executor, batch_of, critical_modes, verdicts
+from iblf_jax.lowering import native
+from iblf_jax.lowering.batch import Executor, batch_of, critical_modes, step_function, verdicts
 from iblf_jax.lowering.step import Leaves
 from iblf_jax.paths import get, with_parameters
 
+LARGEST = 60_000
+"""Operations of a step with its derivatives up to which "auto" lowers it: compilers take minutes over longer ones."""
 FLAGS = ("guard_active", "saturated")
 """Fields of a sample that are no numbers."""
 
@@ -171,6 +174,17 @@ def derivative_function(treedef, is_lane: tuple[bool, ...], carry_treedef, metho
 
 def _floats_of(metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
     return {name: x for name, x in metrics.items() if jnp.issubdtype(x.dtype, jnp.floating)}
+
+
+def is_short(scenario, varied, directions: Directions, folds, dt, *, method: str) -> bool:
+    """Whether the derivatives' program is short enough to be compiled in seconds: each tangent costs about as much as the value.
+
+    Raises:
+      UnsupportedError: the step does not lower.
+    """
+    batch = batch_of(native.run, scenario, varied, folds, dt)
+    program, _, _ = batch.program(step_function, jax.eval_shape(batch.start), method, False)
+    return len(program.nodes) * (1 + directions.tangents) <= LARGEST
 
 
 def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str) -> Tangents:
