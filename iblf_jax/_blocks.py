@@ -21,9 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax._draws import Cases, Lanes, Target, draw, merge
-from iblf_jax.lowering import BACKENDS, run_batch
+from iblf_jax.lowering import run_batch, settled
 from iblf_jax.status import Status, flag
 
 BLOCK = {"cpu": 256}
@@ -66,12 +65,6 @@ def block_size() -> int:
     return BLOCK.get(jax.default_backend(), BLOCK_ELSEWHERE)
 
 
-def check_backend(backend: str) -> str:
-    """The backend's name; ValueError for another."""
-    checks.one_of("backend", backend, BACKENDS)
-    return backend
-
-
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     """`x` where the draws were admissible, else NaN (-1 for whole numbers)."""
     mark = jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else -1
@@ -87,6 +80,17 @@ def _draws(program: Program, shared: Shared, lanes: Lanes):
 
     # Without the barrier XLA works the random numbers into every operation of the run: 18 s to compile instead of 5.
     return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
+
+
+def with_settled_backend(program: Program, shared: Shared, lanes: Lanes) -> Program:
+    """The program with the backend that its blocks will run on in place of "auto" or one that is not available.
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    varied, _, _ = jax.eval_shape(partial(_draws, program), shared, lanes)
+    backend = settled(program.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=program.method)
+    return program._replace(backend=backend)
 
 
 def _block(program: Program, shared: Shared, lanes: Lanes) -> Results:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax._blocks import Program, Shared, check_backend
+from iblf_jax._blocks import Program, Shared, block_size, with_settled_backend
 from iblf_jax._designs import check_seed, split, unit_points
 from iblf_jax._draws import Cases, Lanes, plan, sample_size
 from iblf_jax.distributions import Perturbation
@@ -78,6 +78,7 @@ def prepare(
         shapes = sample_size(targets, by_path)
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
-    program = Program(targets, steps, method, check_backend(backend))
+    program = Program(targets, steps, method, backend)
     shared = Shared(Cases(scenario, by_path, jax.random.key(seed)), folds, step)
-    return Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
+    setup = Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
+    return dataclasses.replace(setup, program=with_settled_backend(program, shared, setup.lanes(np.arange(block_size()))))

@@ -93,6 +93,11 @@ class Study:
         return self.setup.seed
 
     @property
+    def backend(self) -> str:
+        """What the runs ran on: "native", "xla" or "vmap", whatever was asked for."""
+        return self.setup.program.backend
+
+    @property
     def dt(self) -> float:
         """Time step [s]."""
         return float(self.setup.shared.dt)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 
 import jax
@@ -107,6 +108,41 @@ def test_choice_has_its_weights():
     draws = np.asarray(ij.choice([1.0, 5.0, 9.0], weights=[1, 0, 3]).quantile(jnp.linspace(0.0005, 0.9995, 1000)))
     assert np.mean(draws == 1.0) == pytest.approx(0.25, abs=2e-3)
     assert set(draws) == {1.0, 9.0}
+
+
+def test_a_law_and_a_distribution_from_a_notebook():
+    """Classes of the user's own, defined where the study is made."""
+
+    @ij.component
+    class Triangular:
+        """The sum of two dice: density 2 (1 - x) on (0, 1)."""
+
+        def quantile(self, u):
+            return 1 - jnp.sqrt(1 - u)
+
+        def support(self):
+            return np.zeros(()), np.ones(())
+
+    @ij.component
+    class Damping:
+        """tau = G0 - Kd q' - f_hat."""
+
+        Kd: jax.Array = ij.leaf("N m s/rad", sign="positive")
+
+        def init(self, q, dq, setting):
+            return ()
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            never = jnp.zeros(q.shape, bool)
+            tau = setting.model.gravity(q) - self.Kd * dq - f_hat
+            return ij.controllers.Command(tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), state
+
+    scenario = dataclasses.replace(SCENARIO, controller=Damping(Kd=[4.0, 4.0]), observer=ij.observers.NoObserver())
+    study = ij.monte_carlo(scenario, {"plant.payload": ij.value(Triangular())}, runs=300, seed=1, duration=0.05, progress=False)
+    assert study.backend in ("native", "xla")
+    assert abs(study.samples["plant.payload"].mean() - 1 / 3) < 0.05
+    replayed = study.replay(7)
+    np.testing.assert_array_equal(replayed.metrics["effort"], study.metrics["effort"][7])
 
 
 def test_robot_paths_move_plant_and_model_together_and_shared_draws_are_one():

@@ -166,6 +166,7 @@ def test_another_scenario_law_or_backend_is_refused(finished):
         ij.sweep(ij.presets.zhang_yan_2024(reading="corrected"), cases.GRID, perturbations=ways, **options)
     with pytest.raises(ij.StoreError, match="backend"):
         ij.sweep(SCENARIO, cases.GRID, perturbations=ways, **options, backend="vmap")
+    assert ij.load_sweep(finished).attrs["backend"] in ("native", "xla"), "what it ran on, not what was asked for"
 
 
 def chunks(path, name="margin"):

@@ -1,8 +1,9 @@
 """The command line: `python -m iblf_jax COMMAND`, or `iblf-jax COMMAND`.
 
 One module a command, each with `add_parser(subparsers)` and `run(args) -> int`; a new command is a new module and a word in `COMMANDS`.
-Exit codes: 0 done, 1 a run failed (a bound was violated, the state ran away, the step was too large), 2 bad arguments or files, with
-one line on stderr.  What is slow to import is imported by `run`, so that `--help` is quick.  The CLI computes in float64.
+Exit codes: 0 done; 1 a run failed (a bound was violated, the state ran away, the step was too large); 2 bad arguments or files, with
+one line on stderr; 3 a study did not finish (disk full, another process lost) and what it wrote stays valid; 130 interrupted.
+What is slow to import is imported by `run`, so that `--help` is quick.  The CLI computes in float64.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="iblf-jax",
         description="Simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots.",
-        epilog="Exit codes: 0 done; 1 a run failed; 2 bad arguments or files.",
+        epilog="Exit codes: 0 done; 1 a run failed; 2 bad arguments or files; 3 a study did not finish; 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"iblf_jax {iblf_jax.__version__} (jax {jax.__version__})")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, dest="command")

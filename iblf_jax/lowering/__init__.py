@@ -76,6 +76,32 @@ def with_fallback(backend: str, run_on: Callable, plain: Callable):
     return plain()
 
 
+def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds, dt: jax.Array, *, method: str) -> str:
+    """The backend that a batch will run on, fallbacks and their warnings included; builds the native kernel if it is that one.
+
+    Args:
+      backend, scenario, folds, dt, method: as `run_batch`.
+      varied: path -> values or their shapes, batch axis first.
+
+    Returns:
+      "native", "xla" or "vmap".
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    found = []
+
+    def trace(varied):
+        def run_on(executor):
+            batch.run(executor, scenario, varied, folds, dt, steps=1, method=method, record_every=None)
+            return {native.run: "native", xla.run: "xla"}[executor]
+
+        found.append(with_fallback(backend, run_on, lambda: "vmap"))
+
+    jax.eval_shape(trace, dict(varied))
+    return found[-1]
+
+
 def run_batch(
     scenario: Scenario,
     varied: Mapping[str, jax.Array],
