@@ -196,17 +196,17 @@ def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
     return (as_one_function(one) if alone else one)(scenario, folds, dt)
 
 
-@partial(jax.jit, static_argnames=("steps", "record_every", "method"))
-def _run_native(scenario, folds, dt, *, steps, record_every, method):
-    """`run` as a batch of one on the native backend, which falls back to the others by itself."""
+@partial(jax.jit, static_argnames=("steps", "record_every", "method", "backend"))
+def _run_generated(scenario, folds, dt, *, steps, record_every, method, backend):
+    """`run` as a batch of one on a backend that generates code, which falls back to the others by itself."""
     from iblf_jax.lowering import run_batch
 
     alone = {"initial.q": scenario.initial.q[None]}
     options = {"steps": steps, "record_every": record_every, "method": method}
-    return jax.tree.map(lambda x: x[0], run_batch(scenario, alone, folds, dt, backend="native", **options))
+    return jax.tree.map(lambda x: x[0], run_batch(scenario, alone, folds, dt, backend=backend, **options))
 
 
-SINGLE_RUN_BACKENDS = ("xla", "native")
+SINGLE_RUN_BACKENDS = ("xla", "native", "gpu")
 """How `simulate` can execute one run."""
 
 
@@ -237,7 +237,8 @@ def simulate(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
       backend: "xla", or "native": the same program as generated code, several times faster once the system's compiler has built it
-        (seconds, once for a structure; kept on disk).  Inside your own `jit`, `vmap` or `grad` a run is always on xla.
+        (seconds, once for a structure; kept on disk), or "gpu": the same as one kernel on an NVIDIA GPU.  Inside your own `jit`, `vmap`
+        or `grad` a run is always on xla.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -269,8 +270,8 @@ def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     alone = checks.is_concrete((scenario, folds))
     options = {"steps": steps, "record_every": record_every, "method": method}
-    if backend == "native" and alone:
-        outcome = _run_native(scenario, folds, dt, **options)
+    if backend != "xla" and alone:
+        outcome = _run_generated(scenario, folds, dt, backend=backend, **options)
     else:
         outcome = _run_compiled(scenario, folds, dt, alone=alone, **options)
     arrays, controller_state, observer_state = outcome.records

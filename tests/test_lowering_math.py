@@ -41,7 +41,7 @@ def kernel(dtype):
         f"{{ for (long i = 0; i < n; i += W) store(y + i, f_{name}(load(x + i))); }}\n"
         for name in FUNCTIONS
     )
-    source = f"#define DOUBLE {int(dtype == np.float64)}\n" + emit_c._text("vector.h") + emit_c._text("mathlib.h") + entries
+    source = f"#define DOUBLE {int(dtype == np.float64)}\n" + emit_c.header("vector.h") + emit_c.header("mathlib.h") + entries
     return toolchain.loaded(toolchain.built(source)[0])
 
 

@@ -5,8 +5,10 @@
     vmap     plain `jax.vmap` of a run: any scenario, any device, reverse-mode derivatives
     xla      the step's scalar program, one (batch,) array a number, in `lax.scan`: any device, nothing needed but jax
     native   the same program as C, built by the system's compiler, SIMD over runs and threads: CPU
+    gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs (not yet measured on one)
 
-What a scalar program cannot express runs on `vmap`, and what has no compiler on `xla`; a `BackendWarning` says why, once.
+What a scalar program cannot express runs on `vmap`, and what has no compiler, or is for another device, on `xla`; a `BackendWarning`
+says why, once.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import jax
 
 from iblf_jax import checks
 from iblf_jax.derivatives import Tangents
-from iblf_jax.lowering import batch, native, sensitivities, xla
+from iblf_jax.lowering import batch, gpu, native, sensitivities, xla
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.one_function import SMALL, as_one_function
@@ -27,8 +29,10 @@ from iblf_jax.paths import with_parameters
 from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
 
-BACKENDS = ("auto", "vmap", "xla", "native")
-"""How a batch can be executed; "auto" is native on CPU, else xla."""
+BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
+"""How a batch can be executed; "auto" is native on CPU, gpu on an NVIDIA GPU, else xla."""
+COMPILED = {"cpu": native, "gpu": gpu}
+"""The backend that builds its kernels, by platform."""
 
 
 class BackendWarning(UserWarning):
@@ -44,32 +48,36 @@ def _tell(text: str) -> None:
         warnings.warn(text, BackendWarning, stacklevel=4)
 
 
+def automatic() -> tuple[str, str | None]:
+    """The backend that "auto" takes for what lowers, and why it is not a compiled one, in one line (None if it is)."""
+    compiled = COMPILED.get(jax.default_backend())
+    reason = compiled.unavailable() if compiled else f"no kernels are compiled for {jax.default_backend()}"
+    return ("xla", reason) if compiled is None or reason else (compiled.NAME, None)
+
+
 def with_fallback(backend: str, run_on: Callable, plain: Callable):
     """`run_on(executor)` on the backend that was asked for, or the next one that can; `plain()` is vmap.
 
     Args:
       backend: one of BACKENDS.
-      run_on: function of an executor (`native.run`, `xla.run`).
+      run_on: function of an executor (`native.run`, `gpu.run`, `xla.run`).
       plain: function without arguments.
 
     Raises:
       ValueError: an unknown backend.
     """
     checks.one_of("backend", backend, BACKENDS)
-    on_cpu = jax.default_backend() == "cpu"
-    if backend == "auto":
-        backend = "native" if on_cpu else "xla"
-    if backend == "native" and not on_cpu:
-        _tell(f"The native backend is for CPU, the default device is {jax.default_backend()}: running on xla.")
-        backend = "xla"
+    here = COMPILED.get(jax.default_backend())
+    compiled = {"native": native, "gpu": gpu, "auto": here}.get(backend)
     try:
-        if backend == "native":
+        if compiled and compiled is not here:
+            _tell(f"The {backend} backend is not for the default device, {jax.default_backend()}: running on xla.")
+        elif compiled:
             try:
-                return run_on(native.run)
+                return run_on(compiled.run)
             except ToolchainError as error:
-                _tell(f"The native backend is not available ({error}): running on xla.")
-                backend = "xla"
-        if backend == "xla":
+                _tell(f"The {compiled.NAME} backend is not available ({error}): running on xla.")
+        if backend != "vmap":
             return run_on(xla.run)
     except UnsupportedError as reason:
         _tell(f"This scenario runs on plain vmap, several times slower: {reason}.")
@@ -84,7 +92,7 @@ def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds, 
       varied: path -> values or their shapes, batch axis first.
 
     Returns:
-      "native", "xla" or "vmap".
+      "gpu", "native", "xla" or "vmap".
 
     Raises:
       ValueError: an unknown backend.
@@ -94,7 +102,7 @@ def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds, 
     def trace(varied):
         def run_on(executor):
             batch.run(executor, scenario, varied, folds, dt, steps=1, method=method, record_every=None)
-            return {native.run: "native", xla.run: "xla"}[executor]
+            return {gpu.run: "gpu", native.run: "native", xla.run: "xla"}[executor]
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))
 

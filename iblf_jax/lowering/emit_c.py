@@ -1,7 +1,8 @@
 """C from a scalar program: one function for what only shared leaves decide, one for what time decides, one for a block of runs.
 
-The text is plain statements, one a node; `c/vector.h` says what a vector of runs is, `c/mathlib.h` has the elementary functions
-and `c/driver.h` the loops and threads around it.
+The text is plain statements, one a node, and the same for every target; the headers around it say what it means.  On a CPU `c/vector.h`
+makes of a name a vector of runs, `c/mathlib.h` has the elementary functions and `c/driver.h` the loops and threads; on a GPU
+`c/scalar.h` makes of it the number of one thread's run, and `c/kernels.h` has the kernels.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from importlib.resources import files
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +27,12 @@ CALLS = (
 )  # fmt: skip
 
 
+COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
+NATIVE = (("vector.h", "mathlib.h"), ("driver.h",))
+CUDA = (("scalar.h", "mathlib.h"), ("kernels.h",))
+"""The headers before and after the generated functions, by target."""
+
+
 def literal(node: Node, dtype: np.dtype) -> str:
     """A constant as a vector of runs."""
     if node.kind == "b":
@@ -32,9 +40,9 @@ def literal(node: Node, dtype: np.dtype) -> str:
     if node.kind == "i":
         return f"splat_i({node.value})"
     if math.isnan(node.value):
-        return 'splat(__builtin_nanf(""))'
+        return "splat(NAN)"
     if math.isinf(node.value):
-        return f"splat({'-' if node.value < 0 else ''}(real)__builtin_inf())"
+        return f"splat({'-' if node.value < 0 else ''}INFINITY)"
     return f"splat({node.value.hex()}{'f' if dtype == np.float32 else ''})"
 
 
@@ -44,7 +52,8 @@ def expression(node: Node, args: list[str], kinds: list[str]) -> str:
     if op in ("eq", "ne") and kinds[0] == "b":
         return f"{'~' if op == 'eq' else ''}({args[0]} ^ {args[1]})"
     if (op in INFIX and kinds[0] != "b") or op in ("and", "or", "xor"):
-        return f"{args[0]} {INFIX[op]} {args[1]}"
+        text = f"{args[0]} {INFIX[op]} {args[1]}"
+        return f"MASK({text})" if op in COMPARISONS else text
     if op in ("neg", "not"):
         return f"{'-' if op == 'neg' else '~'}{args[0]}"
     if op == "select":
@@ -55,7 +64,7 @@ def expression(node: Node, args: list[str], kinds: list[str]) -> str:
         return f"i_{op}({args[0]}, {args[1]})"
     if op in CALLS and kinds[0] == "f":
         return f"f_{op}({', '.join(args)})"
-    raise UnsupportedError(f"the native backend has no {op} of kind {kinds}")
+    raise UnsupportedError(f"generated code has no {op} of kind {kinds}")
 
 
 def _conversion(source: str, target: str, arg: str) -> str:
@@ -100,24 +109,50 @@ def _unpacked(node: Node, place: str) -> str:
     return f"splat({place}.f)" if node.kind == "f" else f"splat_i({place}.i)"
 
 
-def source(program: Program, shared_leaves: int, lane_leaves: int) -> str:
-    """The whole C source of a program's kernel."""
-    e = _Emitter(program)
-    constants = frontier(program, e.classes, SHARED, lambda c: c != SHARED)
-    columns = frontier(program, e.classes, TIME, lambda c: bool(c & LANE))
-    floats = [i for i, kind in enumerate(program.kinds) if kind == "f"]
-    ints = [i for i, kind in enumerate(program.kinds) if kind != "f"]
-    sizes = {
-        "SHARED_LEAVES": shared_leaves, "LEAVES": lane_leaves, "FLOATS": len(floats), "INTS": len(ints), "CONSTANTS": len(constants),
-        "COLUMNS": len(columns), "SAMPLES": len(program.samples), "DOUBLE": int(program.dtype == np.float64),
+class Layout(NamedTuple):
+    """Which numbers of a program stand where in the generated code."""
+
+    constants: list[int]
+    """Nodes that are computed once."""
+    columns: list[int]
+    """Nodes that are computed once a step."""
+    floats: list[int]
+    ints: list[int]
+    """Places in the carry."""
+
+    @staticmethod
+    def of(program: Program) -> Layout:
+        """That of a program."""
+        classes, kinds = program.classes(), program.kinds
+        return Layout(
+            frontier(program, classes, SHARED, lambda c: c != SHARED),
+            frontier(program, classes, TIME, lambda c: bool(c & LANE)),
+            [i for i, kind in enumerate(kinds) if kind == "f"],
+            [i for i, kind in enumerate(kinds) if kind != "f"],
+        )
+
+
+def sizes(program: Program, shared_leaves: int, lane_leaves: int) -> str:
+    """The definitions of the sizes that the headers ask for."""
+    constants, columns, floats, ints = map(len, Layout.of(program))
+    values = {
+        "SHARED_LEAVES": shared_leaves, "LEAVES": lane_leaves, "FLOATS": floats, "INTS": ints, "CONSTANTS": constants,
+        "COLUMNS": columns, "SAMPLES": len(program.samples), "DOUBLE": int(program.dtype == np.float64),
     }  # fmt: skip
-    parts = [f"#define {name} {value}\n" for name, value in sizes.items()]
-    parts += [_text("vector.h"), _text("mathlib.h")]
-    parts += [_constants(e, constants), _signals(e, constants, columns), _advance(e, constants, columns, floats, ints), _text("driver.h")]
-    return "\n".join(parts)
+    return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
-def _text(name: str) -> str:
+def source(program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE) -> str:
+    """The whole C source of a program's kernel for a target, NATIVE or CUDA."""
+    e, layout = _Emitter(program), Layout.of(program)
+    before, after = target
+    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before)]
+    parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns), _advance(e, *layout)]
+    return "\n".join([*parts, *map(header, after)])
+
+
+def header(name: str) -> str:
+    """The text of a file in `c/`."""
     return (files("iblf_jax.lowering") / "c" / name).read_text()
 
 
@@ -125,8 +160,8 @@ def _constants(e: _Emitter, constants: list[int]) -> str:
     nodes = e.program.nodes
     names = {i: f"splat(shared[{n.value}])" for i, n in enumerate(nodes) if n.op == "shared"}
     e.statements(names, constants)
-    e.lines += [f"  out[{k}].{_part(nodes[i])} = ({names[i]})[0];" for k, i in enumerate(constants)]
-    return e.function("static void shared_constants(const real *shared, word *out)")
+    e.lines += [f"  out[{k}].{_part(nodes[i])} = AT({names[i]}, 0);" for k, i in enumerate(constants)]
+    return e.function("FUNCTION void shared_constants(const real *shared, word *out)")
 
 
 def _part(node: Node) -> str:
@@ -137,12 +172,12 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
     nodes = e.program.nodes
     names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: "index" for i, n in enumerate(nodes) if n.op == "index"}
-    e.lines.append("  I index;\n  for (int l = 0; l < W; l++) index[l] = first + l;")
+    e.lines.append("  I index = from(first);")
     e.statements(names, columns)
     e.lines += [
-        f"  for (int l = 0; l < W; l++) table[l * COLUMNS + {k}].{_part(nodes[i])} = ({names[i]})[l];" for k, i in enumerate(columns)
+        f"  for (int l = 0; l < W; l++) table[l * COLUMNS + {k}].{_part(nodes[i])} = AT({names[i]}, l);" for k, i in enumerate(columns)
     ]
-    return e.function("static void shared_signals(const word *constants, integer first, word *table)")
+    return e.function("FUNCTION void shared_signals(const word *constants, integer first, word *table)")
 
 
 def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
@@ -167,7 +202,7 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
     e.lines.append("  }")
     e.lines += [f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]]
     return e.function(
-        "static void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
+        "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
         "                    int64_t first, int64_t every, real *records, int64_t runs, int64_t run)"
     )
 
@@ -180,5 +215,5 @@ def _record(e: _Emitter, names: dict[int, str]) -> None:
     inner = dict(names)
     e.statements(inner, e.program.samples)
     for k, i in enumerate(e.program.samples):
-        e.lines.append(f"  {{ F x = {inner[i]}; memcpy(out + {k} * runs, &x, live * sizeof(real)); }}")
+        e.lines.append(f"  store_some(out + {k} * runs, {inner[i]}, live);")
     e.lines.append("  }")

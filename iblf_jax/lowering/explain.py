@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.lowering import batch, native
+from iblf_jax.lowering import automatic, batch, native
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
 from iblf_jax.lowering.toolchain import threads
 from iblf_jax.metrics import standard
@@ -39,7 +39,9 @@ class Explanation:
     width: int
     """Runs in a register of 64 bytes."""
     limit: float
-    """Estimated limit of this machine [steps/s]: two vector instructions a cycle on every core."""
+    """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on every core."""
+    backend: str = ""
+    """What a batch runs on here when nobody says otherwise, and why that is not compiled code if it is not."""
 
     def __repr__(self) -> str:
         lines = ["operations done        number  which"]
@@ -48,6 +50,7 @@ class Explanation:
             lines.append(f"{name:22s} {sum(counter.values()):6d}  {which}")
         lines.append(f"about {self.slots:.0f} vector instructions a step for {self.width} runs")
         lines.append(f"two a cycle on every core would be {self.limit:.3g} steps/s")
+        lines.append(f"a batch runs on {self.backend}")
         return "\n".join(lines)
 
 
@@ -76,7 +79,9 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
-    return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots)
+    name, reason = automatic()
+    backend = f"{name}: {reason}" if reason else name
+    return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots, backend)
 
 
 def instructions(program: Program, width: int) -> float:

@@ -15,9 +15,20 @@ import numpy as np
 from iblf_jax.lowering.emit_c import source
 from iblf_jax.lowering.program import Program
 from iblf_jax.lowering.step import Packed
-from iblf_jax.lowering.toolchain import built, loaded, threads
+from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded, threads
+
+NAME = "native"
 
 _registered: set[str] = set()
+
+
+def unavailable() -> str | None:
+    """Why this process cannot run it, in one line, or None if it can."""
+    try:
+        compiler()
+    except ToolchainError as error:
+        return str(error)
+    return None
 
 
 @lru_cache(maxsize=64)

@@ -14,6 +14,7 @@ import shutil
 import stat
 import subprocess
 import tempfile
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 
@@ -89,17 +90,27 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     flags = [*FLAGS, *extra]
     content = [source, *flags, path, _version(path), _processor(), header.read_text()]
+
+    def compile_to(result: Path) -> None:
+        text = result.with_suffix(".cc")
+        text.write_text(source)
+        _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"])
+
+    return kept(content, ".so", compile_to)
+
+
+def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) -> tuple[Path, str]:
+    """The file that `make(path)` writes, and the key of its content, made unless it is in the cache; ToolchainError on failure."""
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
     directory = cache_directory()
-    library = directory / f"{key}.so"
-    if not _is_ours(library):
+    path = directory / f"{key}{suffix}"
+    if not _is_ours(path):
         with tempfile.TemporaryDirectory(dir=directory) as folder:
-            text, result = Path(folder) / "kernel.cc", Path(folder) / "kernel.so"
-            text.write_text(source)
-            _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm"])
+            result = Path(folder) / f"kernel{suffix}"
+            make(result)
             result.chmod(0o700)
-            os.replace(result, library)
-    return library, key
+            os.replace(result, path)
+    return path, key
 
 
 def _is_ours(path: Path) -> bool:

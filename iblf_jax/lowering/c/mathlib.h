@@ -1,19 +1,35 @@
-/* Elementary functions on vectors of runs.  tests/test_lowering_math.py holds their errors to: sin, cos 2.1 ulp, tested for |x| up to 3e4, NaN
+/* Elementary functions, on vectors of runs or (scalar.h) one run.  tests/test_lowering_math.py holds their errors to: sin, cos 2.1 ulp, tested for |x| up to 3e4, NaN
    beyond SINCOS_LIMIT; exp, expm1, log, log1p, atan 3.6 ulp; tanh, tan, logistic 5.6 ulp.  Sources: W. J. Cody,
    W. Waite, Software Manual for the Elementary Functions, 1980 (range reduction); S. Moshier, Cephes (coefficients of sin, cos, atan). */
 
-INLINE F f_abs(F x) { return (F)((I)x & ~splat_i(SIGN_BIT)); }
-INLINE F with_sign(F x, F s) { return (F)((I)x ^ ((I)s & SIGN_BIT)); }
+#if DOUBLE
+#define MANTISSA 52
+#define EXPONENT_BIAS 1023
+#define SIGN_BIT ((integer)1 << 63)
+#define SMALLEST_NORMAL 0x1p-1022
+#define SCALE_UP 0x1p54
+#define SCALE_UP_BITS 54
+#else
+#define MANTISSA 23
+#define EXPONENT_BIAS 127
+#define SIGN_BIT ((integer)1 << 31)
+#define SMALLEST_NORMAL 0x1p-126f
+#define SCALE_UP 0x1p25f
+#define SCALE_UP_BITS 25
+#endif
+
+INLINE F f_abs(F x) { return from_bits(bits(x) & ~splat_i(SIGN_BIT)); }
+INLINE F with_sign(F x, F s) { return from_bits(bits(x) ^ (bits(s) & SIGN_BIT)); }
 INLINE F f_max(F x, F y) { F m = x > y ? x : y; return x != x ? x : m; }
 INLINE F f_min(F x, F y) { F m = x < y ? x : y; return x != x ? x : m; }
 INLINE I i_max(I x, I y) { return x > y ? x : y; }
 INLINE I i_min(I x, I y) { return x < y ? x : y; }
 INLINE F f_sign(F x) { F one = splat(1), zero = splat(0); return x > zero ? one : (x < zero ? -one : x); }
-INLINE I f_is_finite(F x) { return f_abs(x) < splat(REAL(__builtin_inf)()); }
-LANEWISE(f_sqrt, __builtin_sqrt)
-LANEWISE(f_floor, __builtin_floor)
-LANEWISE(f_ceil, __builtin_ceil)
-LANEWISE(f_round_even, __builtin_rint)
+INLINE I f_is_finite(F x) { return MASK(f_abs(x) < splat(INFINITY)); }
+LANEWISE(f_sqrt, sqrt)
+LANEWISE(f_floor, floor)
+LANEWISE(f_ceil, ceil)
+LANEWISE(f_round_even, rint)
 LANEWISE(f_asin, asin) LANEWISE(f_acos, acos) LANEWISE(f_sinh, sinh) LANEWISE(f_cosh, cosh) LANEWISE(f_asinh, asinh)
 LANEWISE(f_acosh, acosh) LANEWISE(f_atanh, atanh) LANEWISE(f_exp2, exp2) LANEWISE(f_erf, erf) LANEWISE(f_erfc, erfc) LANEWISE(f_cbrt, cbrt)
 LANEWISE2(f_pow, pow) LANEWISE2(f_rem, fmod)
@@ -46,7 +62,7 @@ typedef struct { F s, c; I quadrant; } reduced;
 
 INLINE reduced reduce(F x) {
   F t = x * REAL(0.6366197723675814) + MAGIC, k = t - MAGIC;
-  F r = ((x - k * HALF_PI_1) - k * HALF_PI_2) - k * HALF_PI_3, nan = splat(__builtin_nanf(""));
+  F r = ((x - k * HALF_PI_1) - k * HALF_PI_2) - k * HALF_PI_3, nan = splat(NAN);
   r = f_abs(x) <= splat(SINCOS_LIMIT) ? r : nan;
   F z = r * r;
 #if DOUBLE
@@ -58,20 +74,20 @@ INLINE reduced reduce(F x) {
   F s = (-1.9515295891e-4f * z + 8.3321608736e-3f) * z - 1.6666654611e-1f;
   F c = (2.443315711809948e-5f * z - 1.388731625493765e-3f) * z + 4.166664568298827e-2f;
 #endif
-  reduced out = {s * z * r + r, c * z * z + (REAL(1.0) - REAL(0.5) * z), (I)t};
+  reduced out = {s * z * r + r, c * z * z + (REAL(1.0) - REAL(0.5) * z), bits(t)};
   return out;
 }
 
 INLINE F quadrant_value(reduced a, I q) {
   I swapped = (q & 1) != 0;
   F y = swapped ? a.c : a.s;
-  return (F)((I)y ^ ((q & 2) << (8 * (int)sizeof(real) - 2)));
+  return from_bits(bits(y) ^ ((q & 2) << (8 * (int)sizeof(real) - 2)));
 }
 INLINE F f_sin(F x) { reduced a = reduce(x); return quadrant_value(a, a.quadrant); }
 INLINE F f_cos(F x) { reduced a = reduce(x); return quadrant_value(a, a.quadrant + 1); }
 INLINE F f_tan(F x) { return f_sin(x) / f_cos(x); }
 
-INLINE F power_of_two(I k) { return (F)((k + EXPONENT_BIAS) << MANTISSA); }
+INLINE F power_of_two(I k) { return from_bits((k + EXPONENT_BIAS) << MANTISSA); }
 
 /* exp(r) - 1 for |r| <= ln2 / 2 */
 INLINE F expm1_small(F r) {
@@ -94,7 +110,7 @@ INLINE F exp_scaled(F x, int minus_one) {
   I n = to_int(k), half = n >> 1;
   F a = power_of_two(half), b = power_of_two(n - half), p = expm1_small(r);
   F value = minus_one ? (a * p) * b + (a * b - REAL(1.0)) : ((REAL(1.0) + p) * a) * b;
-  F infinite = splat(REAL(__builtin_inf)());
+  F infinite = splat(INFINITY);
   value = x > high ? infinite : value;
   return x != x ? x : value;
 }
@@ -109,10 +125,10 @@ INLINE F f_tanh(F x) {
 /* log(x) for x > 0, finite */
 INLINE F log_positive(F x) {
   F tiny = splat(SMALLEST_NORMAL);
-  I is_tiny = x < tiny;
+  I is_tiny = MASK(x < tiny);
   F y = is_tiny ? x * SCALE_UP : x;
-  I extra = is_tiny & SCALE_UP_BITS, u = (I)y - (I)splat(REAL(0.70710678118654752)), e = u >> MANTISSA;
-  F m = (F)((u & (((integer)1 << MANTISSA) - 1)) + (I)splat(REAL(0.70710678118654752)));
+  I extra = is_tiny & SCALE_UP_BITS, u = bits(y) - bits(splat(REAL(0.70710678118654752))), e = u >> MANTISSA;
+  F m = from_bits((u & (((integer)1 << MANTISSA) - 1)) + bits(splat(REAL(0.70710678118654752))));
   F k = to_float(e - extra), f = m - REAL(1.0), s = f / (REAL(2.0) + f), z = s * s, h = REAL(0.5) * f * f;
 #if DOUBLE
   F p = splat(2.0 / 23.0);
@@ -126,14 +142,14 @@ INLINE F log_positive(F x) {
   return k * LN2_HI - ((h - (s * (h + p * z) + k * LN2_LO)) - f);
 }
 INLINE F f_log(F x) {
-  F zero = splat(0), infinite = splat(REAL(__builtin_inf)()), nan = splat(__builtin_nanf("")), one = splat(1);
+  F zero = splat(0), infinite = splat(INFINITY), nan = splat(NAN), one = splat(1);
   F safe = (x > zero) & (x < infinite) ? x : one, y = log_positive(safe);
   y = x == infinite ? infinite : y;
   y = x == zero ? -infinite : y;
   return x >= zero ? y : nan;
 }
 INLINE F f_log1p(F x) {
-  F u = x + REAL(1.0), infinite = splat(REAL(__builtin_inf)()), zero = splat(0);
+  F u = x + REAL(1.0), infinite = splat(INFINITY), zero = splat(0);
   F c = (x - (u - REAL(1.0))) / u;
   c = (u > zero) & (u < infinite) ? c : zero;
   F y = f_log(u) + c;
@@ -144,7 +160,7 @@ INLINE F f_log1p(F x) {
 INLINE F f_atan(F x) {
   F a = f_abs(x), one = splat(1), zero = splat(0);
   F high = splat(REAL(2.414213562373095)), middle = splat(REAL(0.41421356237309503));
-  I far = a > high, mid = (a > middle) & ~far;
+  I far = MASK(a > high), mid = MASK(a > middle) & ~far;
   F numerator = far ? -one : (mid ? a - REAL(1.0) : a), denominator = far ? a : (mid ? a + REAL(1.0) : one);
   F w = numerator / denominator, z = w * w;
   F offset = far ? splat(REAL(1.5707963267948966)) : (mid ? splat(REAL(0.78539816339744831)) : zero);
@@ -163,9 +179,9 @@ INLINE F f_atan(F x) {
 INLINE F f_atan2(F y, F x) {
   F zero = splat(0), pi = splat(REAL(3.14159265358979323846));
   F a = f_atan(y / x);
-  I left = (I)x < 0;
+  I left = MASK(bits(x) < 0);
   F both_zero = with_sign(left ? pi : zero, y), shifted = left ? a + with_sign(pi, y) : a;
-  F infinite = splat(REAL(__builtin_inf)());
+  F infinite = splat(INFINITY);
   I corner = (f_abs(x) == infinite) & (f_abs(y) == infinite);
   F at_corner = with_sign(left ? splat(REAL(2.35619449019234492885)) : splat(REAL(0.78539816339744831)), y);
   F result = (x == zero) & (y == zero) ? both_zero : shifted;

@@ -11,23 +11,11 @@ typedef double real;
 typedef int64_t integer;
 #define REAL(x) x
 #define FN(name) name
-#define MANTISSA 52
-#define EXPONENT_BIAS 1023
-#define SIGN_BIT ((integer)1 << 63)
-#define SMALLEST_NORMAL 0x1p-1022
-#define SCALE_UP 0x1p54
-#define SCALE_UP_BITS 54
 #else
 typedef float real;
 typedef int32_t integer;
 #define REAL(x) x##f
 #define FN(name) name##f
-#define MANTISSA 23
-#define EXPONENT_BIAS 127
-#define SIGN_BIT ((integer)1 << 31)
-#define SMALLEST_NORMAL 0x1p-126f
-#define SCALE_UP 0x1p25f
-#define SCALE_UP_BITS 25
 #endif
 
 #ifndef VECTOR_BYTES
@@ -46,10 +34,17 @@ typedef integer I __attribute__((vector_size(VECTOR_BYTES)));
 typedef union { real f; integer i; } word;
 
 #define INLINE static inline __attribute__((always_inline))
+#define FUNCTION static
+#define MASK(comparison) (comparison)
+#define AT(x, l) (x)[l]
 INLINE F splat(real x) { return x - (F){}; }
 INLINE I splat_i(integer x) { return x - (I){}; }
 INLINE F load(const real *p) { F x; memcpy(&x, p, sizeof x); return x; }
 INLINE void store(real *p, F x) { memcpy(p, &x, sizeof x); }
+INLINE void store_some(real *p, F x, int count) { memcpy(p, &x, count * sizeof(real)); }
+INLINE I from(integer first) { I x; for (int l = 0; l < W; l++) x[l] = first + l; return x; }
+INLINE I bits(F x) { return (I)x; }
+INLINE F from_bits(I x) { return (F)x; }
 INLINE F to_float(I x) { return __builtin_convertvector(x, F); }
 INLINE I to_int(F x) { return __builtin_convertvector(x, I); }
 

@@ -1,0 +1,147 @@
+"""The gpu backend on a GPU: one kernel a rollout against XLA on the same device and against this machine's processor, side by side.
+
+    python benchmarks/gpu.py [--quick] [--json FILE] [--dtype float32|float64] [--batches 4096,65536,1048576] [--chain]
+
+On a GPU it first holds the kernel to the reference (largest difference, statuses), then prints the rows of the GPU (`gpu`, `xla`,
+textbook `jit(vmap(scan))`) and, from a process of its own, those of the processor.  `of peak` counts the instructions of the scalar program
+(`ij.explain`) against what the multiprocessors can issue at their highest clock.  Without a GPU there are the processor's rows only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _timing import compile_seconds, interleaved, report
+from throughput import GAINS, chain, draws, textbook
+
+import iblf_jax as ij
+from iblf_jax import lowering
+from iblf_jax.metrics import standard
+from iblf_jax.scenario import canonical
+
+LANES = {
+    "float32": {"8.0": 64, "7.0": 64, "7.5": 64},
+    "float64": {"7.0": 32, "8.0": 32, "9.0": 64, "10.0": 64},
+}
+"""Instructions that a multiprocessor issues a cycle, by compute capability; else 128 and 2 (CUDA C++ Programming Guide, arithmetic
+throughput)."""
+COLUMNS = ["loop", "device", "type", "runs", "row", "steps", "compile s", "steps/s", "x textbook", "of peak"]
+RATES = {"textbook": 2e7, "xla": 2e8, "gpu + 6 tangents": 1e9, "gpu": 5e9, "gpu, no metrics": 5e9}
+"""Steps/s to expect, so that a row takes about a second."""
+
+
+def on_a_gpu() -> bool:
+    return jax.default_backend() == "gpu"
+
+
+def peak(dtype: str) -> float:
+    """Instructions a second that the GPU can issue on numbers of a type, or NaN on a processor."""
+    if not on_a_gpu():
+        return math.nan
+    driver, clock = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
+    if driver.cuDeviceGetAttribute(ctypes.byref(clock), 13, 0):  # CU_DEVICE_ATTRIBUTE_CLOCK_RATE, in kHz
+        return math.nan
+    device = jax.local_devices()[0]
+    lanes = LANES[dtype].get(device.compute_capability, 128 if dtype == "float32" else 2)
+    return 1e3 * clock.value * lanes * device.core_count
+
+
+def candidates(scenario, dtype: str, is_paper: bool) -> dict:
+    """Name -> function of (values, dt, steps)."""
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+
+    def on(backend, folds=folds):
+        return lambda v, dt, steps: lowering.run_batch(scenario, v, folds, dt, steps=steps, method="rk4", backend=backend)
+
+    def tangents(v, dt, steps):
+        return lowering.run_batch_jvp(scenario, v, GAINS, folds[:1], dt, steps=steps, method="rk4", backend=compiled)
+
+    compiled = "gpu" if on_a_gpu() else "native"
+    rows = {"textbook": lambda v, dt, steps: textbook(v, dt, steps=steps)} if is_paper else {}
+    rows |= {"xla": on("xla"), compiled: on(compiled), f"{compiled}, no metrics": on(compiled, ())}
+    return rows | ({f"{compiled} + 6 tangents": tangents} if is_paper else {})
+
+
+def check(scenario, dtype: str, steps: int) -> None:
+    """Prints how far the kernel is from the reference on some runs."""
+    folds, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard()), jnp.asarray(1e-3, dtype)
+    values = draws(scenario, 300, dtype)
+
+    def outcome(backend):
+        return jax.jit(lambda v: lowering.run_batch(scenario, v, folds, dt, steps=steps, method="rk4", backend=backend))(values)
+
+    found, expected = outcome("gpu"), outcome("vmap")
+    worst = 0.0
+    for x, y in zip(jax.tree.leaves(found.metrics), jax.tree.leaves(expected.metrics), strict=True):
+        finite = np.isfinite(y)
+        scale = 1 + np.max(np.abs(np.asarray(y)[finite]), initial=0)
+        worst = max(worst, float(np.max(np.abs(np.asarray(x, float) - np.asarray(y, float))[finite], initial=0)) / scale)
+    same = "equal" if np.array_equal(found.status, expected.status) else "DIFFERENT"
+    print(f"gpu against the reference, {dtype}, 300 runs of {steps} steps: largest difference {worst:.2g}, statuses {same}")
+
+
+def table(which: str, dtype: str, batches, quick: bool) -> list[list]:
+    """The rows of this process's device."""
+    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024() if which == "paper" else chain(4), dtype))
+    dt, rows, device = jnp.asarray(1e-3, dtype), [], jax.local_devices()[0].device_kind
+    slots = ij.explain(scenario, varied=["plant.mass[1]"]).slots
+    if on_a_gpu():
+        check(scenario, dtype, 20 if quick else 10_000)
+    for runs in batches:
+        values = draws(scenario, runs, dtype)
+        calls, seconds, steps_of = {}, {}, {}
+        for name, function in candidates(scenario, dtype, which == "paper").items():
+            rate = RATES.get(name, 5e7) if on_a_gpu() else 5e7
+            steps = steps_of[name] = 20 if quick else int(min(max(rate / runs, 40), 10_000)) // 20 * 20
+            seconds[name], compiled = compile_seconds(partial(function, steps=steps), values, dt)
+            jax.block_until_ready(compiled(values, dt))
+            calls[name] = partial(compiled, values, dt)
+        best = interleaved(calls, 1 if quick else 3)
+        speed = {name: runs * steps_of[name] / best[name] for name in calls}
+        for name, s in speed.items():
+            share = s * slots / peak(dtype) if name == "gpu" else math.nan
+            rows.append([which, device, dtype, runs, name, steps_of[name], seconds[name], s, s / speed.get("textbook", math.nan), share])
+    return rows
+
+
+def rows_of_the_processor(arguments: list[str]) -> list[list]:
+    """The rows of this machine's processor, from a process that has no GPU."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rows.json"
+        command = [sys.executable, __file__, *arguments, "--json", str(path)]
+        subprocess.run(command, check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, stdout=subprocess.DEVNULL)
+        return [[row[name] for name in COLUMNS] for row in json.loads(path.read_text())["rows"]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json")
+    parser.add_argument("--dtype", default="float32", choices=["float32", "float64"])
+    parser.add_argument("--batches", default="4096,65536,1048576")
+    parser.add_argument("--chain", action="store_true", help="a planar chain of four joints, too")
+    options = parser.parse_args()
+    batches = [2] if options.quick else [int(x) for x in options.batches.split(",")]
+    rows = []
+    for which in ["paper", "chain of 4"] if options.chain else ["paper"]:
+        rows += table(which, options.dtype, batches, options.quick)
+    if on_a_gpu():
+        same = ["--dtype", options.dtype, "--batches", str(min(batches)), *(["--quick"] if options.quick else [])]
+        rows += rows_of_the_processor(same)
+    report("One kernel a rollout, RK4 at 1 ms", COLUMNS, rows, options.json)
+
+
+if __name__ == "__main__":
+    main()

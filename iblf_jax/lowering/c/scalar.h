@@ -1,0 +1,43 @@
+/* One run a thread, for a GPU: what vector.h says of W runs, with W = 1.  F is one float, I one whole number, and a comparison gives an I
+   of 0 or -1, as there. */
+#ifdef __CUDACC_RTC__
+typedef int int32_t;
+typedef long long int64_t;
+#endif
+#ifndef NAN
+#define NAN __int_as_float(0x7fffffff)
+#define INFINITY __int_as_float(0x7f800000)
+#endif
+
+#if DOUBLE
+typedef double real;
+typedef int64_t integer;
+#define REAL(x) x
+#define FN(name) name
+#define bits(x) ((integer)__double_as_longlong(x))
+#define from_bits(x) __longlong_as_double(x)
+#else
+typedef float real;
+typedef int32_t integer;
+#define REAL(x) x##f
+#define FN(name) name##f
+#define bits(x) __float_as_int(x)
+#define from_bits(x) __int_as_float(x)
+#endif
+typedef real F;
+typedef integer I;
+typedef union { real f; integer i; } word;
+
+#define W 1
+#define INLINE static __device__ __forceinline__
+#define FUNCTION INLINE
+#define MASK(comparison) (-(I)(comparison))
+#define AT(x, l) (x)
+#define splat(x) ((F)(x))
+#define splat_i(x) ((I)(x))
+#define from(first) (first)
+#define to_float(x) ((F)(x))
+#define to_int(x) ((I)(x))
+#define store_some(place, x, count) (*(place) = (x))
+#define LANEWISE(name, call) INLINE F name(F x) { return FN(call)(x); }
+#define LANEWISE2(name, call) INLINE F name(F x, F y) { return FN(call)(x, y); }

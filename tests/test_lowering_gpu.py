@@ -1,0 +1,281 @@
+"""The gpu backend without a GPU: the kernel's logic on a CPU, its source through NVRTC, and what happens where there is no device."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import warnings
+
+import gpu_on_cpu
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_lowering import DT, MEMBERS, STANDARD, evaluate, with_member
+from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
+
+import iblf_jax as ij
+from iblf_jax import lowering
+from iblf_jax.lowering import batch, gpu, nvrtc
+from iblf_jax.lowering.emit_c import CUDA, Layout, source
+from iblf_jax.lowering.sensitivities import Directions, lowered_jvp
+from iblf_jax.lowering.step import pack
+from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.metrics import standard
+from iblf_jax.scenario import canonical
+
+
+def _has_nvrtc() -> bool:
+    try:
+        nvrtc.library()
+    except ToolchainError:
+        return False
+    return True
+
+
+pytestmark = pytest.mark.filterwarnings("error::iblf_jax.lowering.BackendWarning")
+needs_nvrtc = pytest.mark.skipif(not _has_nvrtc(), reason="no NVRTC")
+
+
+def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
+    """The lowered step of a scenario and the arrays that its kernel takes."""
+    scenario = canonical(ij.astype(scenario, dtype))
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), folds)
+    varied = {path: jnp.asarray(x, dtype) for path, x in varied.items()}
+    of = batch.batch_of(gpu.run, scenario, varied, folds, jnp.asarray(DT, dtype))
+    carry = of.start()
+    program, shapes, _ = of.program(batch.step_function, carry, method, False)
+    shared = jnp.concatenate([jnp.ravel(x) for x in of.leaves.shared])
+    lane = pack(of.leaves.lane, batch.Shapes.of(of.leaves.lane, 1), dtype, of.runs).floats
+    return program, shared, lane, pack(jax.tree.leaves(carry), shapes, dtype, of.runs)
+
+
+def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
+    """The carry of one run after some steps, by NumPy, node by node."""
+    layout, values = Layout.of(program), np.zeros(len(program.kinds), object)
+    values[layout.floats], values[layout.ints] = list(np.asarray(carry.floats)), list(np.asarray(carry.ints))
+    for i in range(steps):
+        values = evaluate(program, np.asarray(shared), np.asarray(lane), list(values), i)
+        values = [np.broadcast_to(v, np.shape(carry.floats)[1:]) for v in values]
+    return np.asarray(values, float)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
+def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
+    varied = {"initial.q": [[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]], "plant.mass[1]": [0.9, 0.7, 0.8]}
+    program, shared, lane, carry = step_of(with_member(family, name, getattr(ij, family).MEMBERS[name]), varied)
+    (floats, ints), _ = gpu_on_cpu.run(program, shared, lane, carry, 5, None, flags=("-O1",))
+    layout, expected = Layout.of(program), stepped(program, shared, lane, carry, 5)
+    np.testing.assert_allclose(floats, expected[layout.floats], rtol=1e-10, atol=1e-10)
+    np.testing.assert_array_equal(ints, expected[layout.ints])
+
+
+@pytest.fixture
+def on_cpu(monkeypatch):
+    """The gpu backend runs here, in blocks of 32 threads and stretches of 64 steps."""
+    monkeypatch.setattr(gpu, "run", gpu_on_cpu.run)
+    monkeypatch.setattr(gpu, "STRETCH", 64)
+    monkeypatch.setattr(lowering, "COMPILED", {"cpu": gpu})
+    monkeypatch.setattr(lowering, "_told", set())
+
+
+def outcome(dtype, backend, values, steps=200, record_every=None):
+    """The outcome of some runs of the paper's scenario."""
+    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    varied, dt = {k: jnp.asarray(v, dtype) for k, v in values.items()}, jnp.asarray(DT, dtype)
+    options = {"steps": steps, "method": "rk4", "record_every": record_every, "backend": backend}
+    return jax.tree.map(np.asarray, jax.jit(lambda s, v: lowering.run_batch(s, v, folds, dt, **options))(scenario, varied))
+
+
+def spoiled(runs):
+    """Draws, of which some fail."""
+    values = draws(runs)
+    values["plant.mass[1]"][1] = np.nan
+    values["initial.q"][3] = 40.0
+    values["plant.mass[1]"][4] = 0.02
+    return values
+
+
+@needs_compiler
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_batch_agrees_with_the_reference(dtype, on_cpu):
+    """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not full."""
+    good = draws(37)
+    found, expected = outcome(dtype, "gpu", good), outcome(dtype, "vmap", good)
+    assert_same(found, expected, TOLERANCE[dtype])
+    np.testing.assert_array_equal(found.status, expected.status)
+
+
+@needs_compiler
+def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
+    values = spoiled(37)
+    found, good, expected = outcome("float64", "gpu", values), outcome("float64", "gpu", draws(37)), outcome("float64", "vmap", values)
+    np.testing.assert_array_equal(found.status, expected.status)
+    assert len(set(found.status[[0, 1, 3]].tolist())) == 3
+    others = np.setdiff1d(np.arange(37), [1, 3, 4])
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(good), strict=True):
+        np.testing.assert_array_equal(x[others], y[others])
+
+
+@needs_compiler
+def test_records_and_one_run(on_cpu, paper):
+    found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
+    assert_same(found, expected, 1e-9)
+    one, other = (ij.simulate(paper, duration=0.15, dt=1e-3, record_every=10, backend=backend) for backend in ("gpu", "xla"))
+    np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
+
+
+@needs_compiler
+def test_forward_sensitivities(paper):
+    scenario, dt = canonical(paper), jnp.asarray(DT)
+    along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
+    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
+    pushed = jax.jit(lambda v: lowered_jvp(gpu_on_cpu.run, scenario, v, along, standard()[:1], dt, steps=60, method="euler"))(varied)
+    expected = jax.jit(
+        lambda v: lowering.run_batch_jvp(
+            scenario, v, {path: np.reshape(x, shape) for path, shape, x in along.items}, standard()[:1], dt, steps=60, method="euler",
+            backend="vmap",
+        )
+    )(varied)  # fmt: skip
+    for x, y in zip(pushed, expected, strict=True):
+        assert_same(jax.tree.map(np.asarray, x), jax.tree.map(np.asarray, y), 1e-10)
+
+
+@needs_compiler
+def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkeypatch):
+    monkeypatch.setattr(gpu, "STRETCH", 4)
+    program, shared, lane, carry = step_of(paper, draws(2))
+    sizes = program, shared.size, lane.shape[0]
+    for calls in (1, 2):
+        gpu_on_cpu.run(program, shared, lane, carry, 10, None)[0].floats.block_until_ready()
+        assert gpu_on_cpu.launches(*sizes) == (1, calls * (1 + 2 * 3))
+    (floats, ints), _ = gpu_on_cpu.run(program, shared, lane, carry, 0, None)
+    np.testing.assert_array_equal(floats, carry.floats)
+    np.testing.assert_array_equal(ints, carry.ints)
+
+
+@needs_compiler
+def test_what_the_driver_refuses_is_an_error_of_jax(paper):
+    program, shared, lane, carry = step_of(paper, draws(2))
+    sizes = program, shared.size, lane.shape[0]
+    with pytest.raises(Exception, match=r"loading: device kernel image is invalid \(CUDA error 200\)"):
+        jax.block_until_ready(gpu.call(gpu_on_cpu.kernel(*sizes, image=b"nothing"), program, shared, lane, carry, 1, None, 32))
+    with pytest.raises(Exception, match=r"launch: invalid argument \(CUDA error 1\)"):
+        jax.block_until_ready(gpu.call(gpu_on_cpu.kernel(*sizes), program, shared, lane, carry, 1, None, 256))
+    with pytest.raises(Exception, match="wrong shapes"):
+        jax.block_until_ready(gpu.call(gpu_on_cpu.kernel(*sizes), program, shared[1:], lane, carry, 1, None, 32))
+
+
+@pytest.mark.parametrize(("runs", "threads"), [(1, 32), (4096, 32), (10_000, 96), (65_536, 128), (10**7, 128)])
+def test_threads_in_a_block(runs, threads):
+    assert gpu.threads_in_block(runs, 132) == threads
+
+
+def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
+    monkeypatch.setattr(lowering, "_told", set())
+    called = []
+    with pytest.warns(lowering.BackendWarning, match="gpu backend is not for the default device, cpu: running on xla"):
+        lowering.with_fallback("gpu", called.append, lambda: None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lowering.with_fallback("gpu", called.append, lambda: None)
+    assert called == [lowering.xla.run] * 2
+
+
+@needs_compiler
+def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
+    assert repr(ij.explain(paper)).endswith("a batch runs on native")
+    monkeypatch.setattr(lowering, "COMPILED", {"cpu": gpu})
+    assert repr(ij.explain(paper)).endswith("a batch runs on xla: it needs an NVIDIA GPU, not cpu")
+
+
+def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
+    def missing(*_):
+        raise ToolchainError("there is no NVRTC")
+
+    monkeypatch.setattr(lowering, "_told", set())
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
+    monkeypatch.setattr(nvrtc, "library", missing)
+    assert lowering.automatic() == ("xla", "there is no NVRTC")
+    with pytest.warns(lowering.BackendWarning, match="gpu backend is not available .there is no NVRTC.: running on xla"):
+        assert lowering.with_fallback("auto", lambda f: missing() if f is gpu.run else f, lambda: None) is lowering.xla.run
+    monkeypatch.setattr(nvrtc, "library", lambda: None)
+    monkeypatch.setattr(gpu, "compiler", lambda: None)
+    assert lowering.automatic() == ("gpu", None)
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "found"), [(["9.0"], "sm_90"), (["12.0"] * 2, "sm_120"), (["8.0", "9.0"], "differ"), (["gfx90a"], "NVIDIA")]
+)
+def test_architecture(capabilities, found, monkeypatch):
+    class Device:
+        device_kind = "a card"
+
+        def __init__(self, capability):
+            self.compute_capability = capability
+
+    monkeypatch.setattr(jax, "local_devices", lambda: [Device(c) for c in capabilities])
+    if found.startswith("sm"):
+        assert gpu.architecture() == found
+    else:
+        with pytest.raises(ToolchainError, match=found):
+            gpu.architecture()
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("architecture", ["sm_80", "sm_90"])
+def test_nvrtc_compiles_the_kernel(architecture, dtype, paper):
+    program, shared, lane, _ = step_of(paper, draws(2), method="rk4", dtype=dtype)
+    text = source(program, shared.size, lane.shape[0], CUDA)
+    image = nvrtc.compiled(text, architecture)
+    assert image[:4] == b"\x7fELF"
+    assert b"iblf_jax_advance" in image
+    assert nvrtc.compiled(text, architecture) == image
+
+
+@pytest.mark.skipif(shutil.which("nvcc") is None, reason="no nvcc")
+def test_the_paper_s_step_stays_in_registers(paper, tmp_path):
+    program, shared, lane, _ = step_of(paper, draws(2), method="rk4", dtype="float32")
+    (tmp_path / "kernel.cu").write_text(source(program, shared.size, lane.shape[0], CUDA))
+    command = ["nvcc", "-w", "-cubin", "-arch=sm_90", "-Xptxas", "-v", "-o", "kernel.cubin", "kernel.cu"]
+    report = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stderr
+    found = re.search(r"function 'iblf_jax_advance'.*?(\d+) bytes spill stores.*?Used (\d+) registers", report, re.DOTALL)
+    assert found, report
+    assert int(found[1]) == 0
+    assert int(found[2]) <= 168, "three blocks of 128 threads fit a multiprocessor"
+
+
+@needs_nvrtc
+def test_what_nvrtc_refuses_is_reported_in_one_line():
+    for text, target in (("this is not CUDA;", "sm_90"), ("", "sm_1")):
+        with pytest.raises(ToolchainError, match=r"NVRTC \d+\.\d+ failed: .*error") as error:
+            nvrtc.compiled(text, target)
+        assert "\n" not in str(error.value)
+
+
+@needs_nvrtc
+@needs_compiler
+def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper, monkeypatch):
+    monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
+    monkeypatch.setattr(lowering, "COMPILED", {"cpu": gpu})
+    scenario, dt, varied = canonical(paper), jnp.asarray(DT), {k: jnp.asarray(v) for k, v in draws(2).items()}
+    call = jax.jit(lambda v: lowering.run_batch(scenario, v, STANDARD, dt, steps=20_000, method="rk4", record_every=10, backend="gpu"))
+    text = call.trace(varied).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("custom_call @iblf_jax_") == 2, "the steps and the power iteration"
+    assert "every = 10 : i64, steps = 20000 : i64, threads = 32 : i64" in text
+
+
+@pytest.mark.skipif(jax.default_backend() != "gpu", reason="no GPU")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_on_a_gpu_it_agrees_with_the_reference(dtype):
+    values = spoiled(1000)
+    found, expected = outcome(dtype, "gpu", values, 1000, 7), outcome(dtype, "vmap", values, 1000, 7)
+    np.testing.assert_array_equal(found.status, expected.status)
+    sound = expected.status == 0
+    of_sound = [jax.tree.map(lambda x: x[sound], x) for x in (found, expected)]
+    assert_same(*of_sound, TOLERANCE[dtype])
