@@ -100,7 +100,7 @@ def spoiled(runs):
 
 
 @needs_compiler
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_a_batch_agrees_with_the_reference(dtype, on_cpu):
     """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not full."""
     good = draws(37)
@@ -121,9 +121,14 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
 
 
 @needs_compiler
-def test_records_and_one_run(on_cpu, paper):
+def test_records_agree_with_the_reference(on_cpu):
     found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
     assert_same(found, expected, 1e-9)
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_one_run_is_the_run(on_cpu, paper):
     one, other = (ij.simulate(paper, duration=0.15, dt=1e-3, record_every=10, backend=backend) for backend in ("gpu", "xla"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 
