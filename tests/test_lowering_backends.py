@@ -13,7 +13,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import lowering
-from iblf_jax.lowering import native, toolchain
+from iblf_jax.lowering import emit_c, native, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.metrics import as_folds, standard
 from iblf_jax.scenario import canonical
@@ -145,6 +145,20 @@ def test_one_run_and_threads():
         del os.environ["IBLF_JAX_THREADS"]
     assert one.status.shape == (1,)
     assert_same(one, jax.tree.map(lambda x: x[:1], batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()})), 1e-12)
+
+
+@needs_compiler
+@pytest.mark.parametrize("record_every", [None, 100])
+def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
+    """Cut into pieces of fifty operations, the numbers stay: only the places of some products with sums differ."""
+    whole = batch(record_every=record_every)
+    monkeypatch.setattr(emit_c, "LONG", 0)
+    monkeypatch.setattr(emit_c, "SEGMENT", 50)
+    native.kernel.cache_clear()
+    monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
+    del COMPILED["float64", "native", 400, record_every]
+    assert_same(batch(record_every=record_every), whole, 1e-12)
+    native.kernel.cache_clear()
 
 
 @needs_compiler

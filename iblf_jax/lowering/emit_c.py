@@ -27,6 +27,8 @@ CALLS = (
 )  # fmt: skip
 
 
+SEGMENT, LONG = 5000, 20_000
+"""Operations of a function of the native backend, where a step has more than LONG: slower by a third, but built three times as fast."""
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 NATIVE = (("vector.h", "mathlib.h"), ("driver.h",))
 CUDA = (("scalar.h", "mathlib.h"), ("kernels.h",))
@@ -81,8 +83,8 @@ class _Emitter:
         self.classes = program.classes()
         self.lines: list[str] = []
 
-    def statements(self, names: dict[int, str], wanted: Iterable[int]) -> None:
-        """Adds statements for `wanted` and what it needs."""
+    def needed(self, names: dict[int, str], wanted: Iterable[int]) -> list[int]:
+        """The nodes without a name that `wanted` needs, in order."""
         nodes = self.program.nodes
         stack, needed = list(wanted), set()
         while stack:
@@ -90,7 +92,12 @@ class _Emitter:
             if i not in names and i not in needed:
                 needed.add(i)
                 stack.extend(nodes[i].args)
-        for i in sorted(needed):
+        return sorted(needed)
+
+    def statements(self, names: dict[int, str], wanted: Iterable[int]) -> None:
+        """Adds statements for `wanted` and what it needs."""
+        nodes = self.program.nodes
+        for i in self.needed(names, wanted):
             node = nodes[i]
             if node.op == "const":
                 names[i] = literal(node, self.program.dtype)
@@ -147,7 +154,9 @@ def source(program: Program, shared_leaves: int, lane_leaves: int, target: tuple
     e, layout = _Emitter(program), Layout.of(program)
     before, after = target
     parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before)]
-    parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns), _advance(e, *layout)]
+    is_long = target is NATIVE and len(program.nodes) > LONG
+    parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
+    parts += [(_advance_in_segments if is_long else _advance)(e, *layout)]
     return "\n".join([*parts, *map(header, after)])
 
 
@@ -180,6 +189,12 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
     return e.function("FUNCTION void shared_signals(const word *constants, integer first, word *table)")
 
 
+HEAD_OF_ADVANCE = (
+    "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
+    "                    int64_t first, int64_t every, real *records, int64_t runs, int64_t run)"
+)
+
+
 def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
@@ -201,10 +216,88 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
     e.lines += [f"  c{c} = n{c};" for c, _ in moved]
     e.lines.append("  }")
     e.lines += [f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]]
-    return e.function(
-        "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
-        "                    int64_t first, int64_t every, real *records, int64_t runs, int64_t run)"
+    return e.function(HEAD_OF_ADVANCE)
+
+
+class _Segments:
+    """The statements of a long step, cut into functions of at most SEGMENT; a number that one hands to another has a place in memory."""
+
+    head = (
+        "static __attribute__((noinline)) void {}(const word *constants, const F *leaves, const F *floats, const I *ints,\n"
+        "                    const word *row, F *__restrict__ x, I *__restrict__ y)"
     )
+    arguments = "(constants, leaves, floats, ints, row, x, y)"
+
+    def __init__(self, e: _Emitter, names: dict[int, str]):
+        self.e, self.names = e, names
+        self.functions: list[str] = []
+        self.free: dict[str, list[str]] = {"x": [], "y": []}
+        self.sizes = {"x": 0, "y": 0}
+
+    def add(self, wanted: list[int], kept: bool) -> list[str]:
+        """Cuts `wanted` and what it needs; returns the calls.  `kept`: their places are never given to other numbers."""
+        nodes, needed = self.e.program.nodes, self.e.needed(self.names, wanted)
+        computed = [i for i in needed if nodes[i].op != "const"]
+        part = {i: k // SEGMENT for k, i in enumerate(computed)}
+        last = dict.fromkeys(computed, -1) | dict.fromkeys(wanted, len(computed))
+        for i in computed:
+            for a in nodes[i].args:
+                if a in part and a not in wanted:
+                    last[a] = max(last[a], part[i])
+        calls = []
+        for k in range(0, len(computed), SEGMENT):
+            here = computed[k : k + SEGMENT]
+            calls.append(self._one(here, {i: last[i] for i in here if last[i] > part[i]}))
+            if not kept:
+                for i in (i for i in computed if i in self.names and last[i] == k // SEGMENT):
+                    self.free[self.names[i][0]].append(self.names[i])
+        return calls
+
+    def _one(self, here: list[int], outlive: dict[int, int]) -> str:
+        inner = dict(self.names)
+        self.e.statements(inner, here)
+        for i in outlive:
+            array = "x" if self.e.program.nodes[i].kind == "f" else "y"
+            if not self.free[array]:
+                self.free[array].append(f"{array}[{self.sizes[array]}]")
+                self.sizes[array] += 1
+            self.names[i] = self.free[array].pop()
+            self.e.lines.append(f"  {self.names[i]} = {inner[i]};")
+        name = f"segment_{len(self.functions)}"
+        self.functions.append(self.e.function(self.head.format(name)))
+        return f"{name}{self.arguments};"
+
+
+def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> list[int]:
+    """The nodes of a step that its samples read, directly or on the way."""
+    computed = set(e.needed(names, outputs))
+    alone = [i for i in e.needed(names, e.program.samples) if i not in computed]
+    return sorted(computed & {*e.program.samples, *(a for i in alone for a in e.program.nodes[i].args)})
+
+
+def _advance_in_segments(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
+    """`_advance` for long steps, over which a compiler would take minutes: its time grows with the square of a function's length."""
+    program, nodes, classes = e.program, e.program.nodes, e.classes
+    names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
+    names |= {i: _unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
+    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
+    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
+    names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
+    segments = _Segments(e, names)
+    before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
+    outputs = sorted({o for _, o in program.carry})
+    within = segments.add(sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False)
+    signs = [f"  {places[c]} = -{places[c]};" for c in ints if program.kinds[c] == "b"]
+    constant = {o: literal(nodes[o], program.dtype) for _, o in program.carry if nodes[o].op == "const"}
+    moved = [(c, (segments.names | constant)[o]) for c, (a, o) in enumerate(program.carry) if a != o]
+    e.lines += [f"  F x[{max(1, segments.sizes['x'])}]; I y[{max(1, segments.sizes['y'])}];", *signs, *(f"  {call}" for call in before)]
+    e.lines += ["  for (int s = 0; s < count; s++, row += COLUMNS) {", *(f"  {call}" for call in within)]
+    if program.samples:
+        _record(e, segments.names)
+    e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
+    e.lines += [f"  {places[c]} = n{c};" for c, _ in moved]
+    e.lines += ["  }", *signs]
+    return "\n".join([*segments.functions, e.function(HEAD_OF_ADVANCE)])
 
 
 def _record(e: _Emitter, names: dict[int, str]) -> None:
