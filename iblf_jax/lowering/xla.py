@@ -1,7 +1,7 @@
 """The xla backend: a scalar program with one array of runs a number, in `lax.scan`.  Needs nothing but jax and runs on any device.
 
 What time decides is tabulated for a stretch of steps at once.  On CPU a block of runs goes through a stretch of steps as one machine
-function (`one_function`), its numbers in the first-level cache, and several streams of blocks go side by side, one a core.
+function (`one_function`), its numbers in the first-level cache.
 """
 
 from __future__ import annotations
@@ -19,12 +19,10 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from iblf_jax.lowering import vector_math
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, frontier
 from iblf_jax.lowering.step import Packed
-from iblf_jax.lowering.toolchain import threads
 from iblf_jax.one_function import as_one_function
 
 BLOCK = 64
 """Runs that go through a stretch of steps together on CPU."""
-MOST_STREAMS = 8
 STORED = 3
 """Cost from which a number with several uses is stored on CPU.  XLA would compute it again for each use."""
 SEGMENT = 2000
@@ -140,36 +138,29 @@ def on_cpu() -> bool:
 
 
 def as_function(f):
-    """`f` as a function that XLA does not inline: fusion stops at its border, and two of them may run side by side."""
+    """`f` as a function that XLA does not inline: fusion stops at its border."""
     return set_xla_metadata(inlineable="false")(jax.jit(f))
 
 
-def entry(parts: Any, i: int) -> Any:
-    """Entry i of every array."""
-    return jax.tree.map(lambda x: x[i], parts)
-
-
 def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
-    """All steps of all runs; arguments and results as `native.run`.  The last blocks repeat the last run."""
+    """All steps of all runs; arguments and results as `native.run`.  The last block repeats the last run."""
     runs = carry.floats.shape[1]
     width = min(BLOCK, runs) if on_cpu() else runs
-    streams = min(threads(), MOST_STREAMS, -(-runs // width))
-    blocks = -(-runs // (width * streams))
+    blocks = -(-runs // width)
 
     def apart(rows):
-        padded = jnp.pad(rows, ((0, 0), (0, streams * blocks * width - runs)), mode="edge")
-        return jnp.moveaxis(padded.reshape(len(rows), streams, blocks, width), 0, 2)
+        padded = jnp.pad(rows, ((0, 0), (0, blocks * width - runs)), mode="edge")
+        return jnp.moveaxis(padded.reshape(len(rows), blocks, width), 1, 0)
 
-    def together(*parts):
-        rows = jnp.stack(parts)
-        return jnp.moveaxis(rows, (0, 1), (-3, -2)).reshape(*rows.shape[2:-1], streams * blocks * width)[..., :runs]
+    def together(parts):
+        rows = jnp.moveaxis(parts, 0, -2)
+        return rows.reshape(*rows.shape[:-2], blocks * width)[..., :runs]
 
-    stream = as_function(lambda lane, carry: _stream(program, shared, lane, carry, steps, every))
-    parts = jax.tree.map(apart, (lane, carry))
-    return jax.tree.map(together, *(stream(*entry(parts, i)) for i in range(streams)))
+    done, samples = _in_blocks(program, shared, apart(lane), jax.tree.map(apart, carry), steps, every)
+    return jax.tree.map(together, done), together(samples)
 
 
-def _stream(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
+def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
     """All steps of some blocks: (blocks, rows, width) in, and out; samples (blocks, samples, rows, width)."""
     classes = program.classes()
     once = {i: shared[n.value] for i, n in enumerate(program.nodes) if n.op == "shared"}
