@@ -50,7 +50,11 @@ def _parts(x: jax.Array):
         r = r - k * part
     r = lax.select(lax.abs(x) <= LIMIT[dtype], r, lax.full_like(x, np.nan))
     z = r * r
-    return r + r * z * _polynomial(z, _SIN[dtype]), 1.0 - 0.5 * z + z * z * _polynomial(z, _COS[dtype]), lax.convert_element_type(k, np.int32)
+    return (
+        r + r * z * _polynomial(z, _SIN[dtype]),
+        1.0 - 0.5 * z + z * z * _polynomial(z, _COS[dtype]),
+        lax.convert_element_type(k, np.int32),
+    )
 
 
 def _quadrant(s, c, k):

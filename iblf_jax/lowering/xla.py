@@ -23,7 +23,7 @@ from iblf_jax.one_function import as_one_function
 
 BLOCK = 64
 """Runs that go through a stretch of steps together on CPU."""
-STORED = 3
+STORED = 8
 """Cost from which a number with several uses is stored on CPU.  XLA would compute it again for each use."""
 SEGMENT = 2000
 """Operations in one XLA computation, on CPU: its passes take more than linear time."""
@@ -70,11 +70,11 @@ class Table(NamedTuple):
 class Evaluator:
     """Evaluates nodes of a program on arrays of one shape."""
 
-    def __init__(self, program: Program, shape: tuple[int, ...], functions: dict[str, Callable]) -> None:
+    def __init__(self, program: Program, shape: tuple[int, ...]) -> None:
         self.program = program
         self.shape = shape
-        self.functions = functions
         self.bordered = on_cpu() and bool(shape)
+        self.functions = FUNCTIONS | (POLYNOMIALS if self.bordered else {})
         self.types = {"f": program.dtype, "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
 
     def compute(self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None) -> None:
@@ -164,7 +164,7 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
     """All steps of some blocks: (blocks, rows, width) in, and out; samples (blocks, samples, rows, width)."""
     classes = program.classes()
     once = {i: shared[n.value] for i, n in enumerate(program.nodes) if n.op == "shared"}
-    Evaluator(program, (), FUNCTIONS).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
+    Evaluator(program, ()).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
     columns = frontier(program, classes, TIME, lambda c: bool(c & LANE))
 
     def block(once, table, part):
@@ -178,15 +178,15 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
 
     length = _stretch_length(steps, every or 1)
     whole, rest = divmod(steps, length)
-    samples = []
+    parts = []
     if whole:
         starts = length * jnp.arange(whole, dtype=jnp.int32)
         carry, rows = lax.scan(lambda c, first: stretch(c, first, length), carry, starts)
-        samples.append(jnp.moveaxis(rows, 0, 1).reshape(rows.shape[1], whole * rows.shape[2], *rows.shape[3:]))
+        parts.append(jnp.moveaxis(rows, 0, 1).reshape(rows.shape[1], whole * rows.shape[2], *rows.shape[3:]))
     if rest:
         carry, rows = stretch(carry, jnp.int32(whole * length), rest)
-        samples.append(rows)
-    return carry, jnp.concatenate(samples, axis=1) if samples else jnp.zeros((lane.shape[0], 0, 0, lane.shape[2]), program.dtype)
+        parts.append(rows)
+    return carry, parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
 
 
 def _stretch_length(steps: int, every: int) -> int:
@@ -199,7 +199,7 @@ def _stretch_length(steps: int, every: int) -> int:
 def _block(program: Program, once, columns, table: Table, lane: jax.Array, carry: Packed, every: int | None) -> tuple[Packed, jax.Array]:
     """One block of runs through the steps of a table."""
     width = carry.floats.shape[1]
-    evaluator = Evaluator(program, (width,), FUNCTIONS | (POLYNOMIALS if on_cpu() else {}))
+    evaluator = Evaluator(program, (width,))
     values = _separate(program, carry)
     fixed = once | {i: lane[n.value] for i, n in enumerate(program.nodes) if n.op == "lane"}
     fixed |= {a: values[c] for c, (a, o) in enumerate(program.carry) if a == o}
@@ -207,37 +207,29 @@ def _block(program: Program, once, columns, table: Table, lane: jax.Array, carry
     moving = [c for c, (a, o) in enumerate(program.carry) if a != o]
     outputs = [program.carry[c][1] for c in moving]
 
-    def step(state, row, wanted=()):
+    wanted = program.samples if every else ()
+    count = len(table.floats)
+    rows = -(-count // every) if every else 0
+
+    def step(state, now):
+        state, records = state
+        row, place = now
         known = fixed | _entries(program, columns, row)
         known |= {program.carry[c][0]: x for c, x in zip(moving, state, strict=True) if program.carry[c][0] >= 0}
         evaluator.compute(known, [*outputs, *wanted], row)
         found = [x.read(row) if isinstance(x, Entry) else x for x in (known[i] for i in [*outputs, *wanted])]
         filled = [jnp.broadcast_to(x, (width,)) for x in found]
-        return filled[: len(outputs)], filled[len(outputs) :]
+        if every:
+            records = lax.dynamic_update_slice(records, jnp.stack(filled[len(outputs) :])[None], (place, np.int32(0), np.int32(0)))
+        return (filled[: len(outputs)], records), None
 
-    def unrecorded(state, row):
-        return step(state, row)[0], None
-
-    def recorded(state, rows):
-        state, sample = step(state, jax.tree.map(lambda x: x[0], rows), program.samples)
-        if len(rows.floats) > 1:
-            state, _ = lax.scan(unrecorded, state, jax.tree.map(lambda x: x[1:], rows))
-        return state, jnp.stack(sample)
-
-    state, samples = [values[c] for c in moving], jnp.zeros((0, 0, width), program.dtype)
-    if every:
-        count = len(table.floats)
-        whole = count // every * every
-        groups = jax.tree.map(lambda x: x[:whole].reshape(whole // every, every, x.shape[1]), table)
-        state, samples = lax.scan(recorded, state, groups)
-        if count > whole:
-            state, last = recorded(state, jax.tree.map(lambda x: x[whole:], table))
-            samples = jnp.concatenate([samples, last[None]])
-    else:
-        state, _ = lax.scan(unrecorded, state, table)
+    # Every step writes its sample, to the row of the next step that is recorded, which so writes last: one copy of the step to compile.
+    places = (np.arange(count, dtype=np.int32) + (every or 1) - 1) // (every or 1)
+    records = jnp.zeros((rows + 1 if every else 0, len(wanted), width), program.dtype)
+    (state, records), _ = lax.scan(step, ([values[c] for c in moving], records), (table, places))
     for c, x in zip(moving, state, strict=True):
         values[c] = x
-    return _joined(program, values, width), samples
+    return _joined(program, values, width), records[:rows]
 
 
 def _entries(program: Program, columns: list[int], row: Table) -> dict[int, Any]:
@@ -254,23 +246,15 @@ def _entries(program: Program, columns: list[int], row: Table) -> dict[int, Any]
 
 def _table(program: Program, once: dict[int, Any], columns: list[int], first: jax.Array, count: int) -> Table:
     """What time decides, for `count` steps from `first` on."""
+    known = dict(once)
+    known |= {i: first + jnp.arange(count, dtype=jnp.int32) for i, n in enumerate(program.nodes) if n.op == "index"}
+    Evaluator(program, (count,)).compute(known, columns)
 
-    def by(functions):
-        known = dict(once)
-        known |= {i: first + jnp.arange(count, dtype=jnp.int32) for i, n in enumerate(program.nodes) if n.op == "index"}
-        Evaluator(program, (count,), functions).compute(known, columns)
+    def stacked(kinds, dtype):
+        some = [jnp.broadcast_to(known[c], (count,)).astype(dtype) for c in columns if program.nodes[c].kind in kinds]
+        return jnp.stack(some, axis=1) if some else jnp.zeros((count, 0), dtype)
 
-        def stacked(kinds, dtype):
-            some = [jnp.broadcast_to(known[c], (count,)).astype(dtype) for c in columns if program.nodes[c].kind in kinds]
-            return jnp.stack(some, axis=1) if some else jnp.zeros((count, 0), dtype)
-
-        return Table(stacked("f", program.dtype), stacked("ib", jnp.int32))
-
-    if not on_cpu():
-        return by(FUNCTIONS)
-    table = by(FUNCTIONS | POLYNOMIALS)
-    # The polynomials are NaN past their range, where the library's functions, an order slower, go on.
-    return lax.cond(jnp.all(jnp.isfinite(table.floats)), lambda: table, lambda: by(FUNCTIONS))
+    return Table(stacked("f", program.dtype), stacked("ib", jnp.int32))
 
 
 def _separate(program: Program, carry: Packed) -> list[jax.Array]:
