@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -167,21 +168,21 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
     Evaluator(program, ()).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
     columns = frontier(program, classes, TIME, lambda c: bool(c & LANE))
 
-    def block(once, table, part):
-        return _block(program, once, columns, table, *part, every)
+    def block(once, table, lane, carry):
+        return _block(program, once, columns, table, lane, carry, every)
 
     call = as_one_function(block) if on_cpu() else block
 
     def stretch(carry, first, count):
         table = _table(program, once, columns, first, count)
-        return lax.map(lambda part: call(once, table, part), (lane, carry))
+        return lax.map(lambda part: call(once, table, *part), (lane, carry))
 
     length = _stretch_length(steps, every or 1)
     whole, rest = divmod(steps, length)
     parts = []
     if whole:
         starts = length * jnp.arange(whole, dtype=jnp.int32)
-        carry, rows = lax.scan(lambda c, first: stretch(c, first, length), carry, starts)
+        carry, rows = lax.scan(partial(stretch, count=length), carry, starts)
         parts.append(jnp.moveaxis(rows, 0, 1).reshape(rows.shape[1], whole * rows.shape[2], *rows.shape[3:]))
     if rest:
         carry, rows = stretch(carry, jnp.int32(whole * length), rest)
@@ -191,9 +192,11 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
 
 def _stretch_length(steps: int, every: int) -> int:
     """Steps of a stretch, a multiple of `every`: so that one length does for all where there is such a length, as each is compiled."""
-    most = min(max(STRETCH // every, 1) * every, max(steps // every * every, 1))
-    exact = next((d for d in range(most // every * every, 0, -every) if steps % d == 0), 0)
-    return exact if exact >= most // 16 and exact else most
+    most = max(STRETCH // every, 1) * every
+    if steps <= most:
+        return steps
+    exact = next((d for d in range(most, 0, -every) if steps % d == 0), 0)
+    return exact if exact > most // 16 else most
 
 
 def _block(program: Program, once, columns, table: Table, lane: jax.Array, carry: Packed, every: int | None) -> tuple[Packed, jax.Array]:
@@ -234,7 +237,8 @@ def _block(program: Program, once, columns, table: Table, lane: jax.Array, carry
 
 def _entries(program: Program, columns: list[int], row: Table) -> dict[int, Any]:
     """The columns of a row of the table."""
-    places, result = Counter(), {}
+    places: Counter[str] = Counter()
+    result: dict[int, Any] = {}
     for c in columns:
         kind = program.nodes[c].kind
         part = "floats" if kind == "f" else "ints"
