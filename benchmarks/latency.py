@@ -27,7 +27,7 @@ from scipy.integrate import solve_ivp
 import iblf_jax as ij
 from iblf_jax.closed_loop import initial_state, rate
 from iblf_jax.metrics import standard
-from iblf_jax.rollout import _run_compiled
+from iblf_jax.rollout import _run_lowered
 
 
 def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ def main() -> None:
 
     scenario = ij.presets.zhang_yan_2024()
     dt = jnp.asarray(1e-3)
-    run = partial(_run_compiled, steps=steps, record_every=1, method="rk4", alone=True)
+    run = partial(_run_lowered, steps=steps, record_every=1, method="rk4", backend="xla")
     start = time.perf_counter()
     folds = standard()
     compiled = jax.jit(run).lower(scenario, folds, dt).compile()

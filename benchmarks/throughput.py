@@ -1,27 +1,28 @@
-"""Throughput of many runs at once: the paper's loop, RK4 at 1 ms, steps per second, everything side by side in one run.
+"""Throughput of many runs at once, RK4 at 1 ms, steps per second, everything side by side in one run.
 
-    python benchmarks/throughput.py [--quick] [--json FILE] [--dtype float32|float64] [--batches 1,64,4096,65536] [--chain]
+    python benchmarks/throughput.py [--quick] [--json FILE] [--dtypes float32,float64] [--batches 1,64,4096,65536] [--loops paper,chain]
 
 Rows: SciPy LSODA and diffrax (of the same motion, in steps of 1 ms), the textbook `jit(vmap(scan))` with `jnp.linalg.solve`, this
-package's backends with the standard metrics, `native` without metrics, `native` with 6 forward sensitivities, and the limit: a rollout
-written by hand in C++ (`limit/paper_loop.cc`), which carries the state alone.  `a core` is steps per second of processor time: on a
-shared machine it is the number to compare.
+package's backends with the standard metrics and without, on one thread and on all, value and 6 forward sensitivities, and the limit: a
+rollout written by hand in C++ (`limit/paper_loop.cc`), which carries the state alone and is there for the paper's loop only.  The second
+loop is a planar chain of four joints.  Last, `native` on 1e4, 1e5 and 1e6 runs.  `a core` is steps per second of processor time: on a
+shared machine it is the number to compare.  A row that needs a package which is not there is left out.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib.util
 import math
-import sys
+import os
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
-
-jax.config.update("jax_enable_x64", "float64" in sys.argv)
-
 import jax.numpy as jnp
 import numpy as np
 from _timing import compile_seconds, report
@@ -167,8 +168,24 @@ def measured(call, repeats: int) -> tuple[float, float]:
     return wall, used
 
 
-def candidates(scenario, dtype: str, is_paper: bool):
-    """Name -> function of (values, dt, steps), to be compiled."""
+class Row(NamedTuple):
+    """One row of the table: `call(values, dt, steps)` is compiled, or called as it is if it is `ready`."""
+
+    name: str
+    call: Callable
+    rate: float
+    """Steps per second that are expected, to choose how many to run."""
+    threads: int | None = None
+    batches: tuple[int, ...] | None = None
+    """The batches that it is measured on; None for all."""
+    ready: bool = False
+
+
+LARGE = (4096, 65536)
+
+
+def rows_of(scenario, dtype: str, is_paper: bool) -> list[Row]:
+    """What is measured on a loop."""
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
 
     def on(backend, folds=folds):
@@ -177,60 +194,98 @@ def candidates(scenario, dtype: str, is_paper: bool):
     def sensitivities(folds):
         return lambda v, dt, steps: lowering.run_batch_jvp(scenario, v, GAINS, folds, dt, steps=steps, method="rk4", backend="native")
 
-    rows = {"vmap": on("vmap"), "xla": on("xla"), "native": on("native"), "native, no metrics": on("native", ())}
-    if is_paper:
-        simple = {"diffrax": with_diffrax, "textbook": textbook}
-        rows = {name: lambda v, dt, steps, f=f: f(v, dt, steps=steps) for name, f in simple.items()} | rows
-        rows["native, rmse"] = on("native", folds[:1])
-        rows["native, rmse + 6 tangents"] = sensitivities(folds[:1])
-        rows["native + 6 tangents"] = sensitivities(folds)
-    return rows
+    rows = [
+        Row("vmap", on("vmap"), 2e6, batches=(1, 4096)),
+        Row("xla", on("xla"), 3e7),
+        Row("xla, no metrics", on("xla", ()), 3e7, batches=LARGE),
+        Row("native", on("native"), 1e8),
+        Row("native, one thread", on("native"), 1e8, threads=1, batches=LARGE[1:]),
+    ]
+    if not is_paper:
+        return rows
+    first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 1e6)]
+    if importlib.util.find_spec("diffrax"):
+        first.append(Row("diffrax", lambda v, dt, steps: with_diffrax(v, dt, steps=steps), 3e5, batches=(4096,)))
+    rows += [
+        Row("native, no metrics", on("native", ()), 1e8, batches=LARGE),
+        Row("native + 6 tangents", sensitivities(folds), 3e7, batches=LARGE),
+        Row("native, rmse", on("native", folds[:1]), 1e8, batches=LARGE[:1]),
+        Row("native, rmse + 6 tangents", sensitivities(folds[:1]), 3e7, batches=LARGE[:1]),
+    ]
+    by_hand = limit(dtype)
+    if by_hand:
+        call = lambda v, dt, steps: by_hand(v, steps)  # noqa: E731
+        rows += [Row("limit", call, 1e8, ready=True), Row("limit, one thread", call, 1e8, threads=1, batches=LARGE[1:], ready=True)]
+    return first + rows
 
 
-def steps_for(name: str, runs: int, quick: bool) -> int:
+def steps_for(row: Row, runs: int, quick: bool) -> int:
     """So many steps that a row takes about a second."""
-    rate = {"textbook": 5e5, "diffrax": 3e5, "vmap": 2e6, "xla": 1e7, "native + 6 tangents": 3e7}.get(name, 1e8)
-    rate = min(rate, 2e5 * runs)
-    return 20 if quick else int(min(max(rate / runs, 40), 10_000)) // 20 * 20
+    return 20 if quick else int(min(max(min(row.rate, 2e5 * runs) / runs, 40), 10_000)) // 20 * 20
 
 
-def table(dtype: str, batches, which: str, quick: bool) -> list[list]:
-    """The rows of one scenario and type."""
-    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024() if which == "paper" else chain(4), dtype))
-    dt, rows, by_hand = jnp.asarray(1e-3, dtype), [], limit(dtype) if which == "paper" else None
+def timed(row: Row, values, dt, steps: int, repeats: int) -> tuple[float, float, float]:
+    """Seconds to compile, smallest wall and processor seconds."""
+    before = os.environ.get("IBLF_JAX_THREADS")
+    if row.threads:
+        os.environ["IBLF_JAX_THREADS"] = str(row.threads)
+    try:
+        seconds, call = (0.0, partial(row.call, steps=steps)) if row.ready else compile_seconds(partial(row.call, steps=steps), values, dt)
+        jax.block_until_ready(call(values, dt))
+        return seconds, *measured(partial(call, values, dt), repeats)
+    finally:
+        if row.threads:
+            os.environ.pop("IBLF_JAX_THREADS")
+            os.environ.update({"IBLF_JAX_THREADS": before} if before else {})
+
+
+def table(dtype: str, batches, loop: str, quick: bool) -> list[list]:
+    """The rows of one loop and type."""
+    jax.config.update("jax_enable_x64", dtype == "float64")
+    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024() if loop == "paper" else chain(4), dtype))
+    dt, result, rows = jnp.asarray(1e-3, dtype), [], rows_of(scenario, dtype, loop == "paper")
     for runs in batches:
-        values = draws(scenario, runs, dtype)
-        found = []
-        for name, function in candidates(scenario, dtype, which == "paper").items():
-            steps = steps_for(name, runs, quick)
-            seconds, compiled = compile_seconds(partial(function, steps=steps), values, dt)
-            jax.block_until_ready(compiled(values, dt))
-            found.append((name, steps, seconds, *measured(partial(compiled, values, dt), 1 if quick else 3)))
-        if by_hand:
-            steps = steps_for("limit", runs, quick)
-            found.append(("limit, by hand", steps, 0.0, *measured(partial(by_hand, values, steps), 1 if quick else 3)))
-        base = next((runs * s / w for n, s, _, w, _ in found if n == "textbook"), math.nan)
-        top = next((runs * s / w for n, s, _, w, _ in found if n == "limit, by hand"), math.nan)
-        for name, steps, seconds, wall, cpu in found:
-            speed = runs * steps / wall
-            rows.append([which, dtype, runs, name, steps, seconds, speed, runs * steps / cpu, speed / base, speed / top])
-    return rows
+        values, found = draws(scenario, runs, dtype), []
+        for row in rows:
+            if quick or row.batches is None or runs in row.batches:
+                steps = steps_for(row, runs, quick)
+                seconds, wall, cpu = timed(row, values, dt, steps, 1 if quick else 3)
+                found.append((row.name, steps, seconds, runs * steps / wall, runs * steps / cpu))
+        bases = [next((speed for name, *_, speed, _ in found if name == base), math.nan) for base in ("textbook", "limit")]
+        result += [[loop, dtype, runs, *line, line[3] / bases[0], line[3] / bases[1]] for line in found]
+    return result
+
+
+def flat(quick: bool) -> list[list]:
+    """`native` on more and more runs, whose speed should not depend on how many there are."""
+    jax.config.update("jax_enable_x64", False)
+    scenario, dt = canonical(ij.astype(ij.presets.zhang_yan_2024(), "float32")), jnp.asarray(1e-3, "float32")
+    row = next(row for row in rows_of(scenario, "float32", False) if row.name == "native")
+    result, steps = [], 20 if quick else 200
+    for runs in (4,) if quick else (10_000, 100_000, 1_000_000):
+        seconds, wall, cpu = timed(row, draws(scenario, runs, "float32"), dt, steps, 1 if quick else 3)
+        speeds = runs * steps / wall, runs * steps / cpu
+        result.append(["paper", "float32", runs, "native, flat", steps, seconds, *speeds, math.nan, math.nan])
+    return result
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--json")
-    parser.add_argument("--dtype", default="float32", choices=["float32", "float64"])
+    parser.add_argument("--dtypes", default="float32,float64")
     parser.add_argument("--batches", default="1,64,4096,65536")
-    parser.add_argument("--chain", action="store_true", help="a planar chain of four joints, too")
+    parser.add_argument("--loops", default="paper,chain")
     options = parser.parse_args()
     batches = [2] if options.quick else [int(x) for x in options.batches.split(",")]
-    rows = (
-        [] if options.quick else [["paper", "float64", 1, "SciPy LSODA", 10_000, 0.0, *[1e4 / with_scipy(10_000)] * 2, math.nan, math.nan]]
-    )
-    for which in ["paper", "chain of 4"] if options.chain else ["paper"]:
-        rows += table(options.dtype, batches, which, options.quick)
+    rows = []
+    if not options.quick:
+        jax.config.update("jax_enable_x64", True)
+        rows = [["paper", "float64", 1, "SciPy LSODA", 10_000, 0.0, *[1e4 / with_scipy(10_000)] * 2, math.nan, math.nan]]
+    for loop in ["paper"] if options.quick else options.loops.split(","):
+        for dtype in ["float32"] if options.quick else options.dtypes.split(","):
+            rows += table(dtype, batches, loop, options.quick)
+    rows += flat(options.quick)
     columns = ["loop", "type", "runs", "row", "steps", "compile s", "steps/s", "steps/s a core", "x textbook", "of limit"]
     report("Throughput, RK4 at 1 ms", columns, rows, options.json)
 

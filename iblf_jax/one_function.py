@@ -51,7 +51,9 @@ REFUSED = frozenset(
 )
 """Operations that are not trusted inside: matrix products and decompositions become library calls, the others were not needed."""
 
-COPIES = frozenset({"concatenate", "iota", "convert_element_type", "broadcast_in_dim", "reshape", "slice", "squeeze"})
+COPIES = frozenset(
+    {"concatenate", "iota", "convert_element_type", "broadcast_in_dim", "reshape", "slice", "squeeze", "dynamic_update_slice"}
+)
 """Operations that compute nothing; their size does not matter."""
 
 

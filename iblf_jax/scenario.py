@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import warnings
+from functools import partial
 from typing import Any
 
 import jax
@@ -146,13 +147,19 @@ def canonical(scenario: Scenario) -> Scenario:
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
     check_values(scenario)
     dtype = _shared_dtype(scenario)
-    scenario = jax.tree.map(lambda x: jnp.asarray(x, dtype), scenario)
+    scenario = _typed(scenario, dtype)
     if checks.is_concrete(scenario):
         _check_start(scenario)
         for part in (scenario.controller, scenario.observer):
             for text in getattr(part, "advice", list)():
                 warnings.warn(text, stacklevel=3)
     return scenario
+
+
+@partial(jax.jit, static_argnames="dtype")
+def _typed(scenario: Scenario, dtype) -> Scenario:
+    """The scenario with every leaf an array of a type: in one call, as one a leaf would take a millisecond."""
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), scenario)
 
 
 def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
@@ -162,7 +169,8 @@ def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
             raise checks.fail(
                 jax.tree_util.keystr(path).lstrip("."), value, "an array of numbers", "Other things belong in a static field."
             )
-    floats = {jnp.result_type(x) for x in jax.tree.leaves(scenario) if jnp.issubdtype(jnp.result_type(x), jnp.floating)}
+    types = {x.dtype if isinstance(x, jax.Array) else jnp.result_type(x) for x in jax.tree.leaves(scenario)}
+    floats = {x for x in types if jnp.issubdtype(x, jnp.floating)}
     if len(floats) == 1 and floats <= {jnp.dtype("float32"), jnp.dtype("float64")}:
         return floats.pop()
     if floats and not floats & {jnp.dtype("float32"), jnp.dtype("float64")}:

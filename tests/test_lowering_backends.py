@@ -74,11 +74,12 @@ def test_xla_agrees_with_the_reference():
     np.testing.assert_array_equal(found.status, expected.status)
 
 
-def test_xla_in_blocks_and_streams_agrees(monkeypatch):
+@pytest.mark.parametrize("every", [None, 2, 30])
+def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
     monkeypatch.setattr(lowering.xla, "BLOCK", 2)
-    monkeypatch.setenv("IBLF_JAX_THREADS", "2")
+    monkeypatch.setattr(lowering.xla, "STRETCH", 4)
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
-    options = {"steps": 3, "method": "euler", "record_every": 2}
+    options = {"steps": 11, "method": "euler", "record_every": every}
     varied = {k: jnp.asarray(v) for k, v in draws(7).items()}
     found, expected = (
         jax.jit(lambda s, v, b=b: lowering.run_batch(s, v, (), dt, backend=b, **options))(scenario, varied) for b in ("xla", "vmap")

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -151,6 +152,29 @@ def run_batch(
         return (as_one_function(batched) if min(map(len, varied.values())) <= SMALL else batched)(dict(varied))
 
     return with_fallback(backend, run_on, plain)
+
+
+def run_alone(scenario: Scenario, folds, dt: jax.Array, *, steps: int, method: str, record_every: int, backend: str) -> Outcome:
+    """One run by its scalar program; call it inside `jit`.
+
+    Args:
+      scenario, folds, dt, steps, method, record_every: as `run_batch`, of one run.
+      backend: "native" or "gpu", which fall back with a warning, or "xla", which falls back to the plain run without one.
+    """
+    options: dict[str, Any] = {"steps": steps, "method": method, "record_every": record_every}
+
+    def run_on(executor):
+        return batch.run_alone(executor, scenario, folds, dt, **options)
+
+    def plain():
+        return as_one_function(partial(run, **options))(scenario, folds, dt)
+
+    if backend != "xla":
+        return with_fallback(backend, run_on, plain)
+    try:
+        return run_on(xla.run) if jax.default_backend() == "cpu" else plain()
+    except UnsupportedError:
+        return plain()
 
 
 def run_batch_jvp(

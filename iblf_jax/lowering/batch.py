@@ -14,6 +14,7 @@ from iblf_jax import rollout
 from iblf_jax.closed_loop import LoopState
 from iblf_jax.lowering.program import Program
 from iblf_jax.lowering.step import Leaves, Packed, Shapes, lowered, pack, split, unpack
+from iblf_jax.one_function import as_one_function
 from iblf_jax.stability import POWER_ITERATIONS, Growth, growth_rate, growth_start, growth_step
 
 Executor = Callable[[Program, jax.Array, jax.Array, Packed, int, int | None], tuple[Packed, jax.Array]]
@@ -108,6 +109,21 @@ def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: 
     carry, samples = batch.advance(step_function, batch.start(), steps, record_every, method, record_every is not None)
     outcome, last = finish(batch, method, steps, carry)
     return outcome if record_every is None else outcome._replace(records=_records(samples, last, steps % record_every == 0))
+
+
+def run_alone(executor: Executor, scenario, folds, dt, *, steps: int, method: str, record_every: int):
+    """`rollout.run` for one run, by a lowered step; raises as `run`.  Start and end are the plain ones, quicker to compile than lowered."""
+    batch = batch_of(executor, scenario, {"initial.q": scenario.initial.q[None]}, folds, dt)
+    carry = jax.tree.map(lambda x: x[None], rollout.start(scenario, folds, dt))
+    carry, samples = batch.advance(step_function, carry, steps, record_every, method, True)
+
+    def end(scenario, folds, dt, carry):
+        carry, sample, outcome = rollout.finish(scenario, folds, method, dt, steps, carry)
+        return outcome, rollout.record_of(sample, carry.state)
+
+    outcome, last = as_one_function(end)(scenario, folds, dt, jax.tree.map(lambda x: x[0], carry))
+    records = _records(samples, jax.tree.map(lambda x: x[None], last), steps % record_every == 0)
+    return outcome._replace(records=jax.tree.map(lambda x: x[0], records))
 
 
 def finish(batch: Batch, method: str, steps: int, carry: Any):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 LIMIT = {np.dtype(np.float32): 1e5, np.dtype(np.float64): 1.6e6}
 """|x| up to which sin and cos are computed."""
@@ -43,18 +44,22 @@ def _polynomial(z, coefficients):
 def _parts(x: jax.Array):
     """Sin and cos of x - k pi/2, and the quadrant k."""
     dtype = np.dtype(x.dtype)
-    k = jnp.round(x * (2 / np.pi))
+    k = lax.round(x * (2 / np.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     r = x
     for part in _PARTS[dtype]:
         r = r - k * part
-    r = jnp.where(jnp.abs(x) <= LIMIT[dtype], r, jnp.nan)
+    r = lax.select(lax.abs(x) <= LIMIT[dtype], r, lax.full_like(x, np.nan))
     z = r * r
-    return r + r * z * _polynomial(z, _SIN[dtype]), 1.0 - 0.5 * z + z * z * _polynomial(z, _COS[dtype]), k.astype(jnp.int32)
+    return (
+        r + r * z * _polynomial(z, _SIN[dtype]),
+        1.0 - 0.5 * z + z * z * _polynomial(z, _COS[dtype]),
+        lax.convert_element_type(k, np.int32),
+    )
 
 
 def _quadrant(s, c, k):
-    y = jnp.where(k & 1 != 0, c, s)
-    return jnp.where(k & 2 != 0, -y, y)
+    y = lax.select(k & 1 != 0, c, s)
+    return lax.select(k & 2 != 0, -y, y)
 
 
 def sin(x: jax.Array) -> jax.Array:

@@ -1,0 +1,62 @@
+"""The contract between backends: on every preset, over ten seconds, each gives what plain vmap of the reference run gives."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import lowering
+from iblf_jax.lowering import toolchain
+from iblf_jax.metrics import as_folds
+from iblf_jax.scenario import canonical
+from iblf_jax.status import FAILED
+
+TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
+STEPS, EVERY, DT, RUNS = 10_000, 250, 1e-3, 6
+
+
+def draws(scenario, dtype):
+    """Masses and starts; the last run starts outside of its bounds."""
+    rng = np.random.default_rng(3)
+    start = np.asarray(scenario.initial.q) + 0.01 * rng.standard_normal((RUNS, scenario.n))
+    start[-1] += 1.0
+    mass = float(np.asarray(scenario.plant.mass)[1]) * rng.uniform(0.7, 1.3, RUNS)
+    return {"plant.mass[1]": jnp.asarray(mass, dtype), "initial.q": jnp.asarray(start, dtype)}
+
+
+@partial(jax.jit, static_argnames="backend")
+def outcome_of(scenario, varied, folds, dt, backend):
+    return lowering.run_batch(scenario, varied, folds, dt, steps=STEPS, method="rk4", record_every=EVERY, backend=backend)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("name", ij.presets.PRESETS)
+def test_backends_agree_with_the_reference(name, dtype):
+    scenario = canonical(ij.astype(ij.presets.PRESETS[name](), dtype))
+    arguments = (scenario, draws(scenario, dtype), as_folds(None, dtype), jnp.asarray(DT, dtype))
+    expected = jax.tree.map(np.asarray, outcome_of(*arguments, backend="vmap"))
+    ok = expected.status & int(FAILED) == 0
+    assert np.any(ok), expected.status
+    assert np.any(~ok), expected.status
+    for backend in ["xla", "native"] if has_compiler() else ["xla"]:
+        found = jax.tree.map(np.asarray, outcome_of(*arguments, backend=backend))
+        np.testing.assert_array_equal(found.status, expected.status, err_msg=backend)
+        times = (x.metrics["first_violation_time"] for x in (found, expected))
+        np.testing.assert_allclose(*times, rtol=0, atol=1.01 * DT, err_msg=backend)
+        for field in ("q", "dq", "e1", "xi", "tau", "disturbance_estimate"):
+            one, other = (x.records[0][field][ok] for x in (found, expected))
+            scale = max(1.0, np.abs(other).max())
+            np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=f"{backend} {field}")
+
+
+def has_compiler() -> bool:
+    try:
+        return bool(toolchain.compiler())
+    except toolchain.ToolchainError:
+        return False
