@@ -27,6 +27,10 @@ class Robot(Protocol):
 
     A member is a component (`iblf_jax.component`) whose inertial parameters are leaves; `payload` [kg], a point mass at
     the tip, is one of them in every member, so that any robot can carry what its model does not know.
+
+    Two methods more are used where a member has them, through `at_time` and `friction_torque` below: `at(t)`, the robot as it is at
+    time t [s], for one that changes while it moves; and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.  Both
+    are of the plant only: law and observer know neither, and (2.1) has them in f.
     """
 
     @property
@@ -61,6 +65,16 @@ class Robot(Protocol):
     def skeleton(self, q: jax.Array) -> jax.Array:
         """Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m]; for drawings."""
         ...
+
+
+def at_time(robot: T, t: jax.Array) -> T:
+    """The robot as it is at time t [s]: itself, unless it has a method `at`."""
+    return robot.at(t) if hasattr(robot, "at") else robot
+
+
+def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
+    """What the joints put against their motion, (n,) [N m], against q' in sign: zero, unless the robot has a method of this name."""
+    return robot.friction_torque(dq) if hasattr(robot, "friction_torque") else jnp.zeros_like(dq)
 
 
 def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
