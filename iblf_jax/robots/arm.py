@@ -263,6 +263,12 @@ class Arm:
         forces = spatial.Wrench(*(x + 0.5 * (a + b - c) for x, a, b, c in zip(push, turn, back, slip, strict=True)))
         return _felt(S, forces)
 
+    def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the momentum of all beyond it."""
+        frames = self._frames(q)
+        V = _moving(frames.allowed, v)
+        return _felt(spatial.along(V, frames.allowed), spatial.momentum(self._bodies(frames), V))
+
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q) = - g . sum_i m_i c_i, () [J]; zero with all mass at the base's origin."""
         return -jnp.sum(self.g * self._bodies(self._frames(q)).first)
