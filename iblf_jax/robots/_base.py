@@ -30,7 +30,8 @@ class Robot(Protocol):
 
     Two methods more are used where a member has them, through `at_time` and `friction_torque` below: `at(t)`, the robot as it is at
     time t [s], for one that changes while it moves; and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.  Both
-    are of the plant only: law and observer know neither, and (2.1) has them in f.
+    are of the plant only: law and observer know neither, and (2.1) has them in f.  A third, `energy_gradient(q, v)`, is used by the
+    function of this name where a member has something shorter than the general formula.
     """
 
     @property
@@ -96,6 +97,13 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:
     """M'(q) = dM/dq . q', (n, n) [kg m^2/s], by jvp."""
     return jax.jvp(robot.mass_matrix, (q,), (dq,))[1]
+
+
+def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
+    """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v, by the robot's own method if it has one."""
+    if hasattr(robot, "energy_gradient"):
+        return robot.energy_gradient(q, v)
+    return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
 
 
 def from_energy(cls: type[T]) -> type[T]:
