@@ -176,7 +176,7 @@ def unit_at(scenario: Scenario, path: str) -> str:
 def sign_at(scenario: Scenario, path: str) -> str | None:
     """The sign that the finite numbers at a path must have: None, "positive" or "nonnegative"."""
     sign = _metadata(scenario, path).get("sign")
-    return {"limit": None, "positive limit": "positive"}.get(sign, sign)
+    return None if sign == "limit" else "positive" if sign == "positive limit" else sign
 
 
 def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
