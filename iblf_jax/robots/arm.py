@@ -301,7 +301,7 @@ def _outward(rows: jax.Array) -> jax.Array:
 def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
     n = rows.shape[0]
     chosen = triangle(np.ones((n, n), bool)).reshape((n, n) + (1,) * (rows.ndim - 1))
-    return spatial.kept(jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1))
+    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1)
 
 
 def _moving(S: jax.Array, speeds: jax.Array) -> jax.Array:
