@@ -13,7 +13,7 @@ import numpy as np
 from iblf_jax._blocks import _execute, block_size
 from iblf_jax._points import Points
 from iblf_jax._setup import Setup
-from iblf_jax.paths import get, parameters
+from iblf_jax.paths import get, parameters, unit_at
 from iblf_jax.pytree import is_leaf_field
 
 
@@ -59,17 +59,12 @@ def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, 
     import iblf_jax
 
     scenario = setup.shared.cases.scenario
-    units = {p.path: p.unit for p in parameters(scenario)}
-
-    def unit(path: str) -> str:
-        plain = path.replace("robot", "plant", 1) if path.startswith("robot") else path
-        return units.get(plain, units.get(re.sub(r"(\[\d+\])+$", "", plain), ""))
 
     def place(path: str) -> dict[str, Any]:
         return {
             "along": points.along[path],
             "values": points.ticks[path].tolist(),
-            "unit": unit(path),
+            "unit": unit_at(scenario, path),
             "shape": list(np.shape(get(scenario, path))),
         }
 
@@ -79,7 +74,7 @@ def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, 
         "dims": dict(points.dims),
         "points": {path: place(path) for path in points.values},
         "perturbations": {path: describe_component(p) for path, p in setup.perturbations.items()},
-        "perturbed": {t.path: {"unit": unit(t.path), "source": t.source} for t in program.targets},
+        "perturbed": {t.path: {"unit": unit_at(scenario, t.path), "source": t.source} for t in program.targets},
         "runs": setup.runs,
         "seed": setup.seed,
         "sampler": setup.sampler,
@@ -88,7 +83,7 @@ def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, 
         "dt": dt,
         "method": program.method,
         "metrics": describe_component(setup.shared.folds),
-        "scenario": {p.path: np.asarray(p.value).tolist() for p in parameters(scenario)},
+        "scenario": {p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)},
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),

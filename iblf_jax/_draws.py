@@ -11,7 +11,6 @@ with the same u, each around its own nominal value.
 
 from __future__ import annotations
 
-import re
 import zlib
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -58,11 +57,10 @@ class Lanes(NamedTuple):
     """Path of the user -> designed uniform numbers; empty when draws are independent."""
 
 
-def same_place(path: str, other: str) -> bool:
+def same_place(scenario: Scenario, path: str, other: str) -> bool:
     """Whether two paths address an entry in common."""
-    pairs = [(a, b) for a in paths.expand(path) for b in paths.expand(other)]
-    tokens = [(paths.parse(a), paths.parse(b)) for a, b in pairs]
-    return any(all(x == y for x, y in zip(a, b, strict=False)) for a, b in tokens)
+    pairs = [(a, b) for a in paths.places(scenario, path) for b in paths.places(scenario, other)]
+    return any(all(x == y for x, y in zip(a, b, strict=False)) for a, b in pairs)
 
 
 def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
@@ -74,7 +72,7 @@ def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
             if any(isinstance(token, int) and token < 0 for token in paths.parse(full)):
                 raise checks.fail(f"{what}: path", path, "an index >= 0", "Count from the front.")
         for other in seen:
-            if same_place(path, other):
+            if same_place(scenario, path, other):
                 raise checks.fail(what, (other, path), "paths that do not overlap", "Both would set the same number: keep one of them.")
         seen.append(path)
 
@@ -181,17 +179,11 @@ def draw(cases: Cases, targets: tuple[Target, ...], index: jax.Array, point: Map
 
 def merge(scenario: Scenario, point: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
     """What a run replaces, from its point and its draws: each place once, whole leaves where the two overlap."""
-    overlapping = [p for p in point if any(same_place(p, m) for m in made)]
+    overlapping = [p for p in point if any(same_place(scenario, p, m) for m in made)]
     if not overlapping:
         return {**point, **made}
     changed = paths.with_parameters(paths.with_parameters(scenario, point), made)
-    touched = {
-        _leaf(full) for p in (*overlapping, *(m for m in made if any(same_place(m, p) for p in overlapping))) for full in paths.expand(p)
-    }
-    rest = {p: v for p, v in {**point, **made}.items() if not any(same_place(p, leaf) for leaf in touched)}
+    meeting = [*overlapping, *(m for m in made if any(same_place(scenario, m, p) for p in overlapping))]
+    touched = {leaf for p in meeting for leaf in paths.leaves(scenario, p)}
+    rest = {p: v for p, v in {**point, **made}.items() if not any(same_place(scenario, p, leaf) for leaf in touched)}
     return {**rest, **{leaf: paths.get(changed, leaf) for leaf in touched}}
-
-
-def _leaf(path: str) -> str:
-    """The path of the whole leaf that holds an entry."""
-    return re.sub(r"(\[\d+\])+$", "", path)

@@ -130,5 +130,5 @@ def to_xarray(study: Study) -> xarray.Dataset:
     attributes |= {"duration": study.duration, "dt": study.dt, "method": setup.program.method, "sampler": setup.sampler}
     attributes |= {"backend": setup.program.backend, "iblf_jax_version": iblf_jax.__version__}
     attributes["perturbations"] = json.dumps({path: describe_component(p) for path, p in study.perturbations.items()})
-    attributes["parameters"] = json.dumps({p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario)})
+    attributes["parameters"] = json.dumps({p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario, named=False)})
     return xarray.Dataset(variables, coordinates, attributes)

@@ -18,6 +18,9 @@ import numpy as np
 MOST_STEPS = 2**31 - 1
 """Steps are counted in int32 inside the compiled loop."""
 
+LIMITS = ("limit", "positive limit")
+"""Signs of leaves that may be infinite."""
+
 
 def is_concrete(value: Any) -> bool:
     """Whether every leaf of `value` is a number now, rather than a tracer or a placeholder."""
@@ -89,9 +92,11 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
     if array is None or not is_concrete(array):
         return
     values = np.asarray(array)
-    if not np.all(np.isfinite(values)):
+    if sign in LIMITS and np.any(np.isnan(values)):
+        raise fail(name, array, "numbers, infinite where there is no limit", "Replace the NaN entries.")
+    if sign not in LIMITS and not np.all(np.isfinite(values)):
         raise fail(name, array, "finite numbers", "Replace the NaN or infinite entries.")
-    if sign == "positive" and not np.all(values > 0):
+    if sign in ("positive", "positive limit") and not np.all(values > 0):
         raise fail(name, array, "numbers > 0", "Give positive values.")
     if sign == "nonnegative" and not np.all(values >= 0):
         raise fail(name, array, "numbers >= 0", "Give non-negative values.")

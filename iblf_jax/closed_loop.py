@@ -1,7 +1,7 @@
 """The closed loop: the one place where plant, law and observer meet.
 
     state  x = (q, q', state of the law, state of the observer)
-    q" = M^-1 (tau + disturbance - C q' - G)                            with the plant's M, C, G
+    q" = M^-1 (tau + disturbance + friction - C q' - G)                 with the plant's M, C, G, friction at time t
     f  = M0 q" + C0 q' + G0 - tau                                       what the observer should have estimated      (2.1)
     V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde                                                             (3.12)
 
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.linalg import inner, matvec, solve_spd
+from iblf_jax.robots import at_time, friction_torque
 from iblf_jax.scenario import Scenario
 
 
@@ -78,14 +79,14 @@ def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array |
       state: state at t.
       dt: the time that the sample stands for, () [s].
     """
-    plant, model, observer = scenario.plant, scenario.model, scenario.observer
+    plant, model, observer = at_time(scenario.plant, t), scenario.model, scenario.observer
     q, dq = state.q, state.dq
     tube = scenario.setting.tube(t)
 
     f_hat = observer.estimate(t, q, dq, model, state.observer)
     command, controller_rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
     observer_rate = observer.derivative(t, q, dq, command.tau, model, state.observer)
-    pushed = command.tau + scenario.disturbance.torque(t, q, dq, plant, model)
+    pushed = command.tau + scenario.disturbance.torque(t, q, dq, plant, model) + friction_torque(plant, dq)
     ddq = solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
 
     M0, G0 = model.mass_matrix(q), model.gravity(q)

@@ -14,7 +14,10 @@ from iblf_jax import checks
 
 
 class Tableau(NamedTuple):
-    """An explicit method: x + dt sum_i b_i k_i, with k_i = f(t + c_i dt, x + dt sum_j a_ij k_j)."""
+    """An explicit method: x + dt sum_i b_i k_i, with k_i = f(t + c_i dt, x + dt sum_j a_ij k_j).
+
+    In every method here a stage starts from the slope before it alone: a_ij = 0 for j < i - 1.
+    """
 
     c: tuple[float, ...]
     a: tuple[tuple[float, ...], ...]
@@ -41,6 +44,12 @@ def tableau(method: str) -> Tableau:
     """The table of a method by name; ValueError for another name."""
     checks.one_of("method", method, tuple(TABLEAUS))
     return TABLEAUS[method]
+
+
+def stages(method: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """c_i, a_i,i-1 (0 for the first) and b_i of every stage, for a loop over the stages."""
+    table = tableau(method)
+    return table.c, (0.0, *(row[-1] for row in table.a[1:])), table.b
 
 
 def _combine(state, dt, weights, slopes):

@@ -199,7 +199,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
 
     fixed, varying = {}, {}
     batched = np.ndim(run.scenario.initial.q) > 1
-    for p in parameters(run.scenario):
+    for p in parameters(run.scenario, named=False):
         value = np.asarray(p.value)
         if batched:
             one = value[(0,) * len(batch)]

@@ -5,6 +5,9 @@ attributes on a call make it compile the whole callee as one function: two to fi
 the same numbers.  The attributes are XLA's own, and its CPU compiler fails on some operations inside such a function (matrix
 products, calls into libraries) and on arrays large enough to be shared out over threads.  So the callee is traced first, and only what is
 known to work gets them.
+
+The compiler's time grows faster than the length of a function.  A long loop (an arm of seven joints has ten thousand operations an
+evaluation) is therefore not made one function but called piece by piece: each piece is one function, and the loop around it XLA's own.
 """
 
 from __future__ import annotations
@@ -21,6 +24,9 @@ SMALL = 64
 LARGEST = 1 << 13
 """Entries of the largest array of floating-point numbers that is computed inside.  (Records may be of any length: they are stacked and
 copied, not computed.)"""
+
+LONG = 4000
+"""Operations of one evaluation of the closed loop from which on it is a piece of its own."""
 
 REFUSED = frozenset(
     {
@@ -72,6 +78,11 @@ def as_one_function(function: Callable) -> Callable:
         return jax.tree.unflatten(jax.tree.structure(shapes), call(*jax.tree.leaves(args)))
 
     return traced
+
+
+def is_long(function: Callable, *args) -> bool:
+    """Whether a function has so many operations that it had better be compiled once, and as a piece of its own."""
+    return sum(1 for _ in _operations(jax.make_jaxpr(function)(*args).jaxpr)) > LONG
 
 
 def _operations(jaxpr: Jaxpr) -> Iterator:

@@ -1,9 +1,12 @@
 """One path language for every leaf of a scenario: "controller.K2", "plant.mass[1]", "initial.q", "disturbance.phase".
 
 Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow the fields of the components;
-`[i]` selects a part of a `Sum` or one entry of an array.  `robot.` stands for `plant.` and `model.` together: use it to change the
-robot that is simulated and the one that the law knows alike.  A component that wraps another (class attribute `wraps`, such as
-`controllers.Saturated`) is looked through: "controller.K2" is the wrapped law's K2, and "controller.law.K2" works too.
+`[i]` selects a part of a `Sum` or one entry of an array.  A component with rows that have names (class attribute `rows`, such as
+`robots.Arm`) can be addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names (and a
+name without a letter cannot be told from a number: use that).
+`robot.` stands for `plant.` and `model.` together: use it to change the robot that is simulated and the one that the law knows alike.
+A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is looked through: "controller.K2" is the
+wrapped law's K2, and "controller.law.K2" works too.
 """
 
 from __future__ import annotations
@@ -21,7 +24,13 @@ import numpy as np
 from iblf_jax import checks
 from iblf_jax.scenario import Scenario
 
-_TOKEN = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)\]")
+_TOKEN = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)\]|\[([^\[\]]*[^\W\d_][^\[\]]*)\]")
+
+
+class Row(str):
+    """A token of a path that was the name of a row, in brackets."""
+
+    __slots__ = ()
 
 
 class Parameter(NamedTuple):
@@ -55,17 +64,18 @@ class ParameterTable(tuple[Parameter, ...]):
         return f"<table>{head}{body}</table>"
 
 
-def parameters(scenario: Scenario) -> ParameterTable:
+def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
     """Every addressable leaf of a scenario: path, shape, unit, value.
 
     Args:
       scenario: any Scenario.
+      named: rows of leaves by their names too, "plant.link[forearm].mass" besides "plant.mass"; without them every number is there once.
 
     Returns:
       A tuple of `Parameter`, which prints as a table.
     """
     _need_component(scenario)
-    return ParameterTable(_walk(scenario, ""))
+    return ParameterTable(_walk(scenario, "", named))
 
 
 def _need_component(scenario: Any) -> None:
@@ -73,10 +83,10 @@ def _need_component(scenario: Any) -> None:
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
 
 
-def _walk(part: Any, path: str) -> Iterator[Parameter]:
+def _walk(part: Any, path: str, named: bool) -> Iterator[Parameter]:
     if isinstance(part, tuple | list):
         for i, x in enumerate(part):
-            yield from _walk(x, f"{path}[{i}]")
+            yield from _walk(x, f"{path}[{i}]", named)
     elif dataclasses.is_dataclass(part) and not isinstance(part, type):
         own = {field.name for field in dataclasses.fields(part)}
         for field in dataclasses.fields(part):
@@ -85,25 +95,38 @@ def _walk(part: Any, path: str) -> Iterator[Parameter]:
             value, name = getattr(part, field.name), f"{path}.{field.name}" if path else field.name
             if field.name == getattr(type(part), "wraps", None):
                 # As a user would type them, unless the wrapper has a field of that name.
-                for inner in _walk(value, path):
+                for inner in _walk(value, path, named):
                     rest = inner.path[len(path) :].lstrip(".")
                     yield inner if parse(rest)[0] not in own else inner._replace(path=f"{name}.{rest}")
                 continue
             if isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
                 yield Parameter(name, jnp.shape(value), field.metadata.get("unit", ""), value)
             else:
-                yield from _walk(value, name)
+                yield from _walk(value, name, named)
+        if named:
+            yield from _rows(part, path)
+
+
+def _rows(part: Any, path: str) -> Iterator[Parameter]:
+    """The rows that have names."""
+    units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
+    for word, (names, fields) in getattr(type(part), "rows", {}).items():
+        for i, name in enumerate(getattr(part, names)):
+            for field in fields:
+                value = getattr(part, field)
+                row = value[..., i] if jnp.ndim(value) == 1 else value[i]
+                yield Parameter(f"{path}.{word}[{name}].{field}" if path else f"{word}[{name}].{field}", jnp.shape(row), units[field], row)
 
 
 def parse(path: str) -> list[str | int]:
-    """The tokens of a path: names and indices.  ValueError if it is not a path."""
+    """The tokens of a path: names, indices and names of rows.  ValueError if it is not a path."""
     tokens: list[str | int] = []
     position = 0
     while isinstance(path, str) and position < len(path):
         match = _TOKEN.match(path, position)
         if match is None or (position == 0) == path[position].startswith((".", "[")):
             break
-        tokens.append(match[1] if match[1] is not None else int(match[2]))
+        tokens.append(match[1] if match[1] is not None else int(match[2]) if match[2] is not None else Row(match[3]))
         position = match.end()
     if not isinstance(path, str) or not path or position < len(path):
         raise checks.fail("path", path, 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"')
@@ -130,24 +153,87 @@ def get(scenario: Scenario, path: str) -> Any:
     return _resolved(scenario, path, expand(path)[0])[1]
 
 
+def places(scenario: Scenario, path: str) -> list[list[str | int]]:
+    """Where the numbers at a path are: fields and indices alone, for each full path that it stands for."""
+    return [_resolved(scenario, path, full)[0] for full in expand(path)]
+
+
+def leaves(scenario: Scenario, path: str) -> list[str]:
+    """The paths of the whole leaves that hold what is at a path."""
+
+    def joined(tokens):
+        while isinstance(tokens[-1], int):
+            tokens = tokens[:-1]
+        return "".join(f"[{token}]" if isinstance(token, int) else f".{token}" for token in tokens).lstrip(".")
+
+    return [joined(tokens) for tokens in places(scenario, path)]
+
+
+def unit_at(scenario: Scenario, path: str) -> str:
+    """The unit of the leaf at a path."""
+    return _metadata(scenario, path).get("unit", "")
+
+
+def sign_at(scenario: Scenario, path: str) -> str | None:
+    """The sign that the finite numbers at a path must have: None, "positive" or "nonnegative"."""
+    sign = _metadata(scenario, path).get("sign")
+    return None if sign == "limit" else "positive" if sign == "positive limit" else sign
+
+
+def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
+    """What was declared of the leaf at a path."""
+    part: Any = scenario
+    metadata: Mapping[str, Any] = {}
+    for token in places(scenario, path)[0]:
+        if isinstance(token, int):
+            part = part[token] if isinstance(part, tuple | list) else part
+        else:
+            metadata = next(f.metadata for f in dataclasses.fields(part) if f.name == token)
+            part = getattr(part, token)
+    return metadata
+
+
 def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int], Any]:
-    """The tokens of a full path, with the names of wrapped components filled in, and the value there."""
+    """Where a full path leads, as fields and indices, and the value there.
+
+    The names of wrapped components are filled in, and a row by its name becomes an index.
+    """
     value: Any = scenario
-    tokens: list[str | int] = []
-    for token in parse(full):
+    place: list[str | int] = []
+    tokens = parse(full)
+    while tokens:
         try:
-            while isinstance(token, str) and getattr(type(value), "wraps", None) and not _has_field(value, token):
-                tokens.append(type(value).wraps)
-                value = _field(value, type(value).wraps)
-            value = _entry(value, token) if isinstance(token, int) else _field(value, token)
-        except (AttributeError, IndexError, TypeError, KeyError):
+            steps, tokens = _steps(value, tokens)
+            for step in steps:
+                value = _entry(value, step) if isinstance(step, int) else _field(value, step)
+        except (AttributeError, IndexError, TypeError, KeyError, ValueError):
             raise _unknown(scenario, path) from None
-        if isinstance(token, int) and not isinstance(value, jax.Array | np.ndarray | float) and not dataclasses.is_dataclass(value):
+        if isinstance(steps[-1], int) and not isinstance(value, jax.Array | np.ndarray | float) and not dataclasses.is_dataclass(value):
             raise _unknown(scenario, path)
-        tokens.append(token)
+        place += steps
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
         raise _unknown(scenario, path)
-    return tokens, value
+    return place, value
+
+
+def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
+    """The fields and indices that the first tokens stand for in a component, and the tokens that are left."""
+    token = tokens[0]
+    if isinstance(token, int):
+        return [token], tokens[1:]
+    if isinstance(token, Row):
+        raise KeyError(token)
+    rows = getattr(type(part), "rows", {})
+    if token in rows and not _has_field(part, token):
+        names, fields = rows[token]
+        which, field = tokens[1:3]
+        if field not in fields:
+            raise KeyError(field)
+        index = which if isinstance(which, int) else getattr(part, names).index(which)
+        return [field, index], tokens[3:]
+    if getattr(type(part), "wraps", None) and not _has_field(part, token):
+        return [type(part).wraps], tokens
+    return [token], tokens[1:]
 
 
 def _has_field(part: Any, name: str) -> bool:
@@ -162,18 +248,6 @@ def _entry(part: Any, index: int) -> Any:
     if not -size <= index < size:
         raise IndexError(index)
     return part[index]
-
-
-def sign_at(scenario: Scenario, path: str) -> str | None:
-    """The sign that the leaf at a path must have: None, "positive" or "nonnegative"."""
-    part, sign = scenario, None
-    for token in parse(expand(path)[0]):
-        if isinstance(token, int):
-            part = _entry(part, token)
-        else:
-            sign = next(f.metadata.get("sign") for f in dataclasses.fields(part) if f.name == token)
-            part = getattr(part, token)
-    return sign
 
 
 def _field(part: Any, name: str) -> Any:

@@ -33,7 +33,8 @@ def leaf(unit: str, *, sign: str | None = None, shape: str = "joint", default: A
 
     Args:
       unit: SI unit for tables and axes, such as "kg m^2" ("1" for a pure number).
-      sign: None, "positive" or "nonnegative"; checked at construction and at the entry points.
+      sign: None, "positive" or "nonnegative"; "limit" or "positive limit" for what may be infinite, because there is no limit.
+        Checked at construction and at the entry points.
       shape: "joint" for one number a joint, (n,), where a scalar is repeated; "scalar" for (); "any" for neither.
       default: the value if none is given.
     """

@@ -16,16 +16,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from iblf_jax import checks
 from iblf_jax.bounds import NARROWEST, tube_at
 from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
-from iblf_jax.integrators import step, tableau
+from iblf_jax.integrators import stages, step, tableau
 from iblf_jax.metrics import Fold, as_folds
-from iblf_jax.one_function import as_one_function
+from iblf_jax.one_function import as_one_function, is_long
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.stability import comfortable_dt, fastest_mode
+from iblf_jax.stability import comfortable_dt, fastest_mode, fastest_mode_by_differences
 from iblf_jax.status import FAILED, VELOCITY_LIMIT, Status, describe, flag
 
 RECORDED = tuple(f.name for f in dataclasses.fields(Rollout) if f.name in Sample._fields and f.name != "dt")
@@ -90,24 +91,29 @@ def _keep_if(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _observe(scenario: Scenario, folds, t, dt, carry: Carry, loop=evaluate):
-    """Evaluates the loop at t and folds the sample in; returns the rate of the state, the sample and the new carry."""
-    slope, sample = loop(scenario, t, carry.state, dt)
+def _folded(folds, sample: Sample, carry: Carry) -> Carry:
+    """The carry with a sample folded in."""
     accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, carry.accumulators, strict=True))
     near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-    here = Nearest(near, t, jax.lax.stop_gradient(carry.state))
+    here = Nearest(near, sample.t, jax.lax.stop_gradient(carry.state))
     nearest = _keep_if(near > carry.nearest.xi, here, carry.nearest)
-    return slope, sample, Carry(carry.state, accumulators, carry.status | sample_status(sample), nearest)
+    return Carry(carry.state, accumulators, carry.status | sample_status(sample), nearest)
 
 
 def advance(scenario: Scenario, folds, method: str, dt, carry: Carry, index, loop=evaluate) -> tuple[Carry, Sample]:
     """One step of the time loop: observe, integrate, freeze what runs away.  `loop` stands for `closed_loop.evaluate`."""
     t = index.astype(dt.dtype) * dt
-    slope, sample, carry = _observe(scenario, folds, t, dt, carry, loop)
+    slope, sample = loop(scenario, t, carry.state, dt)
+    carry = _folded(folds, sample, carry)
     stepped = step(method, lambda t, state: loop(scenario, t, state)[0], t, carry.state, dt, slope)
+    return _moved(carry, stepped), sample
+
+
+def _moved(carry: Carry, stepped: LoopState, moving: jax.Array | bool = True) -> Carry:
+    """The carry at the next instant if `moving`, its state frozen if that ran away."""
     sound = is_sound(stepped) & (carry.status & int(Status.NOT_FINITE) == 0)
-    state = _keep_if(sound, stepped, carry.state)
-    return carry._replace(state=state, status=carry.status | flag(~sound, Status.NOT_FINITE)), sample
+    state = _keep_if(sound & moving, stepped, carry.state)
+    return carry._replace(state=state, status=carry.status | flag(~sound & moving, Status.NOT_FINITE))
 
 
 def start(scenario: Scenario, folds, dt) -> Carry:
@@ -127,8 +133,8 @@ def finish(scenario: Scenario, folds, method: str, dt, steps: int, carry: Carry)
 
 def observe_end(scenario: Scenario, folds, dt, steps: int, carry: Carry) -> tuple[Carry, Sample]:
     """The carry and the sample after the last step."""
-    _, sample, carry = _observe(scenario, folds, dt * steps, jnp.zeros_like(dt), carry)
-    return carry, sample
+    _, sample = evaluate(scenario, dt * steps, carry.state, jnp.zeros_like(dt))
+    return _folded(folds, sample, carry), sample
 
 
 def critical_instants(scenario: Scenario, dt, steps: int, carry: Carry) -> tuple[jax.Array, LoopState]:
@@ -189,10 +195,72 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
     return outcome._replace(records=records)
 
 
+_evaluate_once = jax.jit(evaluate)
+"""`closed_loop.evaluate`, traced once however often it is called."""
+
+
+def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool) -> Outcome:
+    """As `run`, for a closed loop of so many operations that compiling is what takes the time.
+
+    The closed loop is there once, in a loop over the stages of the integrator, and once more where its modes are measured.  So the
+    sample at the end is that of a step that is not made, and the accumulators begin with the first sample.
+    """
+    piece = as_one_function if alone else lambda function: function
+    every = record_every or 1
+    state, zero = initial_state(scenario), jnp.zeros_like(dt)
+    shapes = jax.eval_shape(_evaluate_once, scenario, zero, state, dt)
+    _, whole_sample = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[1]))
+    _, whole = ravel_pytree(state)
+    weights = tuple(jnp.asarray(w, dt.dtype) for w in stages(method))
+
+    @piece
+    def loop(scenario, t, x, covered):
+        return tuple(ravel_pytree(part)[0] for part in _evaluate_once(scenario, t, whole(x), covered))
+
+    @piece
+    def after(carry, index, sample, stepped):
+        sample = whole_sample(sample)
+        begun = carry._replace(accumulators=_keep_if(index > 0, carry.accumulators, tuple(fold.init(sample) for fold in folds)))
+        moved = _moved(_folded(folds, sample, begun), whole(stepped), index < steps)
+        return _keep_if(index <= steps, moved, carry), record_of(sample, carry.state)
+
+    def one(carry, index):
+        t, x = index.astype(dt.dtype) * dt, ravel_pytree(carry.state)[0]
+        covered = jnp.where(index < steps, dt, zero)
+
+        def stage(slope_and_sum, weights):
+            (k, total), (c, a, b) = slope_and_sum, weights
+            k, sample = loop(scenario, t + c * dt, x + dt * (a * k), covered)
+            return (k, total + b * k), sample
+
+        (_, total), samples = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
+        return after(carry, index, samples[0], x + dt * total)
+
+    def block(carry, first):
+        carry, records = jax.lax.scan(one, carry, first + jnp.arange(every))
+        return carry, None if record_every is None else jax.tree.map(lambda x: x[0], records)
+
+    blank = jax.eval_shape(lambda sample: tuple(fold.init(sample) for fold in folds), shapes[1])
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
+    carry = Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(dt), zero, jax.lax.stop_gradient(state)))
+    carry, records = jax.lax.scan(block, carry, every * jnp.arange(steps // every + 1))
+    times, states = critical_instants(scenario, dt, steps, carry)
+
+    def mode(instant):
+        t, state = instant
+        return fastest_mode_by_differences(lambda x: loop(scenario, t, x, zero)[0], ravel_pytree(state)[0])
+
+    modes = jax.lax.map(mode, (times, states))
+    return verdict(folds, method, dt, carry, modes)._replace(records=records)
+
+
 @partial(jax.jit, static_argnames=("steps", "record_every", "method", "alone"))
 def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
     """`run`, compiled; `alone` says that nobody will batch it from outside, so that it may become one machine function."""
-    one = partial(run, steps=steps, record_every=record_every, method=method)
+    options = {"steps": steps, "record_every": record_every, "method": method}
+    if is_long(_evaluate_once, scenario, jnp.zeros_like(dt), initial_state(scenario), dt):
+        return run_compactly(scenario, folds, dt, alone=alone, **options)
+    one = partial(run, **options)
     return (as_one_function(one) if alone else one)(scenario, folds, dt)
 
 

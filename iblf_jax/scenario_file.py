@@ -155,7 +155,7 @@ def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None
     text = tomli_w.dumps(tables)
     # tomli_w writes one number a line; a row a line reads better.  A line break inside a string is escaped, so this is safe.
     text = re.sub(r"\[\n(?:\s*[-+.\w]+,\n)+\s*\]", lambda m: "[" + ", ".join(re.findall(r"[-+.\w]+", m[0])) + "]", text)
-    return _with_units(text, {p.path: p.unit for p in parameters(scenario)} | {"run.duration": "s", "run.dt": "s"})
+    return _with_units(text, {p.path: p.unit for p in parameters(scenario, named=False)} | {"run.duration": "s", "run.dt": "s"})
 
 
 def _with_units(text: str, units: Mapping[str, str]) -> str:

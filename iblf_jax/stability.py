@@ -49,7 +49,12 @@ def growth_step(scenario: Scenario, t: jax.Array, state: LoopState, growth: Grow
     """One of POWER_ITERATIONS steps: the direction, pushed by the closed loop's Jacobian at (t, state)."""
     flat, unravel = ravel_pytree(state)
     w = jax.jvp(lambda x: ravel_pytree(rate(scenario, t, unravel(x)))[0], (flat,), (growth.direction,))[1]
-    size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(flat.dtype).tiny)
+    return _grown(growth, w, index)
+
+
+def _grown(growth: Growth, w: jax.Array, index: jax.Array) -> Growth:
+    """The growth after the direction has become w."""
+    size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(w.dtype).tiny)
     counted = index >= POWER_ITERATIONS - AVERAGED
     return Growth(w / size, growth.total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size)))
 
@@ -69,6 +74,23 @@ def fastest_mode(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Arra
         return growth_step(scenario, t, state, growth, index), None
 
     return growth_rate(jax.lax.scan(iterate, growth_start(state), jnp.arange(POWER_ITERATIONS))[0])
+
+
+def fastest_mode_by_differences(rate, x: jax.Array) -> jax.Array:
+    """As `fastest_mode`, from central differences: for a loop so long that compiling its derivative is what takes the time.
+
+    Args:
+      rate: function of the state as one vector (m,) -> its rate (m,).
+      x: the state.
+    """
+    h = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.abs(x))
+    rates = jax.lax.map(lambda move: rate(x + move), jnp.concatenate([jnp.diag(h), -jnp.diag(h)]))
+    columns = (rates[: x.size] - rates[x.size :]) / (2.0 * h[:, None])
+
+    def iterate(growth, index):
+        return _grown(growth, jnp.sum(columns * growth.direction[:, None], axis=0), index), None
+
+    return growth_rate(jax.lax.scan(iterate, growth_start(x), jnp.arange(POWER_ITERATIONS))[0])
 
 
 def stable_dt(mode: float, method: str) -> float:

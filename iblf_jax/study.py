@@ -10,7 +10,6 @@ statistics always, are counted, and the answer says so.
 from __future__ import annotations
 
 import dataclasses
-import re
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -186,9 +185,7 @@ class Study:
 
     def parameter_unit(self, path: str) -> str:
         """SI unit of a drawn parameter, by the path of its leaf or of an entry."""
-        plain = paths.expand(path)[0]
-        known = {p.path: p.unit for p in paths.parameters(self.scenario)}
-        return known.get(plain, known.get(re.sub(r"(\[\d+\])+$", "", plain), ""))
+        return paths.unit_at(self.scenario, path)
 
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
         """Which runs a statistic is over, (N,) bool, and what to say about it."""

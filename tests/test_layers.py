@@ -41,6 +41,7 @@ ONLY_IN = {
     "matplotlib": ("plotting",),
     "optax": ("tuning",),
     "argparse": ("cli",),
+    "mujoco": ("robots",),
     "xarray": ("io", "study", "_sweep", "_dataset", "_summaries", "_sensitivity", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""

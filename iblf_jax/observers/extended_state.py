@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from iblf_jax import checks
 from iblf_jax.linalg import matvec
 from iblf_jax.pytree import Leaf, component, leaf
-from iblf_jax.robots import Robot, mass_matrix_rate
+from iblf_jax.robots import Robot, energy_gradient
 
 
 class ExtendedStateValues(NamedTuple):
@@ -63,5 +63,5 @@ class ExtendedState:
         """p_hat' and f_hat'."""
         l1, l2 = (self.l1, self.l2) if self.bandwidth is None else (2.0 * self.bandwidth, self.bandwidth**2)
         innovation = matvec(model.mass_matrix(q), dq) - state.p_hat
-        drift = matvec(mass_matrix_rate(model, q, dq), dq) - model.coriolis(q, dq, dq) - model.gravity(q)
+        drift = energy_gradient(model, q, dq) - model.gravity(q)
         return ExtendedStateValues(tau + drift + state.f_hat + l1 * innovation, l2 * innovation)

@@ -8,14 +8,14 @@ from iblf_jax import checks
 from iblf_jax.linalg import matvec
 from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
 from iblf_jax.pytree import Leaf, component, leaf, static
-from iblf_jax.robots import Robot, mass_matrix_rate
+from iblf_jax.robots import Robot, energy_gradient
 
 
 @component
 class Momentum:
     """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').        (3.11), corrected
 
-    Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.
+    Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.  (M0' q' - C0 q' is dT/dq.)
     Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for the form.
     """
 
@@ -44,5 +44,4 @@ class Momentum:
     def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
-        drift = model.coriolis(q, dq, dq) + model.gravity(q) - matvec(mass_matrix_rate(model, q, dq), dq)
-        return -self.kf * (f_hat + tau - drift)
+        return -self.kf * (f_hat + tau + energy_gradient(model, q, dq) - model.gravity(q))

@@ -27,6 +27,11 @@ class Robot(Protocol):
 
     A member is a component (`iblf_jax.component`) whose inertial parameters are leaves; `payload` [kg], a point mass at
     the tip, is one of them in every member, so that any robot can carry what its model does not know.
+
+    Two methods more are used where a member has them, through `at_time` and `friction_torque` below: `at(t)`, the robot as it is at
+    time t [s], for one that changes while it moves; and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.  Both
+    are of the plant only: law and observer know neither, and (2.1) has them in f.  A third, `energy_gradient(q, v)`, is used by the
+    function of this name where a member has something shorter than the general formula.
     """
 
     @property
@@ -63,6 +68,16 @@ class Robot(Protocol):
         ...
 
 
+def at_time(robot: T, t: jax.Array) -> T:
+    """The robot as it is at time t [s]: itself, unless it has a method `at`."""
+    return robot.at(t) if hasattr(robot, "at") else robot
+
+
+def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
+    """What the joints put against their motion, (n,) [N m], against q' in sign: zero, unless the robot has a method of this name."""
+    return robot.friction_torque(dq) if hasattr(robot, "friction_torque") else jnp.zeros_like(dq)
+
+
 def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
     """C(q, v) u from M(q) by automatic differentiation, with the Christoffel symbols (head of this module).
 
@@ -82,6 +97,13 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:
     """M'(q) = dM/dq . q', (n, n) [kg m^2/s], by jvp."""
     return jax.jvp(robot.mass_matrix, (q,), (dq,))[1]
+
+
+def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
+    """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v, by the robot's own method if it has one."""
+    if hasattr(robot, "energy_gradient"):
+        return robot.energy_gradient(q, v)
+    return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
 
 
 def from_energy(cls: type[T]) -> type[T]:

@@ -176,7 +176,8 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
     """Forward mode against central differences, reverse mode against forward mode."""
 
     def random_like(x):
-        return jnp.asarray(rng.normal(size=np.shape(x)) * np.maximum(np.abs(x), 0.1))
+        size = np.where(np.isfinite(x), np.maximum(np.abs(x), 0.1), 0.1)  # a limit may be infinite
+        return jnp.asarray(rng.normal(size=np.shape(x)) * size)
 
     def floats(p):
         return {k: v for k, v in function(p).items() if jnp.issubdtype(v.dtype, jnp.floating)}

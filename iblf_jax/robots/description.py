@@ -1,0 +1,161 @@
+"""Reading a robot's description, URDF or MJCF, without trusting it.
+
+A file from elsewhere may be malformed, huge, a bomb of entities, or just not what its ending says.  Here it is read with limits, parsed by
+a parser that knows no entities, and copied: only the elements and attributes that say how links move and what they weigh go on, to the
+library that understands them.  What draws, what collides and what senses stays behind, so no mesh is ever opened, and files that MJCF
+includes are read here, under the same limits.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from iblf_jax import checks
+
+LARGEST = 8 << 20
+"""Bytes of a description, its includes together."""
+DEEPEST = 200
+"""Levels of elements."""
+MOST_NESTED = 8
+"""Files that include each other."""
+MOST = 30_000
+"""Elements."""
+MOST_BODIES = 1000
+"""Links or bodies."""
+LARGEST_NUMBER = 1e10
+"""No length, mass or inertia of a robot in SI units is beyond."""
+
+
+class Shown(str):
+    """Words in place of a value in an error message."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def read(path: str | os.PathLike) -> ET.Element:
+    """The root element of a description.
+
+    Args:
+      path: a file, URDF or MJCF.
+
+    Raises:
+      ValueError: no such file, not a file, too large, too deep, not XML, or XML that declares entities.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise checks.fail("path", path, "the path of a URDF or MJCF file")
+    root = _Reader(Path(path).parent).parse(Path(path))
+    if root.tag not in ("robot", "mujoco"):
+        expected = "a URDF or MJCF file"
+        if root.tag == "sdf":
+            raise checks.fail("path", str(path), expected, "It is SDF.")
+        raise checks.fail("path", str(path), expected, f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.")
+    return root
+
+
+class _Reader:
+    """Reads files with one budget of bytes and elements for all of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.bytes_left = LARGEST
+        self.elements_left = MOST
+
+    def parse(self, path: Path, nesting: int = 0) -> ET.Element:
+        """The root element of one file, what it includes in its place."""
+        data = self._bytes(path)
+        builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+        depth = 0
+
+        def fail(problem: str, mend: str = "") -> ValueError:
+            where = f"line {parser.CurrentLineNumber} of {str(path)!r}"
+            return ValueError(f"{where}: {problem}." + (f" {mend}" if mend else ""))
+
+        def start(tag: str, attributes: dict[str, str]) -> None:
+            nonlocal depth
+            depth += 1
+            self.elements_left -= 1
+            if depth > DEEPEST:
+                raise fail(f"more than {DEEPEST} levels of elements")
+            if self.elements_left < 0:
+                raise fail(f"more than {MOST} elements")
+            if tag.startswith("xacro:"):
+                raise fail(f"<{tag[:40]}> is a macro", "Expand the file first: xacro arm.urdf.xacro > arm.urdf")
+            builder.start(tag, attributes)
+
+        def end(tag: str) -> None:
+            nonlocal depth
+            depth -= 1
+            builder.end(tag)
+
+        def doctype(*_: Any) -> None:
+            raise fail("it declares a document type or entities", "A robot needs none: remove <!DOCTYPE ...>.")
+
+        parser.StartElementHandler, parser.EndElementHandler = start, end
+        parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = doctype
+        try:
+            parser.Parse(data, True)
+        except expat.ExpatError as error:
+            raise fail(f"malformed XML, {expat.ErrorString(error.code)}", "Correct it there.") from None
+        except (LookupError, UnicodeError) as error:
+            raise fail(f"an encoding that cannot be read, {error}") from None
+        return self._with_includes(builder.close(), path, nesting)
+
+    def _with_includes(self, root: ET.Element, path: Path, nesting: int) -> ET.Element:
+        """`root` of an MJCF, with the children of each file that it includes in the place of the <include>."""
+        if root.tag != "mujoco":
+            return root
+        if nesting > MOST_NESTED:
+            raise checks.fail("<include>", str(path), f"at most {MOST_NESTED} files inside each other", "Does it include itself?")
+        for parent in list(root.iter()):
+            for element in [child for child in parent if child.tag == "include"]:
+                file = element.get("file")
+                if not file:
+                    raise checks.fail("<include>", Shown("no file"), 'file="..."')
+                children = list(self.parse(self.folder / file, nesting + 1))
+                at = list(parent).index(element)
+                parent[at : at + 1] = children
+        return root
+
+    def _bytes(self, path: Path) -> bytes:
+        name, expected = str(path), "the path of a URDF or MJCF file"
+        try:
+            if not path.is_file():
+                found = "It is a directory." if path.is_dir() else "It is not a file." if path.exists() else "Nothing is there."
+                raise checks.fail("path", name, expected, found)
+            with path.open("rb") as file:
+                data = file.read(self.bytes_left + 1)
+        except OSError as error:
+            raise checks.fail("path", name, expected, f"It cannot be read: {error}.") from None
+        self.bytes_left -= len(data)
+        if self.bytes_left < 0:
+            raise checks.fail("path", name, f"a file of at most {LARGEST >> 20} MiB", "A description without meshes is far smaller.")
+        return data
+
+
+def label(element: ET.Element) -> str:
+    """How an element is called in messages: link "forearm"."""
+    name = element.get("name")
+    return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag[:40]}>"
+
+
+def floats(where: str, text: str, count: int | None = None, *, least: int = 1) -> list[float]:
+    """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as expected, finite and not absurd."""
+    words = text.split()
+    expected = f"{count} numbers" if count and count > 1 else "one number" if count else "numbers"
+    if (count is not None and len(words) != count) or not least <= len(words) <= 100:
+        raise checks.fail(where, text, expected)
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise checks.fail(where, text, expected) from None
+    if not all(math.isfinite(x) and abs(x) < LARGEST_NUMBER for x in values):
+        raise checks.fail(where, text, f"{expected}, finite and in SI units")
+    return values
