@@ -3,8 +3,8 @@
 from iblf_jax.robots._base import Robot as Robot
 from iblf_jax.robots._base import at_time as at_time
 from iblf_jax.robots._base import coriolis_from_mass_matrix as coriolis_from_mass_matrix
-from iblf_jax.robots._base import friction_torque as friction_torque
 from iblf_jax.robots._base import energy_gradient as energy_gradient
+from iblf_jax.robots._base import friction_torque as friction_torque
 from iblf_jax.robots._base import from_energy as from_energy
 from iblf_jax.robots._base import mass_matrix_rate as mass_matrix_rate
 from iblf_jax.robots.arm import Arm as Arm
@@ -29,8 +29,8 @@ __all__ = [
     "TwoLink",
     "at_time",
     "coriolis_from_mass_matrix",
-    "friction_torque",
     "energy_gradient",
+    "friction_torque",
     "from_energy",
     "load",
     "mass_matrix_rate",

@@ -20,6 +20,7 @@ Friction in the joints acts on the plant (`friction_torque`); the law's M0, C0, 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -54,12 +55,10 @@ class Pose(NamedTuple):
 class Frames(NamedTuple):
     """The links' frames in the world, and what their joints allow."""
 
-    rotation: jax.Array
-    """(n, 3, 3)."""
-    position: jax.Array
-    """(n, 3) [m]."""
-    allowed: spatial.Motion
-    """S, the links' motion per unit of joint speed."""
+    placement: jax.Array
+    """[R, p] of each, (n, 3, 4)."""
+    allowed: jax.Array
+    """S, the links' motion per unit of joint speed, (n, 2, 3)."""
 
 
 @component
@@ -187,39 +186,38 @@ class Arm:
         """Frames of the links and directions of the joints at q."""
         turns = np.array([kind == "revolute" for kind in self.kinds])
         a, fixed = spatial.unit(self.axis), spatial.rotation(self.rotation)
+        axis = spatial.apply(fixed, a)
+        along = axis[:, :, None] * a[:, None, :]
         angle = q if turns.all() else jnp.where(turns, q, jnp.zeros_like(q))
         sine, cosine = jnp.sin(angle)[:, None, None], jnp.cos(angle)[:, None, None]
-        aa = a[:, :, None] * a[:, None, :]
-        turned = spatial.product(fixed, aa + cosine * (jnp.eye(3, dtype=a.dtype) - aa) + sine * spatial.skew(a))
+        turned = along + cosine * (fixed - along) + sine * spatial.cross(fixed, a[:, None, :])
         shifted = self.position
         if not turns.all():
-            shifted = shifted + jnp.where(turns, jnp.zeros_like(q), q)[:, None] * spatial.apply(fixed, a)
-        R, p = [turned[0]], [shifted[0]]
-        for i in range(1, self.n):
-            p.append(p[-1] + spatial.apply(R[-1], shifted[i]))
-            R.append(spatial.product(R[-1], turned[i]))
-        rotation, position = jnp.stack(R), jnp.stack(p)
-        z = spatial.apply(rotation, a)
-        w, v = z, spatial.cross(position, z)
+            shifted = shifted + jnp.where(turns, jnp.zeros_like(q), q)[:, None] * axis
+        H = spatial.chained(spatial.placement(turned, shifted))
+        z = spatial.apply(H[:, :, :3], a)
+        w, v = z, spatial.cross(H[:, :, 3], z)
         if not turns.all():
             w, v = jnp.where(turns[:, None], w, jnp.zeros_like(z)), jnp.where(turns[:, None], v, z)
-        return Frames(rotation, position, spatial.Motion(w, v))
+        return Frames(H, jnp.stack([w, v], axis=1))
 
-    def _bodies(self, frames: Frames) -> spatial.Inertia:
-        """Inertias of the links in the world; the last one's with all that the tip carries."""
+    def _bodies(self, frames: Frames) -> tuple[jax.Array, jax.Array]:
+        """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the last with all that the tip carries."""
         P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
-        H = spatial.placement(spatial.rotation(self.tip_rotation), self.tip_position)
-        tip = jnp.concatenate([H, jnp.asarray([[0.0, 0.0, 0.0, 1.0]], H.dtype)])
+        tip = jnp.concatenate([self._tip_placement(), jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
         corner = jnp.asarray(np.diag([0.0, 0.0, 0.0, 1.0]), P.dtype) * self.payload
         held = spatial.product(spatial.product(tip, self.carried.moments() + corner), tip.T)
         P = jnp.concatenate([P[:-1], P[-1:] + held])
-        return spatial.moved(spatial.placement(frames.rotation, frames.position), P)
+        return spatial.moved(frames.placement, P), P[:, 3, 3:]
+
+    def _tip_placement(self) -> jax.Array:
+        """[R, p] of the tip in the last link's frame, (3, 4)."""
+        return spatial.placement(spatial.rotation(self.tip_rotation), self.tip_position)
 
     def pose(self, q: jax.Array) -> Pose:
         """Position and orientation of the tip's frame in the base's."""
-        frames = self._frames(q)
-        R = frames.rotation[-1]
-        return Pose(frames.position[-1] + spatial.apply(R, self.tip_position), spatial.product(R, spatial.rotation(self.tip_rotation)))
+        H = spatial.joined(self._frames(q).placement[-1], self._tip_placement())
+        return Pose(H[:, 3], H[:, :3])
 
     def tip(self, q: jax.Array) -> jax.Array:
         """Position of the tip, (3,) [m]."""
@@ -227,7 +225,7 @@ class Arm:
 
     def skeleton(self, q: jax.Array) -> jax.Array:
         """Origins of the joints' frames, then the tip, (n + 1, 3) [m]."""
-        return jnp.concatenate([self._frames(q).position, self.tip(q)[None]])
+        return jnp.concatenate([self._frames(q).placement[:, :, 3], self.tip(q)[None]])
 
     def jacobian(self, q: jax.Array) -> jax.Array:
         """D tip / dq, (3, n) [m/rad]: the tip's velocity per unit of joint speed."""
@@ -235,50 +233,51 @@ class Arm:
 
     def twist_jacobian(self, q: jax.Array) -> jax.Array:
         """The tip's velocity (first three rows) and angular velocity (last three) per unit of joint speed, (6, n)."""
-        allowed = self._frames(q).allowed
-        return jnp.concatenate([(allowed.v + spatial.cross(allowed.w, self.tip(q)[None])).T, allowed.w.T])
+        w, v = jnp.unstack(self._frames(q).allowed, axis=1)
+        return jnp.concatenate([(v + spatial.cross(w, self.tip(q)[None])).T, w.T])
 
     # ---------------------------------------------------------------------------------------------------------------- dynamics
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
         frames = self._frames(q)
+        composite = spatial.inertia(*map(_outward, self._bodies(frames)))
         S = frames.allowed
-        composite = spatial.Inertia(*(_outward(x) for x in self._bodies(frames)))
-        L = spatial.momentum(composite, S)
-        upper = jnp.sum(S.w[:, None] * L.n[None] + S.v[:, None] * L.f[None], axis=-1)
-        above = np.triu(np.ones((self.n, self.n), bool))
-        return jnp.where(above, upper, upper.T) + jnp.eye(self.n, dtype=upper.dtype) * self.armature
+        upper = jnp.sum(S[:, None] * spatial.momentum(composite, S), axis=(-1, -2))
+        above, diagonal = np.triu(np.ones((self.n, self.n), bool)), np.eye(self.n, dtype=bool)
+        return jnp.where(above, upper, upper.T) + jnp.where(diagonal, self.armature, jnp.zeros_like(upper))
 
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
         frames = self._frames(q)
-        S, bodies = frames.allowed, self._bodies(frames)
-        V, U = _moving(S, v), _moving(S, u)
+        S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
+        V = _moving(S, v)
         carried = _moving(spatial.along(V, S), u)
-        push = spatial.momentum(bodies, carried)
-        turn = spatial.along_wrench(V, spatial.momentum(bodies, U))
-        back = spatial.along_wrench(U, spatial.momentum(bodies, V))
-        slip = spatial.momentum(bodies, spatial.along(V, U))
-        forces = spatial.Wrench(*(x + 0.5 * (a + b - c) for x, a, b, c in zip(push, turn, back, slip, strict=True)))
+        if u is v:  # the usual case: V x V = 0
+            forces = spatial.momentum(bodies, carried) + spatial.along_wrench(V, spatial.momentum(bodies, V))
+        else:
+            U = _moving(S, u)
+            L = spatial.momentum(bodies, jnp.stack([carried - 0.5 * spatial.along(V, U), U, V]))
+            forces = L[0] + 0.5 * jnp.sum(spatial.along_wrench(jnp.stack([V, U]), L[1:]), axis=0)
         return _felt(S, forces)
 
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the momentum of all beyond it."""
         frames = self._frames(q)
-        V = _moving(frames.allowed, v)
-        return _felt(spatial.along(V, frames.allowed), spatial.momentum(self._bodies(frames), V))
+        S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
+        V = _moving(S, v)
+        return _felt(spatial.along(V, S), spatial.momentum(bodies, V))
 
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q) = - g . sum_i m_i c_i, () [J]; zero with all mass at the base's origin."""
-        return -jnp.sum(self.g * self._bodies(self._frames(q)).first)
+        return -jnp.sum(self.g * self._bodies(self._frames(q))[0][:, :, 3])
 
     def gravity(self, q: jax.Array) -> jax.Array:
         """G(q), (n,) [N m]."""
         frames = self._frames(q)
-        bodies = self._bodies(frames)
-        weight = spatial.Wrench(-spatial.cross(bodies.first, self.g), -bodies.mass * self.g)
-        return _felt(frames.allowed, weight)
+        upper, mass = self._bodies(frames)
+        weight = jnp.stack([spatial.cross(upper[:, :, 3], self.g), mass * self.g], axis=1)
+        return -_felt(frames.allowed, weight)
 
     def friction_torque(self, dq: jax.Array) -> jax.Array:
         """-(damping q' + friction tanh(q' / friction_width)), (n,) [N m]: what the joints themselves put against the motion."""
@@ -291,19 +290,25 @@ def _numbered(word: str, n: int) -> tuple[str, ...]:
 
 def _inward(rows: jax.Array) -> jax.Array:
     """Row i: the sum of the rows up to i, (n, ...): what a link has from the joints before it."""
-    return jnp.cumsum(rows, axis=0)
+    return _summed(rows, np.tril)
 
 
 def _outward(rows: jax.Array) -> jax.Array:
     """Row i: the sum of the rows from i on, (n, ...): what a joint bears of the links beyond it."""
-    return jnp.cumsum(rows[::-1], axis=0)[::-1]
+    return _summed(rows, np.triu)
 
 
-def _moving(S: spatial.Motion, speeds: jax.Array) -> spatial.Motion:
-    """J_i u, the motion of every link when the joints move at `speeds`."""
-    return spatial.Motion(*(_inward(x * speeds[:, None]) for x in S))
+def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
+    n = rows.shape[0]
+    chosen = triangle(np.ones((n, n), bool)).reshape((n, n) + (1,) * (rows.ndim - 1))
+    return spatial.kept(jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1))
 
 
-def _felt(S: spatial.Motion, forces: spatial.Wrench) -> jax.Array:
-    """sum_i J_i^T F_i, (n,): what the joints feel of forces on the links."""
-    return jnp.sum(S.w * _outward(forces.n) + S.v * _outward(forces.f), axis=-1)
+def _moving(S: jax.Array, speeds: jax.Array) -> jax.Array:
+    """J_i u, the motion of every link when the joints move at `speeds`, (n, 2, 3)."""
+    return _inward(S * speeds[:, None, None])
+
+
+def _felt(S: jax.Array, forces: jax.Array) -> jax.Array:
+    """sum_i J_i^T F_i, (n,): what the joints feel of wrenches on the links."""
+    return jnp.sum(S * _outward(forces), axis=(-1, -2))

@@ -21,6 +21,8 @@ LARGEST = 8 << 20
 """Bytes of a description, its includes together."""
 DEEPEST = 200
 """Levels of elements."""
+MOST_NESTED = 8
+"""Files that include each other."""
 MOST = 100_000
 """Elements."""
 MOST_BODIES = 1000
@@ -49,7 +51,7 @@ def read(path: str | os.PathLike) -> ET.Element:
     """
     if not isinstance(path, str | os.PathLike):
         raise checks.fail("path", path, "the path of a URDF or MJCF file")
-    root = _Reader().parse(Path(path))
+    root = _Reader(Path(path).parent).parse(Path(path))
     if root.tag not in ("robot", "mujoco"):
         expected = "a URDF or MJCF file"
         if root.tag == "sdf":
@@ -61,11 +63,12 @@ def read(path: str | os.PathLike) -> ET.Element:
 class _Reader:
     """Reads files with one budget of bytes and elements for all of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
         self.bytes_left = LARGEST
         self.elements_left = MOST
 
-    def parse(self, path: Path) -> ET.Element:
+    def parse(self, path: Path, nesting: int = 0) -> ET.Element:
         """The root element of one file, what it includes in its place."""
         data = self._bytes(path)
         builder, parser = ET.TreeBuilder(), expat.ParserCreate()
@@ -103,7 +106,23 @@ class _Reader:
             raise fail(f"malformed XML, {expat.ErrorString(error.code)}", "Correct it there.") from None
         except (LookupError, UnicodeError) as error:
             raise fail(f"an encoding that cannot be read, {error}") from None
-        return builder.close()
+        return self._with_includes(builder.close(), path, nesting)
+
+    def _with_includes(self, root: ET.Element, path: Path, nesting: int) -> ET.Element:
+        """`root` of an MJCF, with the children of each file that it includes in the place of the <include>."""
+        if root.tag != "mujoco":
+            return root
+        if nesting > MOST_NESTED:
+            raise checks.fail("<include>", str(path), f"at most {MOST_NESTED} files inside each other", "Does it include itself?")
+        for parent in list(root.iter()):
+            for element in [child for child in parent if child.tag == "include"]:
+                file = element.get("file")
+                if not file:
+                    raise checks.fail("<include>", Shown("no file"), 'file="..."')
+                children = list(self.parse(self.folder / file, nesting + 1))
+                at = list(parent).index(element)
+                parent[at : at + 1] = children
+        return root
 
     def _bytes(self, path: Path) -> bytes:
         name, expected = str(path), "the path of a URDF or MJCF file"

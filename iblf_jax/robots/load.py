@@ -127,6 +127,7 @@ class _Chain(NamedTuple):
         _, upright = tree.pose(self.base, self.held)
         links = tree.welded(self.base, self.joints, self.held)
         links.check()
+        tree.check_closed(links, self.joints)
         p, R = links.frames[self.tip]
         tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
         return Arm(

@@ -14,6 +14,9 @@ from iblf_jax import checks
 from iblf_jax.robots.description import Shown
 
 FREE, BALL, SLIDE, HINGE = range(4)
+CONNECT, WELD, COUPLED = range(3)
+JOINT, FIXED, NO_BIAS = 0, 0, 0
+"""The library's numbers for kinds of joints, of constraints, and of an actuator's transmission, gain and bias."""
 Pose = tuple[np.ndarray, np.ndarray]
 
 
@@ -73,6 +76,8 @@ class Tree:
             name or f"{self.bodies[model.jnt_bodyid[j]]}_joint" for j, name in enumerate(names(objects.mjOBJ_JOINT, model.njnt))
         ]
         self.sites = names(objects.mjOBJ_SITE, model.nsite)
+        self.equalities = names(objects.mjOBJ_EQUALITY, model.neq)
+        self.site_type = objects.mjOBJ_SITE
         self.gravity = np.array(model.opt.gravity)
 
     @staticmethod
@@ -232,6 +237,7 @@ class Tree:
         dofs = m.jnt_dofadr[at]
         limited, driven = m.jnt_limited[at].astype(bool), m.jnt_actfrclimited[at].astype(bool)
         effort = np.where(driven, np.min(np.abs(m.jnt_actfrcrange[at]), axis=1), np.inf)
+        effort = np.minimum(effort, [self._actuators(j) for j in joints])
         return {
             "axis": np.array(m.jnt_axis[at]),
             "armature": np.array(m.dof_armature[dofs]),
@@ -243,6 +249,37 @@ class Tree:
             "kinds": tuple("revolute" if m.jnt_type[j] == HINGE else "prismatic" for j in joints),
             "joints": tuple(self.joint_names[j] for j in joints),
         }
+
+    def _actuators(self, j: int) -> float:
+        """The largest torque (force) that the actuators of a joint give together; infinite if one has no limit or there are none."""
+        m, total = self.model, 0.0
+        on_it = [a for a in range(m.nu) if m.actuator_trntype[a] == JOINT and m.actuator_trnid[a, 0] == j]
+        for a in on_it:
+            limit = float(np.min(np.abs(m.actuator_forcerange[a]))) if m.actuator_forcelimited[a] else np.inf
+            if m.actuator_ctrllimited[a] and m.actuator_gaintype[a] == FIXED and m.actuator_biastype[a] == NO_BIAS:
+                limit = min(limit, float(np.min(np.abs(m.actuator_ctrlrange[a])) * abs(m.actuator_gainprm[a, 0])))
+            total += limit * abs(float(m.actuator_gear[a, 0]))
+        return total if on_it else np.inf
+
+    def check_closed(self, links: Links, joints: tuple[int, ...]) -> None:
+        """Raises where a constraint ties bodies of different links together, or a joint of the chain to another."""
+        m = self.model
+        for e in range(m.neq):
+            first, second = int(m.eq_obj1id[e]), int(m.eq_obj2id[e])
+            if not m.eq_active0[e]:
+                continue
+            name = self.equalities[e] or f"number {e}"
+            if m.eq_type[e] == COUPLED and {first, second} & set(joints):
+                moving = self.joint_names[first if first in joints else second]
+                mend = f"Lock it: locked={{{moving!r}: 0.0}}, or remove the constraint."
+                raise checks.fail(f"equality {name!r}", Shown(f"joint {moving!r} tied to another"), "joints that move by themselves", mend)
+            if m.eq_type[e] in (CONNECT, WELD):
+                bodies = [int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x for x in (first, second)]
+                tied = {links.carrier.get(b, -1) for b in bodies}
+                if len(tied) > 1:
+                    found = Shown(f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together")
+                    mend = "A closed chain has no serial one: cut it open, or lock its joints."
+                    raise checks.fail(f"equality {name!r}", found, "an open chain", mend)
 
     @staticmethod
     def quaternion(R: np.ndarray) -> np.ndarray:
