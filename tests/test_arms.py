@@ -89,7 +89,7 @@ def test_bounds_are_inside_the_joint_limits(scenario):
 
 def test_the_tip_goes_through_half_a_metre(scenario):
     t = jnp.linspace(0.0, 10.0, 201)
-    tip = np.asarray(jax.vmap(lambda t: scenario.model.tip(scenario.reference.position(t)))(t))
+    tip = np.asarray(jax.jit(jax.vmap(lambda t: scenario.model.tip(scenario.reference.position(t))))(t))
     assert np.linalg.norm(np.ptp(tip, axis=0)) > 0.5
     assert np.linalg.norm(tip, axis=1).max() < 1.3
 
