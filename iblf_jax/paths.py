@@ -2,7 +2,8 @@
 
 Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow the fields of the components;
 `[i]` selects a part of a `Sum` or one entry of an array.  A component with rows that have names (class attribute `rows`, such as
-`robots.Arm`) can be addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names.
+`robots.Arm`) can be addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names (and a
+name without a letter cannot be told from a number: use that).
 `robot.` stands for `plant.` and `model.` together: use it to change the robot that is simulated and the one that the law knows alike.
 A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is looked through: "controller.K2" is the
 wrapped law's K2, and "controller.law.K2" works too.
@@ -23,7 +24,7 @@ import numpy as np
 from iblf_jax import checks
 from iblf_jax.scenario import Scenario
 
-_TOKEN = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)\]|\[([^\[\]]+)\]")
+_TOKEN = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)\]|\[([^\[\]]*[^\W\d_][^\[\]]*)\]")
 
 
 class Row(str):
@@ -176,7 +177,7 @@ def unit_at(scenario: Scenario, path: str) -> str:
 def sign_at(scenario: Scenario, path: str) -> str | None:
     """The sign that the finite numbers at a path must have: None, "positive" or "nonnegative"."""
     sign = _metadata(scenario, path).get("sign")
-    return {"limit": None, "positive limit": "positive"}.get(sign, sign)
+    return None if sign == "limit" else "positive" if sign == "positive limit" else sign
 
 
 def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:

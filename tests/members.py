@@ -5,6 +5,8 @@ Whoever adds a member adds it here; `test_contracts.test_every_member_is_listed`
 
 from __future__ import annotations
 
+from arm_cases import random_arm
+
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, metrics, observers, references, robots
 
@@ -15,6 +17,7 @@ ROBOTS = {
     "two_link_payload": robots.TwoLink(mass=[1.0, 2.0], length=[0.5, 0.4], centre=[0.2, 0.3], inertia=[0.02, 0.01], payload=0.7, g=1.62),
     "chain_1": robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02]),
     "chain_3": robots.PlanarChain(mass=[2.0, 1.0, 0.5], length=[0.4, 0.3, 0.2], centre=[0.2, 0.15, 0.1], inertia=0.01, payload=0.3),
+    "arm": random_arm(3, seed=1, armature=0.1, payload=0.4),
 }
 
 REFERENCES = {

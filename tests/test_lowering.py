@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arm_cases import random_arm
 
 import iblf_jax as ij
 from iblf_jax import lowering, rollout
@@ -23,6 +24,7 @@ PRESET = ij.presets.zhang_yan_2024()
 DT = 1e-3
 STANDARD = standard()
 SPECIAL = {
+    "arm": lambda cls: random_arm(2, seed=0, prismatic=0.0),
     "planar_chain": lambda cls: cls(mass=[2.0, 0.85], length=[0.35, 0.31], centre=0.16, inertia=0.03),
     "waypoint_spline": lambda cls: cls(times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]),
     "quintic": lambda cls: cls(start=0.5, end=0.6, duration=2.0),

@@ -101,8 +101,8 @@ class Arm:
     upper: Leaf = leaf("rad", sign="limit", default=np.inf)
     effort: Leaf = leaf("N m", sign="positive limit", default=np.inf)
     """Largest torques (forces) of the actuators; of the dynamics nothing depends on them."""
-    carried: Payload | None = None
-    """A load with an extent of its own, which may be picked up at a time."""
+    carried: Payload = None  # type: ignore[assignment]
+    """A load with an extent of its own, which may be picked up at a time; nothing if not given."""
     kinds: tuple[str, ...] = static(default=())
     """ "revolute" or "prismatic", one a joint; all revolute if not given."""
     links: tuple[str, ...] = static(default=())
@@ -301,7 +301,7 @@ def _outward(rows: jax.Array) -> jax.Array:
 def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
     n = rows.shape[0]
     chosen = triangle(np.ones((n, n), bool)).reshape((n, n) + (1,) * (rows.ndim - 1))
-    return spatial.kept(jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1))
+    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1)
 
 
 def _moving(S: jax.Array, speeds: jax.Array) -> jax.Array:

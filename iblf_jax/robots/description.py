@@ -23,7 +23,7 @@ DEEPEST = 200
 """Levels of elements."""
 MOST_NESTED = 8
 """Files that include each other."""
-MOST = 100_000
+MOST = 30_000
 """Elements."""
 MOST_BODIES = 1000
 """Links or bodies."""

@@ -11,8 +11,7 @@ It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], 
 
 Products are written as sums: a call into a matrix library costs more than the arithmetic (`iblf_jax.linalg`), and what is compiled as one
 function must hold none.  Few operations on whole arrays rather than many on their entries keep the compiler quick, and where an entry is
-known to be zero it is selected or concatenated as such, not multiplied by zero, so that a scalar program drops it.  Results that several
-others use are `kept`: XLA would compute them again inside each, and a chain of products is a tower of such repetitions.
+known to be zero it is selected or concatenated as such, not multiplied by zero, so that a scalar program drops it.
 """
 
 from __future__ import annotations
@@ -35,18 +34,14 @@ class Inertia(NamedTuple):
     """(m, 1) [kg]."""
 
 
-kept = jax.lax.optimization_barrier
-"""The same array, computed once."""
-
-
 def apply(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Matrices times vectors, (..., m, n) and (..., n) -> (..., m)."""
-    return kept(jnp.sum(matrix * vector[..., None, :], axis=-1))
+    return jnp.sum(matrix * vector[..., None, :], axis=-1)
 
 
 def product(left: jax.Array, right: jax.Array) -> jax.Array:
     """Matrices times matrices, (..., m, k) and (..., k, n) -> (..., m, n)."""
-    return kept(jnp.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2))
+    return jnp.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2)
 
 
 def _next(a: jax.Array) -> jax.Array:
@@ -55,12 +50,12 @@ def _next(a: jax.Array) -> jax.Array:
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Cross products along the last axis, (..., 3)."""
-    return kept(_next(a * _next(b) - _next(a) * b))
+    return _next(a * _next(b) - _next(a) * b)
 
 
 def unit(vector: jax.Array) -> jax.Array:
     """The vector divided by its length, (..., k)."""
-    return kept(vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True)))
+    return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True))
 
 
 def rotation(quaternion: jax.Array) -> jax.Array:
@@ -68,7 +63,7 @@ def rotation(quaternion: jax.Array) -> jax.Array:
     q = unit(quaternion)
     w, v, one = q[..., :1, None], q[..., 1:], jnp.eye(3, dtype=q.dtype)
     straight = (w**2 - jnp.sum(v**2, axis=-1)[..., None, None]) * one
-    return kept(straight + 2.0 * (v[..., :, None] * v[..., None, :] + w * cross(one, v[..., None, :])))
+    return straight + 2.0 * (v[..., :, None] * v[..., None, :] + w * cross(one, v[..., None, :]))
 
 
 def pseudo_inertia(mass: jax.Array, centre: jax.Array, inertia: jax.Array) -> jax.Array:
@@ -83,12 +78,12 @@ def pseudo_inertia(mass: jax.Array, centre: jax.Array, inertia: jax.Array) -> ja
 
 def placement(R: jax.Array, p: jax.Array) -> jax.Array:
     """[R, p], (..., 3, 4): the upper rows of H."""
-    return kept(jnp.concatenate([R, p[..., None]], axis=-1))
+    return jnp.concatenate([R, p[..., None]], axis=-1)
 
 
 def joined(outer: jax.Array, inner: jax.Array) -> jax.Array:
     """The placement of what is placed by `inner` in a frame that is placed by `outer`, (..., 3, 4)."""
-    return kept(product(outer[..., :3], inner) + placement(jnp.zeros_like(outer[..., :3]), outer[..., 3]))
+    return product(outer[..., :3], inner) + placement(jnp.zeros_like(outer[..., :3]), outer[..., 3])
 
 
 def chained(steps: jax.Array) -> jax.Array:
@@ -117,16 +112,16 @@ def momentum(body: Inertia, motion: jax.Array) -> jax.Array:
     """Inertia times motion, (..., m, 2, 3): n = J w + h x v,  f = m v - h x w."""
     w, v = motion[..., 0, :], motion[..., 1, :]
     straight = jnp.stack([apply(body.rotational, w), body.mass * v], axis=-2)
-    return kept(straight + cross(body.first[..., None, :], jnp.stack([v, -w], axis=-2)))
+    return straight + cross(body.first[..., None, :], jnp.stack([v, -w], axis=-2))
 
 
 def along(motion: jax.Array, other: jax.Array) -> jax.Array:
     """The rate of the motion `other` when it is carried along by `motion`: (w x w', w x v' + v x w')."""
     lever = cross(motion[..., 1:, :], other[..., :1, :])
-    return kept(cross(motion[..., :1, :], other) + jnp.concatenate([jnp.zeros_like(lever), lever], axis=-2))
+    return cross(motion[..., :1, :], other) + jnp.concatenate([jnp.zeros_like(lever), lever], axis=-2)
 
 
 def along_wrench(motion: jax.Array, wrench: jax.Array) -> jax.Array:
     """The rate of a wrench that is carried along by `motion`: (w x n + v x f, w x f)."""
     lever = cross(motion[..., 1:, :], wrench[..., 1:, :])
-    return kept(cross(motion[..., :1, :], wrench) + jnp.concatenate([lever, jnp.zeros_like(lever)], axis=-2))
+    return cross(motion[..., :1, :], wrench) + jnp.concatenate([lever, jnp.zeros_like(lever)], axis=-2)

@@ -52,7 +52,7 @@ class Links(NamedTuple):
                 mend = "Give it an inertial, or fix its joint."
                 raise checks.fail(f"link {name!r}", Shown("no mass"), "a mass [kg] of each link that moves", mend)
 
-    def parameters(self) -> dict[str, np.ndarray]:
+    def parameters(self) -> dict[str, Any]:
         """The fields of an Arm."""
         mass = self.moments[:, 3, 3]
         centre = self.moments[:, :3, 3] / np.where(mass > 0, mass, 1.0)[:, None]

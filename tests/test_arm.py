@@ -1,0 +1,328 @@
+"""Arms in space: against MuJoCo's dynamics, against the planar closed form, and what they carry."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arm_cases import ARMS, REAL, as_mjcf, dynamics_of, random_arm, without_constraints
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from members import TWO_LINK
+
+import iblf_jax as ij
+from iblf_jax.closed_loop import evaluate, initial_state
+from iblf_jax.linalg import solve_spd
+from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
+from iblf_jax.scenario import canonical
+
+mujoco = pytest.importorskip("mujoco")
+
+
+@jax.jit
+def dynamics(arm, q, v):
+    return jax.vmap(lambda q, v: (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q), arm.gravity(q)))(q, v)
+
+
+@jax.jit
+def everything(arm, q, v):
+    return (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q)), arm.pose(q), arm.twist_jacobian(q)
+
+
+@jax.jit
+def acceleration(arm, q, v):
+    return solve_spd(arm.mass_matrix(q), -arm.coriolis(q, v, v) - arm.gravity(q))
+
+
+def relative(a, b) -> float:
+    return float(np.max(np.abs(np.asarray(a) - b)) / np.max(np.abs(b)))
+
+
+def real(name: str):
+    """A real arm as ours and as MuJoCo's, without friction."""
+    arm = ij.robots.load(ARMS / REAL[name])
+    n = arm.n
+    arm = dataclasses.replace(arm, damping=np.zeros(n), friction=np.zeros(n))
+    return arm, without_constraints(mujoco.MjModel.from_xml_path(str(ARMS / REAL[name])))
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_arms_have_the_dynamics_that_mujoco_gives(name):
+    arm, model = real(name)
+    rng, states = np.random.default_rng(0), 1000
+    q, v = rng.uniform(-np.pi, np.pi, (states, arm.n)), rng.normal(size=(states, arm.n)) * 2
+    ours = [np.asarray(x) for x in dynamics(arm, q, v)]
+    for i in range(states):
+        M, bias = dynamics_of(model, q[i], v[i])
+        G = dynamics_of(model, q[i], 0 * v[i])[1]
+        assert relative(ours[0][i], M) < 1e-9
+        assert relative(ours[1][i], bias) < 1e-9
+        assert relative(ours[2][i], G) < 1e-9
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_motion_is_mujocos(name):
+    arm, model = real(name)
+    rng = np.random.default_rng(1)
+    data = mujoco.MjData(model)
+    q, v = rng.uniform(-1, 1, arm.n), rng.normal(size=arm.n)
+    data.qpos[:], data.qvel[:] = q, v
+    h = model.opt.timestep
+
+    def rate(x):
+        return np.concatenate([x[1], acceleration(arm, *x)]).reshape(2, -1)
+
+    x = np.stack([q, v])
+    for _ in range(1000):
+        k1 = rate(x)
+        k2 = rate(x + h / 2 * k1)
+        k3 = rate(x + h / 2 * k2)
+        k4 = rate(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(x[0], data.qpos, rtol=0, atol=1e-9)
+
+
+def test_armature_is_on_the_diagonal():
+    arm, model = real("ur5")
+    armature = np.linspace(0.1, 2.0, arm.n)
+    model.dof_armature[:] = armature
+    q, v = np.random.default_rng(2).normal(size=(2, arm.n))
+    M, bias = dynamics_of(model, q, v)
+    ours = dynamics(dataclasses.replace(arm, armature=armature), q[None], v[None])
+    assert relative(ours[0][0], M) < 1e-9
+    assert relative(ours[1][0], bias) < 1e-9
+
+
+@settings(max_examples=25)
+@given(n=st.sampled_from([1, 4, 7]), seed=st.integers(0, 2**32 - 1))
+def test_random_chains_have_the_dynamics_that_mujoco_gives(n, seed):
+    rng = np.random.default_rng(seed)
+    arm = random_arm(n, seed, armature=rng.uniform(0, 0.2, n))
+    model = without_constraints(mujoco.MjModel.from_xml_string(as_mjcf(arm)))
+    q, v = rng.normal(size=(2, n))
+    M, bias = dynamics_of(model, q, v)
+    ours, pose, twist = everything(arm, q, v)
+    assert relative(ours[0], M) < 1e-9
+    assert relative(ours[1], bias) < 1e-9
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(pose.position, data.site("tip").xpos, atol=1e-12)
+    np.testing.assert_allclose(pose.rotation, data.site("tip").xmat.reshape(3, 3), atol=1e-12)
+    linear, angular = np.zeros((2, 3, n))
+    mujoco.mj_jacSite(model, data, linear, angular, 0)
+    np.testing.assert_allclose(twist, np.concatenate([linear, angular]), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_c_is_the_one_of_the_christoffel_symbols(seed):
+    arm = random_arm(4, seed)
+    q, v, u = jnp.asarray(np.random.default_rng(seed).normal(size=(3, 4)))
+    ours, theirs = jax.jit(lambda a: (a.coriolis(q, v, u), coriolis_from_mass_matrix(a.mass_matrix, q, v, u)))(arm)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
+    rate = ij.robots.mass_matrix_rate(arm, q, v) @ v - arm.coriolis(q, v, v)
+    np.testing.assert_allclose(arm.energy_gradient(q, v), rate, rtol=1e-10, atol=1e-12)
+
+
+def two_link_in_space(**fields) -> Arm:
+    """The paper's arm as an Arm: both axes along y, gravity down."""
+    p = TWO_LINK
+    axis = [0.0, -1.0, 0.0]
+    inertia = np.zeros((2, 6))
+    inertia[:, 1] = p.inertia
+    along = np.array([1.0, 0.0, 0.0])
+    return Arm(
+        mass=p.mass,
+        centre=np.asarray(p.centre)[:, None] * along,
+        inertia=inertia,
+        position=[[0.0, 0.0, 0.0], [float(p.length[0]), 0.0, 0.0]],
+        axis=axis,
+        tip_position=float(p.length[1]) * along,
+        **fields,
+    )
+
+
+@pytest.mark.parametrize("payload", [0.0, 0.8])
+def test_two_link_in_space_is_the_planar_one(payload):
+    flat, arm = dataclasses.replace(TWO_LINK, payload=payload), two_link_in_space(payload=payload)
+    q, v, u = jnp.asarray(np.random.default_rng(3).normal(size=(3, 2)))
+    np.testing.assert_allclose(arm.mass_matrix(q), flat.mass_matrix(q), rtol=1e-12)
+    np.testing.assert_allclose(arm.coriolis(q, v, u), flat.coriolis(q, v, u), rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(arm.gravity(q), flat.gravity(q), rtol=1e-12)
+    np.testing.assert_allclose(arm.skeleton(q)[:, [0, 2]], flat.skeleton(q), atol=1e-13)
+
+
+def test_derivatives_by_inertial_parameters_are_finite_differences():
+    arm = random_arm(3, 5)
+    q, v, a = jnp.asarray(np.random.default_rng(5).normal(size=(3, 3)))
+
+    @jax.jit
+    def torque(mass, centre, inertia):
+        other = dataclasses.replace(arm, mass=mass, centre=centre, inertia=inertia)
+        return other.mass_matrix(q) @ a + other.coriolis(q, v, v) + other.gravity(q)
+
+    point = (arm.mass, arm.centre, arm.inertia)
+    slopes = jax.jit(jax.jacfwd(torque, argnums=(0, 1, 2)))(*point)
+    for k, (x, slope) in enumerate(zip(point, slopes, strict=True)):
+        for index in np.ndindex(x.shape):
+            ends = [torque(*point[:k], x.at[index].add(h), *point[k + 1 :]) for h in (1e-5, -1e-5)]
+            np.testing.assert_allclose(slope[(slice(None), *index)], (ends[0] - ends[1]) / 2e-5, atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------------- in the closed loop
+
+
+def scenario_with(plant, **parts) -> ij.Scenario:
+    return dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), plant=plant, model=two_link_in_space(), **parts)
+
+
+def accelerations(scenario, t: float) -> np.ndarray:
+    scenario = canonical(scenario)
+    state = initial_state(scenario)._replace(dq=jnp.asarray([0.3, -0.4]))
+    return np.asarray(evaluate(scenario, jnp.asarray(t), state)[0].dq)
+
+
+def test_friction_of_the_joints_acts_on_the_plant():
+    plain = accelerations(scenario_with(two_link_in_space()), 0.0)
+    damped = accelerations(scenario_with(two_link_in_space(damping=[0.5, 0.2], friction=0.1)), 0.0)
+    dq = np.array([0.3, -0.4])
+    M = np.asarray(two_link_in_space().mass_matrix(jnp.asarray([0.8, 0.8])))
+    np.testing.assert_allclose(M @ (damped - plain), -(np.array([0.5, 0.2]) * dq + 0.1 * np.tanh(dq / 0.05)), atol=1e-12)
+
+
+def test_a_load_is_picked_up():
+    load = {"mass": 1.2, "centre": [0.0, 0.0, 0.1], "inertia": [0.01, 0.02, 0.015, 0.0, 0.0, 0.0]}
+    without, held = two_link_in_space(), two_link_in_space(carried=Payload(**load))
+    picked = two_link_in_space(carried=Payload(**load, start=1.0, rise=0.2))
+    q = jnp.asarray([0.4, 0.5])
+    np.testing.assert_allclose(picked.mass_matrix(q), without.mass_matrix(q))
+    np.testing.assert_allclose(picked.at(jnp.asarray(0.9)).mass_matrix(q), without.mass_matrix(q))
+    np.testing.assert_allclose(picked.at(jnp.asarray(1.3)).mass_matrix(q), held.mass_matrix(q))
+    half = 0.5 * (without.mass_matrix(q) + held.mass_matrix(q))
+    np.testing.assert_allclose(picked.at(jnp.asarray(1.1)).mass_matrix(q), half, rtol=1e-12)
+    for t, same in ((0.5, without), (2.0, held)):
+        np.testing.assert_allclose(accelerations(scenario_with(picked), t), accelerations(scenario_with(same), t), rtol=1e-12)
+
+
+def test_the_model_does_not_know_when():
+    picked = two_link_in_space(carried=Payload(mass=1.2, start=1.0))
+    scenario = canonical(dataclasses.replace(scenario_with(picked), model=picked))
+    state = initial_state(scenario)
+    before, after = (evaluate(scenario, jnp.asarray(t), state)[1] for t in (0.5, 3.0))
+    np.testing.assert_allclose(after.gravity, before.gravity)
+    assert np.max(np.abs(after.disturbance - before.disturbance)) > 0.1, "what is picked up is in f"
+
+
+SHORT_RUN = {"duration": 0.1, "dt": 1e-3}
+
+
+def test_runs_as_the_planar_robot_does():
+    planar = dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), plant=TWO_LINK, model=TWO_LINK)
+    run, other = ij.simulate(scenario_with(two_link_in_space()), **SHORT_RUN), ij.simulate(planar, **SHORT_RUN)
+    np.testing.assert_allclose(run.q, other.q, atol=1e-11)
+    np.testing.assert_allclose(run.tau, other.tau, atol=1e-7)
+
+
+@pytest.mark.parametrize("backend", ["xla", "native"])
+def test_batches_of_arms_agree_with_single_runs(backend):
+    scenario = scenario_with(two_link_in_space())
+    study = ij.monte_carlo(
+        scenario,
+        {"plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)), "plant.joint[0].damping": ij.value(ij.uniform(0.0, 0.5))},
+        runs=3,
+        seed=0,
+        backend=backend,
+        **SHORT_RUN,
+    )
+    for i in range(3):
+        values = {path: np.asarray(x)[i] for path, x in study.samples.items()}
+        alone = ij.simulate(ij.with_parameters(scenario, values), **SHORT_RUN)
+        np.testing.assert_allclose(study.metrics["rmse"][i], alone.metrics["rmse"], rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------------------ names and checks
+
+
+def test_rows_have_names():
+    arm = ij.robots.load(ARMS / "ur5.urdf")
+    scenario = scenario_with(two_link_in_space(links=("upper arm", "fore/arm"), joints=("shoulder", "elbow")))
+    assert float(ij.paths.get(scenario, "plant.link[fore/arm].mass")) == float(scenario.plant.mass[1])
+    changed = ij.with_parameters(scenario, {"plant.link[fore/arm].centre[2]": 0.3, "plant.joint[elbow].damping": 0.7})
+    assert float(changed.plant.centre[1, 2]) == 0.3
+    assert float(changed.plant.damping[1]) == 0.7
+    both = ij.with_parameters(dataclasses.replace(scenario, model=scenario.plant), {"robot.link[0].mass": 3.0})
+    assert float(both.plant.mass[0]) == float(both.model.mass[0]) == 3.0
+    listed = {p.path: p for p in ij.parameters(scenario)}
+    assert listed["plant.link[fore/arm].mass"].unit == "kg"
+    assert listed["plant.joint[shoulder].axis"].shape == (3,)
+    assert not any("[elbow]" in p.path for p in ij.parameters(scenario, named=False))
+    assert ij.paths.sign_at(scenario, "plant.link[1].mass") == "nonnegative"
+    assert ij.paths.unit_at(scenario, "plant.joint[elbow].damping") == "N m s/rad"
+    assert ij.paths.sign_at(scenario, "plant.joint[elbow].effort") == "positive"
+    assert ij.parameters(dataclasses.replace(scenario, plant=two_link_in_space())), arm
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "plant.link[forearms].mass",
+        "plant.link[9].mass",
+        "plant.link[link1].damping",
+        "plant.link[link1]",
+        "plant.link",
+        "plant[link1].mass",
+    ],
+)
+def test_unknown_rows_are_refused(path):
+    with pytest.raises(ValueError, match="expected the path of a leaf"):
+        ij.paths.get(scenario_with(two_link_in_space()), path)
+
+
+def test_a_name_that_is_nearly_right_is_suggested():
+    with pytest.raises(ValueError, match=r"plant\.link\[link1\]\.mass"):
+        ij.paths.get(scenario_with(two_link_in_space()), "plant.link[link7].mass")
+
+
+def test_two_names_for_one_number_overlap():
+    with pytest.raises(ValueError, match="do not overlap"):
+        ij.monte_carlo(
+            scenario_with(two_link_in_space()),
+            {"plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)), "plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))},
+            runs=2,
+            seed=0,
+            **SHORT_RUN,
+        )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"centre": np.zeros((3, 3))}, "Arm.centre"),
+        ({"inertia": np.zeros((2, 3))}, "Arm.inertia"),
+        ({"axis": np.zeros((2, 3))}, "Arm.axis"),
+        ({"kinds": ("revolute", "helical")}, "Arm.kinds"),
+        ({"links": ("a", "a")}, "Arm.links"),
+        ({"lower": 1.0, "upper": 0.0}, "Arm.lower"),
+        ({"mass": [1.0, -1.0]}, "Arm.mass"),
+        ({"carried": 3.0}, "Arm.carried"),
+        ({"lower": np.nan}, "Arm.lower"),
+    ],
+)
+def test_fields_that_do_not_fit_are_refused(fields, message):
+    arm = two_link_in_space()
+    kept = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
+    with pytest.raises(ValueError, match=message):
+        Arm(**{**kept, **fields})
+
+
+def test_scenario_files_hold_arms(tmp_path):
+    scenario = scenario_with(two_link_in_space(carried=Payload(mass=0.5, start=1.0), upper=[1.0, np.inf], lower=-3.0))
+    ij.save_scenario(scenario, tmp_path / "arm.toml")
+    again = ij.load_scenario(tmp_path / "arm.toml")
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,0 +1,391 @@
+"""Arms from files: what is read, which chain is picked, and that no file, however bad, does more than raise a ValueError."""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import os
+import re
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm_cases import ARMS, as_mjcf, dynamics_of, random_arm, without_constraints
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import iblf_jax as ij
+from iblf_jax.robots import description
+
+mujoco = pytest.importorskip("mujoco")
+
+SOLID = '<inertial><origin xyz="0 0 0.1"/><mass value="1.5"/><inertia ixx="0.02" iyy="0.03" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+LIMIT = '<limit lower="-1" upper="2" effort="7" velocity="1"/>'
+
+
+def link(name: str, inside: str = SOLID) -> str:
+    return f'<link name="{name}">{inside}</link>'
+
+
+def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT) -> str:
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}<origin xyz="0 0 0.2" rpy="0.3 0 0"/><axis xyz="0 1 0"/>{inside}</joint>'
+
+
+def robot(*parts: str) -> str:
+    return f'<robot name="r">{"".join(parts)}</robot>'
+
+
+GRIPPER = (
+    *(link("base", ""), link("upper"), link("fore"), link("tool", ""), link("left"), link("right")),
+    joint("shoulder", "base", "upper", inside=LIMIT + '<dynamics damping="0.4" friction="0.2"/>'),
+    joint("elbow", "upper", "fore", "continuous", ""),
+    joint("flange", "fore", "tool", "fixed", ""),
+    joint("finger", "tool", "left", "prismatic", '<limit lower="0" upper="0.04" effort="3" velocity="1"/>'),
+    joint(
+        "other",
+        "tool",
+        "right",
+        "prismatic",
+        '<limit lower="0" upper="0.04" effort="3" velocity="1"/><mimic joint="finger" multiplier="2"/>',
+    ),
+)
+"""Two joints, and a gripper with a finger that follows the other."""
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text: str, name: str = "arm.urdf") -> Path:
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+# ---------------------------------------------------------------------------------------------------------------- what is read
+
+
+def test_names_limits_and_friction(file):
+    arm = ij.robots.load(file(robot(*GRIPPER)), tip="tool")
+    assert arm.links == ("upper", "fore")
+    assert arm.joints == ("shoulder", "elbow")
+    assert arm.kinds == ("revolute", "revolute")
+    np.testing.assert_allclose(arm.damping, [0.4, 0.0])
+    np.testing.assert_allclose(arm.friction, [0.2, 0.0])
+    np.testing.assert_allclose(arm.effort, [7.0, np.inf])
+    np.testing.assert_allclose(arm.limits.lower, [-1.0, -np.inf])
+    np.testing.assert_allclose(arm.limits.upper, [2.0, np.inf])
+    np.testing.assert_allclose(arm.mass, [1.5, 4.5])
+    np.testing.assert_allclose(arm.g, [0, 0, -9.81])
+
+
+def test_seven_joints_without_a_tip():
+    arm = ij.robots.load(ARMS / "iiwa14.urdf")
+    assert arm.n == 7
+    assert arm.joints == tuple(f"iiwa_joint_{i}" for i in range(1, 8))
+    np.testing.assert_allclose(arm.limits.upper[0], 2.96705972839)
+
+
+def test_locked_joints_keep_their_links(file):
+    """A mimic follows the joint that is locked, and the whole has the dynamics of a file with that joint fixed there."""
+    arm = ij.robots.load(file(robot(*GRIPPER)), tip="tool", locked={"finger": 0.03})
+    fixed = []
+    for name, child, along in (("finger", "left", 0.03), ("other", "right", 0.06)):
+        place = f'xyz="0 {along * np.cos(0.3)} {0.2 + along * np.sin(0.3)}"'
+        fixed.append(joint(name, "tool", child, "fixed", "").replace('xyz="0 0 0.2"', place))
+    same = ij.robots.load(file(robot(*GRIPPER[:-2], *fixed)), tip="tool")
+    for name in ("mass", "centre", "inertia", "position", "tip_position"):
+        np.testing.assert_allclose(getattr(arm, name), getattr(same, name), atol=1e-12)
+
+
+def test_a_joint_of_the_chain_can_be_locked(file):
+    arm = ij.robots.load(file(robot(*GRIPPER)), tip="tool", locked={"elbow": 0.5})
+    assert arm.joints == ("shoulder",)
+    np.testing.assert_allclose(arm.mass, [6.0])
+
+
+def test_the_base_is_the_world_and_gravity_turns_with_it(file):
+    whole = ij.robots.load(file(robot(*GRIPPER)), tip="tool")
+    part = ij.robots.load(file(robot(*GRIPPER)), base="upper", tip="tool")
+    assert part.joints == ("elbow",)
+    np.testing.assert_allclose(part.g, [0, -9.81 * np.sin(0.3), -9.81 * np.cos(0.3)], atol=1e-12)
+    q = np.array([0.0, 0.7])
+    np.testing.assert_allclose(part.gravity(q[1:]), whole.gravity(q)[1:], atol=1e-12)
+
+
+def test_gravity_can_be_given(file):
+    np.testing.assert_allclose(ij.robots.load(file(robot(*GRIPPER)), tip="tool", gravity=[1.62, 0, 0]).g, [1.62, 0, 0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mjcf_gives_the_arm_that_it_was_written_from(seed, file):
+    arm = random_arm(4, seed, armature=[0.1, 0.0, 0.3, 0.2])
+    again = ij.robots.load(file(as_mjcf(arm)), tip="tip")
+    q = np.random.default_rng(seed).normal(size=4)
+    np.testing.assert_allclose(again.mass_matrix(q), arm.mass_matrix(q), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(again.tip(q), arm.tip(q), atol=1e-12)
+    np.testing.assert_allclose(again.pose(q).rotation, arm.pose(q).rotation, atol=1e-12)
+    assert again.links == arm.links
+
+
+MJCF = """<mujoco><compiler angle="degree"/>
+<default><joint damping="1"/><default class="a"><joint armature="0.1" range="-90 90"/></default></default>
+<worldbody><body name="b0" pos="0 0 .1"><body name="b1" pos="0 0 1" euler="0 30 0" childclass="a">
+  <joint name="j1" axis="0 0 1" ref="20"/><geom type="capsule" size=".02" mass=".3" fromto="0 0 0 0 0 .3"/>
+  <joint name="j1b" axis="0 1 0" pos="0 0 0.05"/>
+  <body name="b2" pos="0 0 .3"><joint name="j2" axis="0 1 0" type="slide" range="-.1 .2" actuatorfrcrange="-5 6" frictionloss=".3"/>
+    <inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .01"/><geom type="mesh" mesh="nowhere"/>
+    <site name="ee" pos="0 0 .2" euler="0 90 0"/>
+    <body name="f1" pos=".1 0 0">{finger}<geom type="box" size=".01 .01 .01" mass="0.2"/></body>
+  </body></body></body></worldbody>
+<actuator><motor joint="j1" gear="10" ctrlrange="-3 2"/><position joint="j1b" gear="2" forcerange="-7 7"/></actuator></mujoco>"""
+
+
+def test_mjcf_with_classes_references_and_two_hinges_in_a_body(file):
+    arm = ij.robots.load(file(MJCF.format(finger='<joint name="jf" axis="1 0 0"/>')), tip="ee")
+    assert arm.links == ("b1:j1", "b1", "b2")
+    assert arm.kinds == ("revolute", "revolute", "prismatic")
+    np.testing.assert_allclose(arm.effort, [20.0, 14.0, 5.0])
+    np.testing.assert_allclose(arm.friction, [0, 0, 0.3])
+    np.testing.assert_allclose(arm.damping, 1.0)
+    plain = MJCF.format(finger="").replace('<geom type="mesh" mesh="nowhere"/>', "")
+    model = without_constraints(mujoco.MjModel.from_xml_string(plain))
+    q, v = np.array([0.3, -0.4, 0.1]), np.array([1.0, -2.0, 0.5])
+    M, bias = dynamics_of(model, q, v)
+    np.testing.assert_allclose(arm.mass_matrix(q), M, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(arm.coriolis(q, v, v) + arm.gravity(q), bias, rtol=1e-9, atol=1e-12)
+
+
+def test_mjcf_that_includes_another_file(file):
+    main = MJCF.format(finger="").replace("<worldbody>", '<include file="more.xml"/><worldbody>')
+    file("<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>", "more.xml")
+    assert ij.robots.load(file(main), tip="ee").n == 3
+    file('<mujoco><include file="more.xml"/></mujoco>', "more.xml")
+    with pytest.raises(ValueError, match="include itself"):
+        ij.robots.load(file(main), tip="ee")
+
+
+# ----------------------------------------------------------------------------------------------------------------- bad files
+
+PLAIN = (link("base", ""), link("a"), link("b"))
+CHAIN = (joint("ja", "base", "a"), joint("jb", "a", "b"))
+MASS_ONLY = '<inertial><mass value="1"/></inertial>'
+WEIGHTLESS = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+
+
+def bad_inertia(text: str) -> str:
+    return robot(link("base", ""), link("a", SOLID.replace('ixx="0.02" iyy="0.03" izz="0.01"', text)), joint("ja", "base", "a"))
+
+
+BAD = {
+    "no inertia": (robot(link("base", ""), link("a", MASS_ONLY), joint("ja", "base", "a")), "link 'a'.*no <inertia>"),
+    "zero inertia": (bad_inertia('ixx="0" iyy="0" izz="0"'), "link 'a'.*positive definite"),
+    "indefinite inertia": (bad_inertia('ixx="0.02" iyy="-0.03" izz="0.01"'), "link 'a'.*positive definite"),
+    "impossible inertia": (bad_inertia('ixx="0.02" iyy="0.09" izz="0.01"'), "link 'a'.*sum of the two others"),
+    "missing moment": (bad_inertia('ixx="0.02" iyy="0.09"'), "link 'a': inertia izz"),
+    "nan": (bad_inertia('ixx="nan" iyy="0.09" izz="0.01"'), "link 'a': inertia ixx.*finite"),
+    "inertia without mass": (robot(link("base", ""), link("a", WEIGHTLESS), joint("ja", "base", "a")), "link 'a'.*without a mass"),
+    "negative mass": (robot(link("base", ""), link("a", SOLID.replace("1.5", "-1.5")), joint("ja", "base", "a")), "link 'a': mass"),
+    "no mass that moves": (robot(link("base", ""), link("a", ""), link("b"), *CHAIN), "'a'"),
+    "no mass at the end": (robot(link("base", ""), link("a"), link("b", ""), *CHAIN), "'b'"),
+    "mimic": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", inside=LIMIT + '<mimic joint="ja"/>')), "joint 'jb'.*mimic"),
+    "mimic of nothing": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", inside=LIMIT + '<mimic joint="x"/>')), "joint 'jb': mimic"),
+    "two parents": (robot(*PLAIN, *CHAIN, joint("jc", "base", "b")), "link 'b'.*two parents"),
+    "ring": (robot(*PLAIN, joint("ja", "b", "a"), joint("jb", "a", "b")), "ring of joints"),
+    "two roots": (robot(*PLAIN, CHAIN[0]), "links without a parent: 'base', 'b'"),
+    "unknown parent": (robot(*PLAIN, CHAIN[0], joint("jb", "x", "b")), "joint 'jb': parent"),
+    "no child": (robot(*PLAIN, CHAIN[0], '<joint name="jb" type="fixed"><parent link="a"/></joint>'), "joint 'jb': child"),
+    "two links of a name": (robot(*PLAIN, link("a"), *CHAIN), "link 'a'.*two of this name"),
+    "two joints of a name": (robot(*PLAIN, CHAIN[0], joint("ja", "a", "b")), "joint 'ja'.*two of this name"),
+    "unnamed link": (robot(link("")), "<link>"),
+    "floating": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", "floating")), "joint 'jb': type.*serial"),
+    "no type": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", "")), "joint 'jb': type"),
+    "no range": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", inside="")), "joint 'jb': limit"),
+    "empty range": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", inside='<limit lower="1" upper="1"/>')), "joint 'jb': limit"),
+    "no axis": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b").replace("0 1 0", "0 0 0")), "joint 'jb': axis"),
+    "short vector": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b").replace("0 1 0", "0 1")), "joint 'jb': axis.*3 numbers"),
+    "negative damping": (robot(*PLAIN, CHAIN[0], joint("jb", "a", "b", inside=LIMIT + '<dynamics damping="-1"/>')), "joint 'jb': damping"),
+    "nothing that moves": (robot(link("base"), link("a"), joint("ja", "base", "a", "fixed", "")), "end at: none"),
+    "two ends": (robot(*PLAIN, CHAIN[0], joint("jb", "base", "b")), "'a', 'b'"),
+    "no links": ("<robot/>", "no <link>"),
+    "macro": ('<robot xmlns:xacro="x"><xacro:arm/></robot>', "xacro"),
+    "sdf": ("<sdf><model/></sdf>", "It is SDF"),
+    "another document": ("<html/>", "root element is <html>"),
+    "malformed": ("<robot><link name='a'></robot>", "line 1 of.*malformed"),
+    "no XML": ("solid arm", "malformed"),
+    "empty": ("", "malformed"),
+    "bomb": ('<!DOCTYPE x [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>', "entities"),
+    "external entity": ('<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/hostname">]><robot>&a;</robot>', "entities"),
+    "deep": ("<robot>" + "<a>" * 5000 + "</a>" * 5000 + "</robot>", "levels"),
+    "many elements": ("<robot>" + "<a/>" * 200_000 + "</robot>", "elements"),
+    "many links": (robot(*(link(f"l{i}", "") for i in range(2000))), "2000 links"),
+}  # fmt: skip
+
+SPHERE = '<geom size="0.1" mass="1"/>'
+
+
+def mjcf(inside: str, outside: str = "") -> str:
+    return f'<mujoco><worldbody><body name="a"><joint name="ja"/>{SPHERE}{inside}</body></worldbody>{outside}</mujoco>'
+
+
+BAD_MJCF = {
+    "no bodies": ("<mujoco/>", "no <body>"),
+    "ball": (mjcf(f'<body name="b"><joint name="jb" type="ball"/>{SPHERE}</body>'), "joint 'jb'.*ball"),
+    "free": (f'<mujoco><worldbody><body name="a"><freejoint name="f"/>{SPHERE}</body></worldbody></mujoco>', "joint 'f'.*free"),
+    "mesh": (mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>'), "body 'b'.*mesh"),
+    "no mass": (mjcf('<body name="b"><joint/></body>'), "'b'"),
+    "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness"),
+    "connect": (
+        mjcf(f'<body name="b"><joint/>{SPHERE}</body>', '<equality><connect name="c" body1="a" body2="b" anchor="0 0 0"/></equality>'),
+        "equality 'c'.*tied together",
+    ),
+    "weld": (mjcf("", '<equality><weld name="c" body1="a"/></equality>'), "equality 'c'.*tied together"),
+    "coupled": (mjcf("", '<equality><joint name="c" joint1="ja"/></equality>'), "equality 'c'.*'ja' tied"),
+    "replicate": ('<mujoco><worldbody><replicate count="1000000000"><body/></replicate></worldbody></mujoco>', "replicate"),
+    "repeated": (mjcf(f'<body name="a">{SPHERE}</body>'), "repeated name 'a'"),
+    "infinite": (mjcf(f'<body name="b" pos="0 inf 0">{SPHERE}</body>'), "body 'b': pos.*finite"),
+    "no such include": ('<mujoco><include file="nowhere.xml"/></mujoco>', "nowhere.xml"),
+}
+
+
+@pytest.mark.parametrize("name", [*BAD, *BAD_MJCF])
+def test_bad_files_are_refused_by_name(name, file):
+    text, message = {**BAD, **BAD_MJCF}[name]
+    path = file(text)
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match=message):
+        ij.robots.load(path)
+    assert time.perf_counter() - start < 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"base": "bases"}, "base: got 'bases'.*'base'"),
+        ({"tip": "tol"}, "tip: got 'tol'.*'tool'"),
+        ({"tip": "base"}, "expected a chain with a joint that moves"),
+        ({"base": "left", "tip": "upper"}, "expected a link beyond the base 'left'"),
+        ({"tip": "left"}, "joint 'other'.*mimic of 'finger'"),
+        ({"tip": "tool", "locked": {"elbows": 0.0}}, "locked: got 'elbows'.*'elbow'"),
+        ({"tip": "tool", "locked": {"elbow": np.nan}}, r"locked\['elbow'\]"),
+        ({"tip": "tool", "gravity": 9.81}, "gravity"),
+        ({}, "Chains beyond 'base' end at: 'left', 'right'"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message, file):
+    with pytest.raises(ValueError, match=message):
+        ij.robots.load(file(robot(*GRIPPER)), **arguments)
+
+
+def test_paths_that_are_no_files(tmp_path):
+    for path, message in (
+        (tmp_path / "x.urdf", "Nothing is there"),
+        (tmp_path, "a directory"),
+        (3, "the path of"),
+        ("", "directory|Nothing"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ij.robots.load(path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="not a file"):
+        ij.robots.load(tmp_path / "pipe")
+
+
+def test_a_gigabyte_is_not_read(tmp_path):
+    path = tmp_path / "big.urdf"
+    with path.open("wb") as big:
+        big.truncate(1 << 30)
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match="at most 8 MiB"):
+        ij.robots.load(path)
+    assert time.perf_counter() - start < 1.0
+
+
+def test_without_the_extra_the_message_says_how(monkeypatch, file):
+    plain = builtins.__import__
+
+    def missing(name, *rest, **more):
+        if name == "mujoco":
+            raise ImportError(name)
+        return plain(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(ImportError, match=r"iblf_jax\[robots\]"):
+        ij.robots.load(ARMS / "ur5.urdf")
+
+
+# ------------------------------------------------------------------------------------------------------------- mutated files
+
+SOURCES = [(ARMS / "ur5.urdf").read_text(), robot(*GRIPPER), MJCF.format(finger='<joint name="jf" axis="1 0 0"/>')]
+NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
+VALUES = ["nan", "inf", "-1", "0", "1e308", "1e-308", "1e400", "", "abc", "0 0", "1 2 3 4 5", "9" * 400, "1e9", "-1e-3", "true"]
+
+
+@st.composite
+def mutated(draw) -> bytes:
+    """A description with bytes, numbers, passages or elements changed, lost, doubled or moved."""
+    text = draw(st.sampled_from(SOURCES))
+    for _ in range(draw(st.integers(1, 3))):
+        kind, place = draw(st.sampled_from(["bytes", "number", "passage", "element"])), draw(st.integers(0, len(text) - 1))
+        if kind == "bytes":
+            text = text[:place] + draw(st.text(max_size=3)) + text[place + 1 :]
+        elif kind == "number":
+            found = list(NUMBER.finditer(text))
+            if found:
+                one = found[place % len(found)]
+                text = text[: one.start()] + draw(st.sampled_from(VALUES)) + text[one.end() :]
+        elif kind == "passage":
+            passage = text[place : place + draw(st.integers(1, 200))]
+            target = draw(st.integers(0, len(text) - 1))
+            text = text.replace(passage, "", 1) if draw(st.booleans()) else text[:target] + passage + text[target:]
+        else:
+            text = _element_changed(draw, text, place)
+        text = text or " "
+    return text.encode("utf-8", "replace")
+
+
+def _element_changed(draw, text: str, place: int) -> str:
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError:
+        return text
+    elements = list(root.iter())
+    parents = {child: parent for parent in elements for child in parent}
+    if not parents:
+        return text
+    one, other = elements[1 + place % (len(elements) - 1)], draw(st.sampled_from(elements))
+    what = draw(st.sampled_from(["lost", "doubled", "moved", "exchanged"]))
+    if what == "lost":
+        parents[one].remove(one)
+    elif what == "doubled":
+        parents[one].append(one)
+    elif what == "moved" and one not in other.iter() and other not in one.iter():
+        parents[one].remove(one)
+        other.append(one)
+    elif what == "exchanged" and one.attrib:
+        name = draw(st.sampled_from(sorted(one.attrib)))
+        one.set(name, draw(st.sampled_from(VALUES + [x.get(name, "") for x in elements])))
+    return ET.tostring(root, encoding="unicode")
+
+
+@pytest.mark.filterwarnings("ignore:Inertia matrix is too close to singular")
+@settings(max_examples=400)
+@given(data=mutated())
+def test_mutated_files_load_or_are_refused(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "mutated.xml"
+    path.write_bytes(data)
+    start = time.perf_counter()
+    with contextlib.suppress(ValueError):
+        assert np.all(np.isfinite(np.asarray(ij.robots.load(path).mass)))
+    assert time.perf_counter() - start < 5.0
+
+
+def test_nothing_is_written_and_limits_are_stated(file, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="mjMINVAL"):
+        ij.robots.load(file(mjcf('<body name="b"><joint/></body>')))
+    assert {p.name for p in tmp_path.iterdir()} == {"arm.urdf"}
+    assert description.LARGEST < 1 << 30
