@@ -14,10 +14,12 @@ from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.pytree import Leaf, component, leaf
 from iblf_jax.references import Reference
+from iblf_jax.robots import Robot
 
 
 class Side(Protocol):
@@ -84,6 +86,33 @@ class Bounds:
         """Raises ValueError for a side that is not one."""
         for name in ("lower", "upper"):
             checks.conforms(f"Bounds.{name}", getattr(self, name), Side, "A constant bound is iblf_jax.bounds.Constant(value).")
+
+
+def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = None) -> Bounds:
+    """Constant bounds at a robot's joint limits.
+
+        lower + margin < q < upper - margin
+
+    Args:
+      robot: one with `limits`, such as `iblf_jax.robots.Arm`.
+      margin: distance that is kept from the limits [rad].
+      unlimited: bounds of joints without limits, -unlimited and unlimited [rad].
+
+    Raises:
+      ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a margin that leaves nothing.
+    """
+    if not hasattr(robot, "limits"):
+        raise checks.fail("robot", type(robot).__name__, "a robot with joint limits, such as an Arm", "Give bounds of your own.")
+    sides = []
+    for side, sign in zip(robot.limits, (1.0, -1.0), strict=True):
+        if checks.is_concrete(side) and not np.all(np.isfinite(side)) and unlimited is None:
+            raise checks.fail("robot.limits", side, "limits on every joint", "Say what to use where there are none: unlimited=6.3.")
+        far = -sign * (unlimited if unlimited is not None else 0.0)
+        sides.append(jnp.where(jnp.isfinite(side), side + sign * margin, far))
+    lower, upper = sides
+    if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
+        raise checks.fail("margin", margin, "a margin that leaves room between the limits", f"The narrowest range is {float(np.min(np.diff(robot.limits, axis=0))):g} rad.")
+    return Bounds(lower=Constant(lower), upper=Constant(upper))
 
 
 class Tube(NamedTuple):

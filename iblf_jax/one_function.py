@@ -25,8 +25,11 @@ LARGEST = 1 << 13
 """Entries of the largest array of floating-point numbers that is computed inside.  (Records may be of any length: they are stacked and
 copied, not computed.)"""
 
-LONG = 4000
+LONG = 2500
 """Operations of one evaluation of the closed loop from which on it is a piece of its own."""
+
+LONGEST = 60_000
+"""Operations of a function above which the compiler takes minutes over it as one machine function."""
 
 REFUSED = frozenset(
     {
@@ -73,7 +76,8 @@ def as_one_function(function: Callable) -> Callable:
     def traced(*args):
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         call = jaxpr_as_fun(closed)
-        if jax.default_backend() == "cpu" and all(map(_is_trusted, _operations(closed.jaxpr))):
+        operations = list(_operations(closed.jaxpr))
+        if jax.default_backend() == "cpu" and len(operations) <= LONGEST and all(map(_is_trusted, operations)):
             call = set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(call))
         return jax.tree.unflatten(jax.tree.structure(shapes), call(*jax.tree.leaves(args)))
 

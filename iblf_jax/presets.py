@@ -10,6 +10,10 @@ import numpy as np
 
 from iblf_jax import bounds as bounds_
 from iblf_jax import checks, disturbances, references
+from iblf_jax.arms import arm as arm
+from iblf_jax.arms import arm_scenario as arm_scenario
+from iblf_jax.arms import iiwa14 as iiwa14
+from iblf_jax.arms import ur5 as ur5
 from iblf_jax.controllers import LAWS as LAWS
 from iblf_jax.controllers import Saturated, law_by_name
 from iblf_jax.controllers.systems import observer_of
@@ -150,5 +154,7 @@ PRESETS: dict[str, Callable[..., Scenario]] = {
     "printed_gap": printed_gap,
     "zhang_yan_2024_saturated": zhang_yan_2024_saturated,
     "zhang_yan_2024_funnel": zhang_yan_2024_funnel,
+    "ur5": ur5,
+    "iiwa14": iiwa14,
 }
 """Every preset by name."""

@@ -165,6 +165,8 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
 
     Records are stacked every `record_every` steps; with None there are none, and memory does not grow with time.
     """
+    if _is_long(scenario, dt):
+        return run_compactly(scenario, folds, dt, steps=steps, record_every=record_every, method=method)
     advance_one = partial(advance, scenario, folds, method, dt)
 
     def recorded(carry, index):
@@ -199,11 +201,19 @@ _evaluate_once = jax.jit(evaluate)
 """`closed_loop.evaluate`, traced once however often it is called."""
 
 
-def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool) -> Outcome:
+def _is_long(scenario: Scenario, dt) -> bool:
+    """Whether the closed loop is for `run_compactly`."""
+    return is_long(_evaluate_once, scenario, jnp.zeros_like(dt), initial_state(scenario), dt)
+
+
+def run_compactly(
+    scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool = False
+) -> Outcome:
     """As `run`, for a closed loop of so many operations that compiling is what takes the time.
 
     The closed loop is there once, in a loop over the stages of the integrator, and once more where its modes are measured.  So the
-    sample at the end is that of a step that is not made, and the accumulators begin with the first sample.
+    sample at the end is that of a step that is not made, and the accumulators begin with the first sample.  `alone` says that nobody
+    will batch it from outside: then its pieces become machine functions.
     """
     piece = as_one_function if alone else lambda function: function
     every = record_every or 1
@@ -258,8 +268,8 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
 def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
     """`run`, compiled; `alone` says that nobody will batch it from outside, so that it may become one machine function."""
     options = {"steps": steps, "record_every": record_every, "method": method}
-    if is_long(_evaluate_once, scenario, jnp.zeros_like(dt), initial_state(scenario), dt):
-        return run_compactly(scenario, folds, dt, alone=alone, **options)
+    if alone and _is_long(scenario, dt):
+        return run_compactly(scenario, folds, dt, alone=True, **options)
     one = partial(run, **options)
     return (as_one_function(one) if alone else one)(scenario, folds, dt)
 

@@ -8,7 +8,7 @@ Written out in full, a file has one table a component, and `kind` names the memb
     ...
     [reference]  [bounds.lower]  [bounds.upper]  [disturbance]  [controller]  [controller.barrier]  [observer]  [initial]
 
-or it starts from a preset and changes what it must:
+or its robot is read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `robot_file`), or it starts from a preset and changes what it must:
 
     preset = "zhang_yan_2024"
     [arguments]                     # what the preset takes
@@ -43,6 +43,7 @@ from iblf_jax.paths import parameters, with_parameters
 from iblf_jax.plain import Words, as_table, decode_static, did_you_mean, known_keys, numbers
 from iblf_jax.presets import PRESETS
 from iblf_jax.pytree import astype
+from iblf_jax.robot_file import names_a_file, with_robots_read
 from iblf_jax.scenario import Scenario, check_values
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
@@ -88,7 +89,7 @@ def load_scenario(path: str | os.PathLike) -> Scenario:
 
 def load_scenario_file(path: str | os.PathLike) -> ScenarioFile:
     """Scenario and [run] table of a TOML file; raises as `load_scenario`."""
-    return from_dict(read_toml(path), source=os.fspath(path))
+    return from_dict(read_toml(path), source=os.fspath(path), folder=Path(path).parent)
 
 
 def read_toml(path: str | os.PathLike) -> dict[str, Any]:
@@ -188,20 +189,23 @@ def _equal(a: Any, b: Any) -> bool:
 # -------------------------------------------------------------------------------------------------------------- from tables
 
 
-def from_dict(data: dict[str, Any], source: str = "", *, other_tables: Iterable[str] = ()) -> ScenarioFile:
+def from_dict(
+    data: dict[str, Any], source: str = "", *, other_tables: Iterable[str] = (), folder: str | os.PathLike = ""
+) -> ScenarioFile:
     """Scenario and [run] table from the tables of a file.
 
     Args:
       data: tables as read from TOML.
       source: name of the file, for messages.
       other_tables: names of further tables that the caller reads himself (a sweep's, say).
+      folder: of the file, which the paths of robots' files are relative to.
 
     Raises:
       ValueError: anything that does not fit; the message names source, dotted key and mend.
     """
     try:
         data = {key: value for key, value in as_table(data, "file").items() if key not in set(other_tables)}
-        scenario = _from_preset(data) if "preset" in data else _from_components(data)
+        scenario = _from_preset(data) if "preset" in data else _from_components(data, folder)
         if "dtype" in data:
             scenario = astype(scenario, _dtype(data["dtype"]))
         changes = _flat(as_table(data.get("parameters", {}), "parameters"), "")
@@ -211,19 +215,21 @@ def from_dict(data: dict[str, Any], source: str = "", *, other_tables: Iterable[
         raise ValueError(f"{source}: {error}" if source else str(error)) from error
 
 
-def _from_components(data: dict[str, Any]) -> Scenario:
+def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenario:
     known_keys(data, "", (*COMPONENTS, "preset", "parameters", "run", "dtype"))
     tables = {key: value for key, value in data.items() if key in COMPONENTS}
+    for other in ("plant", "model"):
+        if "robot" in tables and other in tables:
+            raise checks.fail(
+                other, Words("this table beside [robot]"), "[robot] alone, or [plant] and [model]", f"Rename [robot] to [{_OTHER[other]}]."
+            )
+    if names_a_file(tables):
+        tables = with_robots_read(tables, folder)
     robot = tables.pop("robot", None)
     if robot is None:
         if "plant" not in tables:
             raise checks.fail("robot", Words("nothing"), "a table [robot], or [plant] and [model]", "Add it, or start from preset = ...")
         return decode_fields(Scenario, tables, "")
-    for other in ("plant", "model"):
-        if other in tables:
-            raise checks.fail(
-                other, Words("this table beside [robot]"), "[robot] alone, or [plant] and [model]", f"Rename [robot] to [{_OTHER[other]}]."
-            )
     try:
         return decode_fields(Scenario, {"plant": robot, **tables}, "")
     except ValueError as error:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax import checks
 from iblf_jax.closed_loop import LoopState, initial_state, rate
 from iblf_jax.integrators import tableau
+from iblf_jax.one_function import as_one_function, is_long
 from iblf_jax.scenario import Initial, Scenario, canonical
 
 POWER_ITERATIONS = 48
@@ -83,14 +85,19 @@ def fastest_mode_by_differences(rate, x: jax.Array) -> jax.Array:
       rate: function of the state as one vector (m,) -> its rate (m,).
       x: the state.
     """
-    h = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.abs(x))
-    rates = jax.lax.map(lambda move: rate(x + move), jnp.concatenate([jnp.diag(h), -jnp.diag(h)]))
-    columns = (rates[: x.size] - rates[x.size :]) / (2.0 * h[:, None])
+    columns = jacobian_by_differences(rate, x)
 
     def iterate(growth, index):
         return _grown(growth, jnp.sum(columns * growth.direction[:, None], axis=0), index), None
 
     return growth_rate(jax.lax.scan(iterate, growth_start(x), jnp.arange(POWER_ITERATIONS))[0])
+
+
+def jacobian_by_differences(rate, x: jax.Array) -> jax.Array:
+    """The derivatives of `rate` at x, (m, m), one row an entry of x, by central differences, one evaluation at a time."""
+    h = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.abs(x))
+    rates = jax.lax.map(lambda move: rate(x + move), jnp.concatenate([jnp.diag(h), -jnp.diag(h)]))
+    return (rates[: x.size] - rates[x.size :]) / (2.0 * h[:, None])
 
 
 def stable_dt(mode: float, method: str) -> float:
@@ -135,10 +142,13 @@ def _jacobians(scenario: Scenario, times: jax.Array) -> jax.Array:
         tube = scenario.setting.tube(t)
         return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
 
-    def jacobian(t, state):
-        flat, unravel = ravel_pytree(state)
-        return jax.jacfwd(lambda x: ravel_pytree(rate(scenario, t, unravel(x)))[0])(flat)
+    def rate_at(t, x):
+        return ravel_pytree(rate(scenario, t, whole(x)))[0]
 
-    first = jacobian(times[0], initial_state(scenario))
-    rest = jax.vmap(lambda t: jacobian(t, along_reference(t)))(times)
-    return jnp.concatenate([first[None], rest])
+    start, whole = ravel_pytree(initial_state(scenario))
+    states = jnp.concatenate([start[None], jax.vmap(lambda t: ravel_pytree(along_reference(t))[0])(times)])
+    times = jnp.concatenate([times[:1], times])
+    if is_long(rate_at, times[0], start):
+        piece = as_one_function(rate_at)
+        return jax.lax.map(lambda at: jacobian_by_differences(partial(piece, at[0]), at[1]).T, (times, states))
+    return jax.vmap(lambda t, x: jax.jacfwd(partial(rate_at, t))(x))(times, states)

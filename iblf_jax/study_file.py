@@ -22,6 +22,7 @@ A draw names its kind (factor, offset or value), its distribution (uniform, norm
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from iblf_jax import checks, distributions
@@ -69,13 +70,13 @@ def load_study_file(path: str | os.PathLike, kind: str) -> StudyFile:
       ValueError: the file is not TOML or does not describe such a study; the message names file, key and mend.
       OSError: it cannot be read.
     """
-    return study_from_dict(read_toml(path), kind, os.fspath(path))
+    return study_from_dict(read_toml(path), kind, os.fspath(path), Path(path).parent)
 
 
-def study_from_dict(data: dict[str, Any], kind: str, source: str = "") -> StudyFile:
+def study_from_dict(data: dict[str, Any], kind: str, source: str = "", folder: str | os.PathLike = "") -> StudyFile:
     """As `load_study_file`, from the tables of a file."""
     own = (kind, "perturbations", *(("grid",) if kind == "sweep" else ()))
-    file = from_dict(data, source, other_tables=own)
+    file = from_dict(data, source, other_tables=own, folder=folder)
     try:
         if "record_every" in file.run:
             raise checks.fail("run.record_every", file.run["record_every"], "nothing", "A study records no trajectories: leave it out.")

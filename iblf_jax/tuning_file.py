@@ -74,7 +74,7 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
       OSError: the file cannot be read.
     """
     data, source = read_toml(path), os.fspath(path)
-    file = from_dict(data, source=source, other_tables=TABLES)
+    file = from_dict(data, source=source, other_tables=TABLES, folder=Path(path).parent)
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
         goal = _objective(data.get("objective", []), data.get("requirement", []))

@@ -1,6 +1,6 @@
 """The layers of the package, held by its imports: they go down only.
 
-    6 outside     presets  scenario_file  io  codec  plain  plotting/  cli/  testing/
+    6 outside     presets  arms  robot_file  scenario_file  io  codec  plain  plotting/  cli/  testing/
     5 studies     _compare  _comparison  _monte_carlo  _sweep  tuning/
     4 judgement   certificates
     3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  rollout  lowering/
@@ -33,7 +33,7 @@ LAYERS = {
         *("_blocks", "_config", "_dataset", "_designs", "_draws", "_interrupt", "_points", "_progress", "_setup"),
         *("_statistics", "_summaries"),
     ),
-    6: ("presets", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
+    6: ("presets", "arms", "robot_file", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
 }
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
 

@@ -52,7 +52,7 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
 def test_long_loops_take_it(paper, monkeypatch):
     """By its length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)
-    monkeypatch.setattr(rollout, "is_long", lambda *args: True)
+    monkeypatch.setattr(rollout, "_is_long", lambda *args: True)
     rollout._run_compiled.clear_cache()
     try:
 

@@ -8,6 +8,7 @@ from iblf_jax.controllers.backstepping import Backstepping as Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque as ComputedTorque
 from iblf_jax.controllers.pd_gravity import PDGravity as PDGravity
 from iblf_jax.controllers.saturated import Saturated as Saturated
+from iblf_jax.controllers.saturated import within_effort as within_effort
 from iblf_jax.controllers.systems import LAWS as LAWS
 from iblf_jax.controllers.systems import law_by_name as law_by_name
 
@@ -32,4 +33,5 @@ __all__ = [
     "Saturated",
     "Setting",
     "law_by_name",
+    "within_effort",
 ]

@@ -10,10 +10,12 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.controllers._base import Command, Controller, Setting, State
 from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.robots import Robot
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
@@ -53,6 +55,27 @@ class Saturated:
         asked = command.tau
         tau = jnp.clip(asked, -self.limit, self.limit) if self.edge == "hard" else self.limit * _smooth_clip(asked / self.limit)
         return command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)), rate
+
+
+UNLIMITED = 1e6
+"""N m; the limit of a joint without one among others that have theirs: beyond any actuator."""
+
+
+def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Controller:
+    """A law within the largest torques of a robot: `Saturated` at its `effort`.
+
+    Args:
+      law: any.
+      robot: such as `iblf_jax.robots.Arm`; the law is returned as it is if the robot has no `effort`, or an infinite one on every joint.
+      edge: as `Saturated.edge`.
+
+    Raises:
+      ValueError: as `Saturated`.
+    """
+    effort = getattr(robot, "effort", jnp.inf)
+    if checks.is_concrete(effort) and not np.any(np.isfinite(effort)):
+        return law
+    return Saturated(law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge)
 
 
 def _smooth_clip(x: jax.Array) -> jax.Array:

@@ -9,9 +9,11 @@ Every function takes one run or a dict of runs by name (`overview`: one run) and
 shows when it is the value of a cell.  Runs may differ in length; of a batch, select a run first.
 """
 
+from iblf_jax.plotting._figures import errors as errors
 from iblf_jax.plotting._figures import joint as joint
 from iblf_jax.plotting._figures import paper_figures as paper_figures
 from iblf_jax.plotting._figures import phase_portrait as phase_portrait
+from iblf_jax.plotting._figures import positions as positions
 from iblf_jax.plotting._figures import save as save
 from iblf_jax.plotting._figures import torques as torques
 from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms

@@ -24,6 +24,8 @@ Runs = Rollout | Mapping[str, Rollout]
 
 ZOOM_SHARE = 0.1
 """The part of the time that the zoom shows if the caller does not say and the runs have no transient."""
+MOST_ZOOMED = 0.3
+"""The part of the time that it shows at most: more would magnify nothing."""
 
 
 class Row(NamedTuple):
@@ -39,7 +41,7 @@ def windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) ->
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves) or 1e-3
     if zoom is None:
         wanted = 2.5 * max(transient_end(curves, row.quantity, row.joint) for row in rows)
-        zoom = float(f"{max(wanted, 0.01 * end):.0e}") if wanted else ZOOM_SHARE * end
+        zoom = float(f"{min(max(wanted, 0.01 * end), MOST_ZOOMED * end):.0e}") if wanted else ZOOM_SHARE * end
     if isinstance(zoom, bool) or not isinstance(zoom, int | float | np.number) or not np.isfinite(zoom) or zoom <= 0:
         raise checks.fail("zoom", zoom, "a time > 0 [s]")
     return (0.0, end), (0.0, min(float(zoom), end))
@@ -102,6 +104,38 @@ def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
     joint = check_joint(curves, joint)
     rows = [Row(quantity, joint, quantity.label) for quantity in (QUANTITIES["q"], QUANTITIES["e1"])]
     return _rows_with_zoom(f"Position and tracking error of joint {joint}", curves, rows, zoom, 2.1)
+
+
+def positions(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Position q [rad] of every joint in its tube.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: no run, a batch, or a zoom that is no time.
+    """
+    return _every_joint("Position", runs, "q", zoom)
+
+
+def errors(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Relative error xi [1] of every joint between its walls: how near to its bounds it comes.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: no run, a batch, or a zoom that is no time.
+    """
+    return _every_joint("Error relative to the bounds", runs, "xi", zoom)
 
 
 def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:

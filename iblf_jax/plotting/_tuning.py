@@ -35,8 +35,10 @@ def tuning(result: TuneResult, *, landscape: tuple[str, str] | None = None, poin
     Source: design of this package.
     """
     n = result.scenario.n
-    figure = _style.new_figure(_style.WIDTH, 5.0 + 1.6 * n)
-    grid = figure.add_gridspec(2 + n, 2, height_ratios=[1.2, 1.6] + [1.0] * n)
+    columns = 1 if n <= 3 else 2
+    rows = -(-n // columns)
+    figure = _style.new_figure(_style.WIDTH, 5.0 + 1.6 * rows)
+    grid = figure.add_gridspec(2 + rows, 2, height_ratios=[1.2, 1.6] + [1.0] * rows)
     _progress(figure.add_subplot(grid[0, 0]), result)
     _margin(figure.add_subplot(grid[0, 1]), result)
     _gains(figure.add_subplot(grid[1, 0]), result)
@@ -47,12 +49,13 @@ def tuning(result: TuneResult, *, landscape: tuple[str, str] | None = None, poin
     timing: dict[str, Any] = {"duration": setup.duration, "dt": setup.dt, "method": setup.method}
     curves = curves_of({"before": simulate(result.start, **timing), "tuned": simulate(result.scenario, **timing)})
     for i in range(n):
-        axes = figure.add_subplot(grid[2 + i, :])
+        axes = figure.add_subplot(grid[2 + i // columns, i % columns] if columns > 1 else grid[2 + i, :])
         show(axes, curves, QUANTITIES["q"], i, (0.0, setup.duration))
         axes.set_ylabel(_style.label(f"joint {i}", "rad"))
         if i == 0:
-            axes.legend(ncols=2, loc="lower right")
-    axes.set_xlabel(_style.label("time $t$", "s"))
+            axes.legend(ncols=2, loc="lower right", fontsize=8.5 if columns == 1 else 6.5)
+        if i + columns >= n:
+            axes.set_xlabel(_style.label("time $t$", "s"))
     figure.suptitle("Gain tuning")
     return figure
 

@@ -1,0 +1,205 @@
+"""Real arms: the ones that come with the package, and a scenario on any arm.
+
+The data of an arm are what its file says, as the [robot] table of a scenario file (folder `arm_data`, with sources and licences); they need
+neither the network nor a parser of robot descriptions.
+
+`arm_scenario` fills in what an arm's own numbers give: bounds from its joint ranges, saturation from its largest torques, and gains in
+proportion to its inertia.  The inertia of a wrist is a thousandth of a shoulder's, so one number for all joints will not do: the loop's
+modes are about K2 / M, and
+
+    K2_i = max(rate M_ii(q), least),   least > 1/2 for Theorem 2,
+
+makes them about `rate` on every joint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from importlib import resources
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import bounds as bounds_
+from iblf_jax import checks, disturbances, references
+from iblf_jax.bounds import Bounds
+from iblf_jax.codec import decode_fields
+from iblf_jax.controllers import Controller, PDGravity, law_by_name, within_effort
+from iblf_jax.controllers.systems import observer_of
+from iblf_jax.disturbances import Disturbance, Nothing
+from iblf_jax.observers import Momentum, Printed
+from iblf_jax.references import Reference
+from iblf_jax.robots import Arm, Robot
+from iblf_jax.scenario import Initial, Scenario
+
+ARMS = ("ur5", "iiwa14")
+"""The arms that come with the package."""
+
+LEAST_K2 = 0.6
+"""N m s/rad; above the 1/2 of Theorem 2 (3.17)."""
+
+
+def arm(name: str) -> Arm:
+    """An arm that comes with the package.
+
+    Args:
+      name: "ur5" (Universal Robots UR5, 6 joints) or "iiwa14" (KUKA LBR iiwa 14 R820, 7 joints).
+
+    Raises:
+      ValueError: another name.
+
+    Source: the files in `iblf_jax/arm_data` name theirs.
+    """
+    checks.one_of("arm", name, ARMS)
+    text = resources.files("iblf_jax").joinpath("arm_data", f"{name}.toml").read_text(encoding="utf-8")
+    return decode_fields(Arm, tomllib.loads(text), name)
+
+
+def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST_K2) -> jax.Array:
+    """K2_i = max(rate M_ii(q), least), (n,) [N m s/rad]: about `rate` for the loop's modes on every joint.
+
+    Args:
+      robot: of n joints.
+      q: a position that is typical of the motion, (n,) [rad].
+      rate: [1/s].
+      least: smallest entry [N m s/rad].
+    """
+    return jnp.maximum(rate * _diagonal(robot, jnp.asarray(q, jnp.result_type(float))), least)
+
+
+@jax.jit
+def _diagonal(robot: Robot, q: jax.Array) -> jax.Array:
+    return jnp.diagonal(robot.mass_matrix(q))
+
+
+def arm_scenario(
+    robot: Robot,
+    reference: Reference,
+    *,
+    law: str = "integral",
+    reading: str = "corrected",
+    bounds: Bounds | None = None,
+    disturbance: Disturbance = Nothing(),
+    initial: Initial | None = None,
+    model: Robot | None = None,
+) -> Scenario:
+    """A scenario on an arm, with what follows from the arm's own numbers: bounds, saturation, gains.
+
+    k1 = 2, K2 as `inertial_gain`, kf = 20; the law within the arm's `effort`; bounds at its joint limits; a start on the reference at rest.
+
+    Args:
+      robot: with `limits` and `effort`, such as `iblf_jax.robots.load` gives; it is the plant.
+      reference: what it should do.
+      law, reading: as for `iblf_jax.presets.zhang_yan_2024`.
+      bounds: in place of the joint limits.
+      disturbance: what acts on it.
+      initial: where it starts.
+      model: what the law knows, if not the plant.
+
+    Returns:
+      A Scenario; every number in it is a leaf to change.
+
+    Raises:
+      ValueError: an unknown law or reading; a joint without limits and no bounds given.
+
+    Source: this package.
+    """
+    checks.one_of("reading", reading, ("printed", "corrected"))
+    start = reference.position(jnp.zeros(()))
+    K2 = inertial_gain(model or robot, start)
+    if law == "pd":  # its gains by name are for one size of joint
+        controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)
+    else:
+        controller = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
+    return Scenario(
+        plant=robot,
+        model=model,  # type: ignore[arg-type]
+        reference=reference,
+        bounds=bounds if bounds is not None else bounds_.from_limits(robot),
+        disturbance=disturbance,
+        controller=within_effort(controller, robot),
+        observer=observer_of(law, (Printed if reading == "printed" else Momentum)(kf=20.0)),
+        initial=initial if initial is not None else Initial(q=start),
+    )
+
+
+def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2.0) -> Scenario:
+    """A Universal Robots UR5 that swings its tool through half a metre, with a payload that its model does not know.
+
+    Every joint has its own frequency and range; the bounds are 0.25 to 0.5 rad around them, other above than below, move with time, and
+    are inside the joint limits.  The law stays within the actuators' torques, and the disturbance is about 3 % of these.
+
+    Args:
+      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.arms.arm_scenario`.
+      payload: at the tip of the plant; the model has none [kg].  (The maker allows 5 kg.)
+
+    Returns:
+      A Scenario of 6 joints; 10 s show it.
+
+    Raises:
+      ValueError: an unknown law or reading, or a negative payload.
+
+    Source: this package; the arm as `iblf_jax.arms.arm` says.
+    """
+    return _swinging(
+        arm("ur5"),
+        middle=[0.0, -1.2, 1.6, -1.4, -1.57, 0.0],
+        amplitude=[0.7, 0.35, 0.5, 0.5, 0.4, 0.8],
+        frequency=[0.6, 0.9, 0.7, 1.0, 0.8, 1.1],
+        push=[4.0, 4.0, 4.0, 0.8, 0.8, 0.5],
+        payload=payload,
+        law=law,
+        reading=reading,
+    )
+
+
+def iiwa14(*, law: str = "integral", reading: str = "corrected", payload: float = 3.0) -> Scenario:
+    """A KUKA LBR iiwa 14 that swings its flange through half a metre, with a payload that its model does not know.
+
+    As `ur5`, for 7 joints.  The maker allows a payload of 14 kg.
+
+    Args:
+      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.arms.arm_scenario`.
+      payload: at the tip of the plant; the model has none [kg].
+
+    Returns:
+      A Scenario of 7 joints; 10 s show it.
+
+    Raises:
+      ValueError: an unknown law or reading, or a negative payload.
+
+    Source: this package; the arm as `iblf_jax.arms.arm` says.
+    """
+    return _swinging(
+        arm("iiwa14"),
+        middle=[0.0, 0.6, 0.0, -1.1, 0.0, 0.9, 0.0],
+        amplitude=[0.6, 0.35, 0.5, 0.4, 0.5, 0.4, 0.6],
+        frequency=[0.6, 0.9, 0.7, 1.0, 0.8, 1.1, 0.75],
+        push=[6.0, 6.0, 4.0, 4.0, 0.3, 0.3, 0.1],
+        payload=payload,
+        law=law,
+        reading=reading,
+    )
+
+
+def _swinging(robot: Arm, middle: Any, amplitude: Any, frequency: Any, push: Any, payload: float, law: str, reading: str) -> Scenario:
+    """A scenario in which every joint swings as a cosine, from rest, inside bounds that move."""
+    middle, amplitude, frequency = (np.asarray(x, float) for x in (middle, amplitude, frequency))
+    quarter = math.pi / 2
+    reference = references.Sinusoid(offset=middle, amplitude=amplitude, frequency=frequency, phase=quarter)
+    lower = bounds_.Sinusoid(offset=middle - amplitude - 0.4, amplitude=0.1, frequency=0.5, phase=quarter)
+    upper = bounds_.Sinusoid(offset=middle + amplitude + 0.3, amplitude=0.05, frequency=0.8)
+    return arm_scenario(
+        dataclasses.replace(robot, payload=payload),
+        reference,
+        law=law,
+        reading=reading,
+        bounds=Bounds(lower=lower, upper=upper),
+        disturbance=disturbances.Sinusoids(amplitude=push, frequency=2.0, phase=np.linspace(0.0, 3.0, robot.n)),
+        initial=Initial(q=middle + amplitude - 0.1),
+        model=robot,
+    )

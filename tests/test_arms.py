@@ -1,0 +1,181 @@
+"""The arms that come with the package: their data, what follows from an arm's own numbers, and the presets on them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax import arms, bounds, controllers, references
+from iblf_jax.scenario_file import from_dict, scenario_to_dict
+
+RUN = {"duration": 1.0, "dt": 1e-3, "record_every": 4}
+PRESETS = {"ur5": (ij.presets.ur5, 6, "tool0"), "iiwa14": (ij.presets.iiwa14, 7, "iiwa_link_ee")}
+
+
+@pytest.fixture(scope="module", params=PRESETS)
+def name(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def scenario(name):
+    return PRESETS[name][0]()
+
+
+@pytest.fixture(scope="module")
+def run(scenario):
+    return ij.simulate(scenario, **RUN)
+
+
+def test_the_data_are_what_the_file_says(name):
+    """Every leaf, name and kind of joint, as `robots.load` reads them from the URDF."""
+    pytest.importorskip("mujoco")
+    loaded = ij.robots.load(ROOT / "tests" / "data" / "arms" / f"{name}.urdf", tip=PRESETS[name][2])
+    shipped = arms.arm(name)
+    assert jax.tree.structure(shipped) == jax.tree.structure(loaded)
+    for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(shipped), jax.tree.leaves(loaded), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=2e-14, err_msg=jax.tree_util.keystr(path))
+    assert shipped.n == PRESETS[name][1]
+
+
+def test_an_arm_is_like_what_its_maker_says():
+    """Reach and weight, from the makers' data sheets: 0.85 m and 18.4 kg with the base; 0.82 m to the wrist and 29.9 kg."""
+    ur5, iiwa = arms.arm("ur5"), arms.arm("iiwa14")
+    stretched = ur5.skeleton(jnp.array([0.0, np.pi / 2, 0, 0, 0, 0]))
+    assert float(jnp.linalg.norm(stretched[3] - stretched[1])) == pytest.approx(0.817, abs=0.11)
+    assert float(ur5.mass.sum()) == pytest.approx(18.4, abs=2)
+    upright = iiwa.skeleton(jnp.zeros(7))
+    assert float(upright[5, 2] - upright[1, 2]) == pytest.approx(0.82, abs=0.01)
+    assert float(iiwa.mass.sum()) == pytest.approx(29.9 - 5.0, abs=2)
+    np.testing.assert_allclose(upright[:, :2], 0, atol=1e-12)
+
+
+def test_unknown_arm():
+    with pytest.raises(ValueError, match="arm: got 'ur6'.*'iiwa14'"):
+        arms.arm("ur6")
+
+
+# ------------------------------------------------------------------------------------------------------------------ the presets
+
+
+def test_the_run_does_its_job(scenario, run):
+    assert run.ok, ij.status.describe(int(run.status))
+    assert np.all(np.asarray(run.metrics.margin) > 0.1)
+    assert np.all(np.abs(run.e1[-1]) < 0.08)
+    assert float(run.metrics.rmse.max()) < 0.12
+    assert np.all(np.asarray(run.metrics.peak_torque) < 0.6 * np.asarray(scenario.model.effort))
+    assert ij.recommended_dt(scenario) >= RUN["dt"]
+
+
+def test_bounds_are_inside_the_joint_limits(scenario):
+    """Strictly, at every time; other below than above; and they move."""
+    t = jnp.linspace(0.0, 120.0, 12001)
+    q_d = jax.vmap(scenario.reference.position)(t)
+    lower, upper = (np.asarray(jax.vmap(side.at)(t, q_d)) for side in (scenario.bounds.lower, scenario.bounds.upper))
+    limits = scenario.plant.limits
+    assert np.all(np.asarray(limits.lower) < lower)
+    assert np.all(upper < np.asarray(limits.upper))
+    assert np.min(np.minimum(q_d - lower, upper - q_d)) > 0.2
+    assert np.all(np.ptp(lower, axis=0) > 0.05)
+    assert np.all(np.ptp(upper, axis=0) > 0.05)
+    assert np.all(np.abs((q_d - lower) - (upper - q_d)).max(axis=0) > 0.05)
+
+
+def test_the_tip_goes_through_half_a_metre(scenario):
+    t = jnp.linspace(0.0, 10.0, 201)
+    tip = np.asarray(jax.jit(jax.vmap(lambda t: scenario.model.tip(scenario.reference.position(t))))(t))
+    assert np.linalg.norm(np.ptp(tip, axis=0)) > 0.5
+    assert np.linalg.norm(tip, axis=1).max() < 1.3
+
+
+def test_the_payload_is_in_the_plant_alone(name, scenario):
+    assert float(scenario.plant.payload) > 0
+    assert float(scenario.model.payload) == 0
+    other = PRESETS[name][0](payload=0.0)
+    assert float(other.plant.payload) == 0
+    assert jax.tree.structure(other) == jax.tree.structure(scenario)
+    with pytest.raises(ValueError, match="payload"):
+        PRESETS[name][0](payload=-1.0)
+
+
+def test_the_law_keeps_to_the_actuators(scenario):
+    assert isinstance(scenario.controller, controllers.Saturated)
+    np.testing.assert_array_equal(scenario.controller.limit, scenario.model.effort)
+
+
+@pytest.mark.slow
+def test_the_certificate_holds(name, scenario):
+    """The corrected law, all the way: every line that applies."""
+    certificate = ij.certify(scenario, ij.simulate(scenario, **RUN))
+    assert certificate.verdict == "holds"
+    assert certificate["inequality, case 2"].margin > 0
+    assert certificate["joints inside"].margin > 0.5
+
+
+def test_files_give_it_back(scenario):
+    again = from_dict(scenario_to_dict(scenario)).scenario
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True))
+
+
+# --------------------------------------------------------------------------------------------- what follows from an arm's numbers
+
+
+def test_joint_limits_become_bounds():
+    arm = arms.arm("iiwa14")
+    found = bounds.from_limits(arm, margin=0.1)
+    np.testing.assert_allclose(found.lower.at(0.0, jnp.zeros(7)), arm.lower + 0.1)
+    np.testing.assert_allclose(found.upper.at(3.0, jnp.zeros(7)), arm.upper - 0.1)
+
+
+def test_joints_without_limits_need_a_word():
+    arm = dataclasses.replace(arms.arm("iiwa14"), upper=arms.arm("iiwa14").upper.at[3].set(jnp.inf))
+    with pytest.raises(ValueError, match="unlimited"):
+        bounds.from_limits(arm)
+    assert float(bounds.from_limits(arm, unlimited=6.0).upper.value[3]) == 6.0
+    with pytest.raises(ValueError, match="margin: got 5"):
+        bounds.from_limits(arms.arm("iiwa14"), margin=5.0)
+    with pytest.raises(ValueError, match="joint limits"):
+        bounds.from_limits(ij.presets.customary_two_link())
+
+
+def test_efforts_become_saturation():
+    law, arm = controllers.ComputedTorque(Kp=25.0, Kd=10.0), arms.arm("ur5")
+    np.testing.assert_array_equal(controllers.within_effort(law, arm).limit, arm.effort)
+    assert controllers.within_effort(law, arm, edge="smooth").edge == "smooth"
+    assert controllers.within_effort(law, dataclasses.replace(arm, effort=jnp.inf)) is law
+    assert controllers.within_effort(law, ij.presets.customary_two_link()) is law
+    some = controllers.within_effort(law, dataclasses.replace(arm, effort=arm.effort.at[0].set(jnp.inf)))
+    assert float(some.limit[0]) == 1e6
+    assert float(some.limit[1]) == 150
+
+
+def test_gains_follow_the_inertia():
+    arm = arms.arm("iiwa14")
+    q = jnp.array([0.0, 0.6, 0.0, -1.1, 0.0, 0.9, 0.0])
+    K2 = arms.inertial_gain(arm, q, rate=30.0)
+    np.testing.assert_allclose(K2[:4], 30.0 * jnp.diagonal(arm.mass_matrix(q))[:4])
+    assert float(K2.min()) == arms.LEAST_K2
+
+
+@pytest.mark.parametrize("law", ["log", "computed_torque", "pd"])
+def test_other_laws_on_the_arm(law):
+    """The yardsticks at gains that suit its wrist, too."""
+    run = ij.simulate(ij.presets.ur5(law=law, payload=0.5), duration=0.2, dt=1e-3, record_every=20)
+    assert run.ok
+
+
+def test_a_scenario_from_an_arm_alone():
+    arm = arms.arm("ur5")
+    reference = references.Quintic(start=[0.0, -1.2, 1.6, -1.4, -1.57, 0.0], end=[0.5, -1.0, 1.2, -1.0, -1.57, 0.5], duration=2.0)
+    scenario = arms.arm_scenario(arm, reference)
+    np.testing.assert_array_equal(scenario.bounds.upper.value, arm.upper)
+    np.testing.assert_allclose(scenario.initial.q, reference.start)
+    with pytest.raises(ValueError, match="reading"):
+        arms.arm_scenario(arm, reference, reading="wrong")

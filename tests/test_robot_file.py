@@ -1,0 +1,134 @@
+"""Scenario, study and tuning files that name a robot's own file; what is saved needs it no more."""
+
+from __future__ import annotations
+
+import shutil
+
+import jax
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax import scenario_file
+from iblf_jax.cli import main
+from iblf_jax.controllers import Saturated
+from iblf_jax.study_file import load_study_file
+from iblf_jax.tuning_file import load_tuning_file
+
+pytest.importorskip("mujoco")
+
+REFERENCE = """
+[reference]
+kind = "sinusoid"
+offset = [0.0, -1.2, 1.6, -1.4, -1.57, 0.0]
+amplitude = 0.3
+frequency = 1.0
+phase = 1.5708
+"""
+ROBOT = '[robot]\nfile = "ur5.urdf"\ntip = "tool0"\n'
+RUN = "\n[run]\nduration = 0.05\ndt = 1e-3\n"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the arm's file and scenario files; the caller is somewhere else."""
+    shutil.copy(ROOT / "tests" / "data" / "arms" / "ur5.urdf", tmp_path)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    return tmp_path
+
+
+def written(folder, text):
+    path = folder / "scenario.toml"
+    path.write_text(text)
+    return path
+
+
+def test_what_the_file_leaves_out_follows_from_the_arm(folder):
+    scenario = ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    arm = ij.robots.load(folder / "ur5.urdf", tip="tool0")
+    np.testing.assert_array_equal(scenario.bounds.lower.value, arm.lower)
+    assert isinstance(scenario.controller, Saturated)
+    np.testing.assert_array_equal(scenario.controller.limit, arm.effort)
+    np.testing.assert_allclose(scenario.initial.q, scenario.reference.position(np.zeros(())))
+    assert jax.tree.structure(scenario.plant) == jax.tree.structure(arm)
+
+
+def test_what_it_says_counts(folder):
+    text = ROBOT + REFERENCE + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n'
+    scenario = ij.load_scenario(written(folder, text + '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n'))
+    assert scenario.controller.law.Kp[3] == 30.0
+    assert scenario.initial.q[0] == 0.1
+    assert (float(scenario.plant.payload), float(scenario.model.payload)) == (2.0, 0.0)
+    assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (3.0, 2.275)
+
+
+def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
+    (folder / "believed.urdf").write_text((folder / "ur5.urdf").read_text().replace('<mass value="2.275" />', '<mass value="2.0" />'))
+    both = '[plant]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
+    both += '[model]\nfile = "believed.urdf"\ntip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
+    reference = REFERENCE.replace(", 0.0]", "]")
+    scenario = ij.load_scenario(written(folder, both + reference))
+    assert scenario.n == 5
+    assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (2.275, 2.0)
+
+
+def test_saved_it_needs_no_other_file(folder):
+    scenario = ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    (folder / "ur5.urdf").unlink()
+    ij.save_scenario(scenario, folder / "saved.toml")
+    again = ij.load_scenario(folder / "saved.toml")
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True))
+    assert "urdf" not in (folder / "saved.toml").read_text()
+
+
+def test_simulate_from_the_command_line(folder, capsys):
+    path = written(folder, ROBOT + REFERENCE + RUN)
+    assert main(["simulate", str(path), "--set", "plant.link[wrist_1_link].mass=1.3", "--out", str(folder / "out")]) == 0
+    assert "status: ok" in capsys.readouterr().out
+    saved = ij.load_scenario(folder / "out" / "scenario.toml")
+    assert float(saved.plant.mass[3]) == 1.3
+    assert main(["parameters", str(path)]) == 0
+    assert "plant.link[forearm_link].mass" in capsys.readouterr().out
+
+
+def test_studies_and_tuning_read_it_too(folder):
+    study = ROBOT + REFERENCE + RUN + '[perturbations]\n"plant.link[forearm_link].mass" = { factor = "uniform", low = 0.8, high = 1.2 }\n'
+    path = written(folder, study + "[study]\nruns = 4\n")
+    assert list(load_study_file(path, "study").perturbations) == ["plant.link[forearm_link].mass"]
+    path = written(folder, ROBOT + REFERENCE + RUN + '[sweep]\n[grid]\n"plant.link[forearm_link].mass" = [2.0, 3.0]\n')
+    assert list(load_study_file(path, "sweep").grid) == ["plant.link[forearm_link].mass"]
+    path = written(folder, ROBOT + REFERENCE + RUN + '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n')
+    assert load_tuning_file(path)["scenario"].n == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[robot]\nfile = "nothing.urdf"\n', r"robot\.file: .*nothing\.urdf"),
+        ('[robot]\nfile = "ur5.urdf"\ntip = "hand"\n', r"robot\.file: tip: got 'hand'"),
+        ('[robot]\nfile = "ur5.urdf"\nmass = 2.0\n', r"robot\.mass: got an unknown key"),
+        ("[robot]\nfile = 3\n", r"robot\.file: got 3, expected a string"),
+        ('[robot]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { elbow = 0.1 }\n', r"robot\.file: .*elbow"),
+        (ROBOT + '[plant]\nfile = "ur5.urdf"\n', "beside"),
+        ('[model]\nfile = "ur5.urdf"\n', "plant: got nothing"),
+    ],
+)
+def test_what_is_wrong_is_said(folder, text, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ij.load_scenario(written(folder, text + REFERENCE))
+    assert "scenario.toml" in str(error.value)
+
+
+def test_a_reference_is_needed(folder):
+    with pytest.raises(ValueError, match="reference: got nothing"):
+        ij.load_scenario(written(folder, ROBOT))
+
+
+def test_without_the_extra_it_says_so(folder, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    with pytest.raises(ValueError, match=r"robot\.file: .*iblf_jax\[robots\]"):
+        scenario_file.load_scenario(written(folder, ROBOT + REFERENCE))
