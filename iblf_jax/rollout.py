@@ -276,10 +276,13 @@ def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
 
 @partial(jax.jit, static_argnames=("steps", "record_every", "method", "backend"))
 def _run_lowered(scenario, folds, dt, *, steps, record_every, method, backend):
-    """`run` by the scalar program of its step, which is not differentiable in reverse; what does not lower runs as it is."""
+    """`run` by the scalar program of its step, which is not differentiable in reverse; what is long or does not lower runs as it is."""
     from iblf_jax.lowering import run_alone
 
-    return run_alone(scenario, folds, dt, steps=steps, record_every=record_every, method=method, backend=backend)
+    options = {"steps": steps, "record_every": record_every, "method": method}
+    if backend == "xla" and _is_long(scenario, dt):
+        return run_compactly(scenario, folds, dt, alone=True, **options)
+    return run_alone(scenario, folds, dt, backend=backend, **options)
 
 
 SINGLE_RUN_BACKENDS = ("xla", "native", "gpu")

@@ -190,10 +190,10 @@ def value(shared: Shared, lanes: Lane, *, plan: Plan) -> Value:
 def slope(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
     """The problem with gradient (S, p) and Gauss-Newton matrix (S, p, p), by forward mode."""
     fold = fold_of(shared.objective, shared.dt.dtype)
-    one = partial(_varied, plan, shared)
+    one, overlap = partial(_varied, plan, shared), partial(same_place, shared.cases.scenario)
     jacobian = jax.vmap(jax.vmap(jax.jacfwd(one), in_axes=(None, 0)))(lanes.z, lanes.index)
-    moving = {path: x for path, x in _flat(jacobian).items() if any(same_place(path, block.path) for block in plan.blocks)}
-    tied = [b.path for b in plan.blocks if b.size == 1 and not any(same_place(b.path, t.path) for t in plan.targets)]
+    moving = {path: x for path, x in _flat(jacobian).items() if any(overlap(path, block.path) for block in plan.blocks)}
+    tied = [b.path for b in plan.blocks if b.size == 1 and not any(overlap(b.path, t.path) for t in plan.targets)]
     varied = _flat(_of_lanes(plan, shared, lanes))
     options: dict[str, Any] = {"steps": plan.steps, "method": plan.method, "backend": plan.backend, "together": tied}
     found = by_coordinates(shared.cases.scenario, varied, moving, fold, shared.dt, **options)
