@@ -83,7 +83,7 @@ def arm_scenario(
     law: str = "integral",
     reading: str = "corrected",
     bounds: Bounds | None = None,
-    disturbance: Disturbance = Nothing(),
+    disturbance: Disturbance | None = None,
     initial: Initial | None = None,
     model: Robot | None = None,
 ) -> Scenario:
@@ -96,7 +96,7 @@ def arm_scenario(
       reference: what it should do.
       law, reading: as for `iblf_jax.presets.zhang_yan_2024`.
       bounds: in place of the joint limits.
-      disturbance: what acts on it.
+      disturbance: what acts on it; nothing if not given.
       initial: where it starts.
       model: what the law knows, if not the plant.
 
@@ -120,7 +120,7 @@ def arm_scenario(
         model=model,  # type: ignore[arg-type]
         reference=reference,
         bounds=bounds if bounds is not None else bounds_.from_limits(robot),
-        disturbance=disturbance,
+        disturbance=disturbance if disturbance is not None else Nothing(),
         controller=within_effort(controller, robot),
         observer=observer_of(law, (Printed if reading == "printed" else Momentum)(kf=20.0)),
         initial=initial if initial is not None else Initial(q=start),

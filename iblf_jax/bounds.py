@@ -111,7 +111,12 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
         sides.append(jnp.where(jnp.isfinite(side), side + sign * margin, far))
     lower, upper = sides
     if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
-        raise checks.fail("margin", margin, "a margin that leaves room between the limits", f"The narrowest range is {float(np.min(np.diff(robot.limits, axis=0))):g} rad.")
+        raise checks.fail(
+            "margin",
+            margin,
+            "a margin that leaves room between the limits",
+            f"The narrowest range is {float(np.min(np.diff(robot.limits, axis=0))):g} rad.",
+        )
     return Bounds(lower=Constant(lower), upper=Constant(upper))
 
 

@@ -206,9 +206,7 @@ def _is_long(scenario: Scenario, dt) -> bool:
     return is_long(_evaluate_once, scenario, jnp.zeros_like(dt), initial_state(scenario), dt)
 
 
-def run_compactly(
-    scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool = False
-) -> Outcome:
+def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool = False) -> Outcome:
     """As `run`, for a closed loop of so many operations that compiling is what takes the time.
 
     The closed loop is there once, in a loop over the stages of the integrator, and once more where its modes are measured.  So the
@@ -267,10 +265,10 @@ def run_compactly(
 @partial(jax.jit, static_argnames=("steps", "record_every", "method", "alone"))
 def _run_compiled(scenario, folds, dt, *, steps, record_every, method, alone):
     """`run`, compiled; `alone` says that nobody will batch it from outside, so that it may become one machine function."""
-    options = {"steps": steps, "record_every": record_every, "method": method}
+    options: dict[str, Any] = {"steps": steps, "record_every": record_every, "method": method}
     if alone and _is_long(scenario, dt):
         return run_compactly(scenario, folds, dt, alone=True, **options)
-    one = partial(run, **options)
+    one = partial(run, steps=steps, record_every=record_every, method=method)
     return (as_one_function(one) if alone else one)(scenario, folds, dt)
 
 

@@ -189,9 +189,7 @@ def _equal(a: Any, b: Any) -> bool:
 # -------------------------------------------------------------------------------------------------------------- from tables
 
 
-def from_dict(
-    data: dict[str, Any], source: str = "", *, other_tables: Iterable[str] = (), folder: str | os.PathLike = ""
-) -> ScenarioFile:
+def from_dict(data: dict[str, Any], source: str = "", *, other_tables: Iterable[str] = (), folder: str | os.PathLike = "") -> ScenarioFile:
     """Scenario and [run] table from the tables of a file.
 
     Args:

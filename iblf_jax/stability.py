@@ -40,7 +40,7 @@ class Growth(NamedTuple):
     total: jax.Array
 
 
-def growth_start(state: LoopState) -> Growth:
+def growth_start(state: LoopState | jax.Array) -> Growth:
     """A direction that no mode is orthogonal to."""
     flat, _ = ravel_pytree(state)
     start = jnp.cos(jnp.arange(1, flat.size + 1, dtype=flat.dtype))

@@ -57,7 +57,7 @@ def test_an_arm_is_like_what_its_maker_says():
 
 
 def test_unknown_arm():
-    with pytest.raises(ValueError, match="arm: got 'ur6'.*'iiwa14'"):
+    with pytest.raises(ValueError, match=r"arm: got 'ur6'.*'iiwa14'"):
         arms.arm("ur6")
 
 

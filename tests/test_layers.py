@@ -33,7 +33,10 @@ LAYERS = {
         *("_blocks", "_config", "_dataset", "_designs", "_draws", "_interrupt", "_points", "_progress", "_setup"),
         *("_statistics", "_summaries"),
     ),
-    6: ("presets", "arms", "robot_file", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain", "plotting", "cli", "testing", "__main__"),
+    6: (
+        *("presets", "arms", "robot_file", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain"),
+        *("plotting", "cli", "testing", "__main__"),
+    ),
 }
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
 

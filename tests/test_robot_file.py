@@ -57,7 +57,9 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
 
 
 def test_what_it_says_counts(folder):
-    text = ROBOT + REFERENCE + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n'
+    text = (
+        ROBOT + REFERENCE + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n'
+    )
     scenario = ij.load_scenario(written(folder, text + '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n'))
     assert scenario.controller.law.Kp[3] == 30.0
     assert scenario.initial.q[0] == 0.1
