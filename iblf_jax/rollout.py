@@ -214,7 +214,7 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
     will batch it from outside: then its pieces become machine functions.
     """
     piece = as_one_function if alone else lambda function: function
-    every = record_every or 1
+    every = min(record_every or 1, steps + 1)
     state, zero = initial_state(scenario), jnp.zeros_like(dt)
     shapes = jax.eval_shape(_evaluate_once, scenario, zero, state, dt)
     _, whole_sample = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[1]))
@@ -226,13 +226,15 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
         return tuple(ravel_pytree(part)[0] for part in _evaluate_once(scenario, t, whole(x), covered))
 
     @piece
-    def after(carry, index, sample, stepped):
+    def after(carry, record, index, sample, stepped):
         sample = whole_sample(sample)
         begun = carry._replace(accumulators=_keep_if(index > 0, carry.accumulators, tuple(fold.init(sample) for fold in folds)))
         moved = _moved(_folded(folds, sample, begun), whole(stepped), index < steps)
-        return _keep_if(index <= steps, moved, carry), record_of(sample, carry.state)
+        record = _keep_if(index % every == 0, record_of(sample, carry.state), record) if record_every else None
+        return _keep_if(index <= steps, moved, carry), record
 
-    def one(carry, index):
+    def one(carried, index):
+        carry, record = carried
         t, x = index.astype(dt.dtype) * dt, ravel_pytree(carry.state)[0]
         covered = jnp.where(index < steps, dt, zero)
 
@@ -242,16 +244,17 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
             return (k, total + b * k), sample
 
         (_, total), samples = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
-        return after(carry, index, samples[0], x + dt * total)
+        return after(carry, record, index, samples[0], x + dt * total), None
 
-    def block(carry, first):
-        carry, records = jax.lax.scan(one, carry, first + jnp.arange(every))
-        return carry, None if record_every is None else jax.tree.map(lambda x: x[0], records)
+    def block(carried, first):
+        carried, _ = jax.lax.scan(one, carried, first + jnp.arange(every))
+        return carried, carried[1]
 
     blank = jax.eval_shape(lambda sample: tuple(fold.init(sample) for fold in folds), shapes[1])
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
     carry = Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(dt), zero, jax.lax.stop_gradient(state)))
-    carry, records = jax.lax.scan(block, carry, every * jnp.arange(steps // every + 1))
+    record = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(record_of, shapes[1], state)) if record_every else None
+    (carry, _), records = jax.lax.scan(block, (carry, record), every * jnp.arange(steps // every + 1))
     times, states = critical_instants(scenario, dt, steps, carry)
 
     def mode(instant):

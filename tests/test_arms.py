@@ -179,3 +179,39 @@ def test_a_scenario_from_an_arm_alone():
     np.testing.assert_allclose(scenario.initial.q, reference.start)
     with pytest.raises(ValueError, match="reading"):
         arms.arm_scenario(arm, reference, reading="wrong")
+
+
+# --------------------------------------------------------------------------------------------------------------- the whole chain
+
+UNKNOWN = {"plant.link[iiwa_link_4].mass": ij.factor(ij.uniform(0.8, 1.2)), "initial.q": ij.offset(ij.uniform(-0.02, 0.02))}
+BRIEF = {"duration": 0.02, "dt": 1e-3, "progress": False}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["vmap", "native"])
+def test_monte_carlo_and_sweep(backend):
+    """Every run of a batch is the run alone.  (The C compiler takes minutes over seven joints.)"""
+    scenario = ij.presets.iiwa14()
+    study = ij.monte_carlo(scenario, UNKNOWN, runs=4, seed=0, backend=backend, **BRIEF)
+    assert not len(study.failed)
+    alone = study.replay(2)
+    np.testing.assert_allclose(study.metrics.rmse[2], alone.metrics.rmse, rtol=1e-6)
+    if backend == "vmap":
+        grid = {"plant.link[iiwa_link_4].mass": [3.0, 4.0]}
+        table = ij.sweep(scenario, grid, runs=2, perturbations={"initial.q": UNKNOWN["initial.q"]}, backend=backend, **BRIEF)
+        assert table.rmse.shape == (2, 2, 7)
+
+
+@pytest.mark.slow
+def test_tune_21_gains():
+    scenario = ij.presets.iiwa14()
+    gains = ["controller.k1", "controller.K2", "observer.kf"]
+    best = ij.tune(scenario, gains, ij.objectives.tracking(), method="euler", iterations=2, report_runs=2, **BRIEF)
+    assert len(best.names) == 21
+    assert ij.simulate(best.scenario, duration=0.02, dt=1e-3).ok
+
+
+@pytest.mark.slow
+def test_compare_on_the_arm():
+    comparison = ij.compare(ij.presets.ur5(), ["integral", "log"], duration=0.1, dt=1e-3)
+    assert all(run.ok for run in comparison.rollouts.values())

@@ -186,6 +186,7 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
         axes.axhline(0.0, color=_style.BOUND, linewidth=1.0)
     rho, _ = _statistics.rank_correlation(x[some], y[some])
     axes.set_title("" if np.isnan(rho) else f"rank correlation {rho:.2f}")
+    axes.locator_params(axis="x", nbins=4)
     axes.set_xlabel(_style.label(path, study.parameter_unit(path)))
     axes.set_ylabel(_style.label(f"worst {metric.replace('_', ' ')}", study.metrics.units.get(metric, "1")))
 
