@@ -18,7 +18,7 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax.lowering import vector_math
-from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, frontier
+from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, UnsupportedError, frontier
 from iblf_jax.lowering.step import Packed
 from iblf_jax.one_function import as_one_function
 
@@ -28,6 +28,8 @@ STORED = 8
 """Cost from which a number with several uses is stored on CPU.  XLA would compute it again for each use."""
 SEGMENT = 2000
 """Operations in one XLA computation, on CPU: its passes take more than linear time."""
+LONGEST = 20_000
+"""Operations of a step above which XLA would take many minutes over it."""
 STRETCH = 4096
 """Steps whose signals are tabulated at once, at most."""
 
@@ -144,7 +146,13 @@ def as_function(f):
 
 
 def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
-    """All steps of all runs; arguments and results as `native.run`.  The last block repeats the last run."""
+    """All steps of all runs; arguments and results as `native.run`.  The last block repeats the last run.
+
+    Raises:
+      UnsupportedError: the step is too long for XLA.
+    """
+    if len(program.nodes) > LONGEST:
+        raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
     runs = carry.floats.shape[1]
     width = min(BLOCK, runs) if on_cpu() else runs
     blocks = -(-runs // width)
