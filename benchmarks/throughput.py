@@ -1,12 +1,13 @@
 """Throughput of many runs at once, RK4 at 1 ms, steps per second, everything side by side in one run.
 
-    python benchmarks/throughput.py [--quick] [--json FILE] [--dtypes float32,float64] [--batches 1,64,4096,65536] [--loops paper,chain]
+    python benchmarks/throughput.py [--quick] [--json FILE] [--dtypes float32,float64] [--batches 1,64,4096,65536] [--loops paper,chain,arm]
 
 Rows: SciPy LSODA and diffrax (of the same motion, in steps of 1 ms), the textbook `jit(vmap(scan))` with `jnp.linalg.solve`, this
 package's backends with the standard metrics and without, on one thread and on all, value and 6 forward sensitivities, and the limit: a
 rollout written by hand in C++ (`limit/paper_loop.cc`), which carries the state alone and is there for the paper's loop only.  The second
-loop is a planar chain of four joints.  Last, `native` on 1e4, 1e5 and 1e6 runs.  `a core` is steps per second of processor time: on a
-shared machine it is the number to compare.  A row that needs a package which is not there is left out.
+loop is a planar chain of four joints; the third, a real arm of seven (`presets.iiwa14`), whose step is too long for XLA.  Last, `native`
+on 1e4, 1e5 and 1e6 runs.  `a core` is steps per second of processor time: on a shared machine it is the number to compare.  A row that
+needs a package which is not there is left out.
 """
 
 from __future__ import annotations
@@ -49,6 +50,9 @@ def chain(n: int):
         observer=ij.observers.Momentum(kf=20.0),
         initial=ij.Initial(q=0.55),
     )
+
+
+LOOPS = {"paper": ij.presets.zhang_yan_2024, "chain": lambda: chain(4), "arm": ij.presets.iiwa14}
 
 
 def draws(scenario, runs: int, dtype):
@@ -186,7 +190,7 @@ class Row(NamedTuple):
 LARGE = (4096, 65536)
 
 
-def rows_of(scenario, dtype: str, is_paper: bool) -> list[Row]:
+def rows_of(scenario, dtype: str, loop: str) -> list[Row]:
     """What is measured on a loop."""
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
 
@@ -196,6 +200,8 @@ def rows_of(scenario, dtype: str, is_paper: bool) -> list[Row]:
     def sensitivities(folds):
         return lambda v, dt, steps: lowering.run_batch_jvp(scenario, v, GAINS, folds, dt, steps=steps, method="rk4", backend="native")
 
+    if loop == "arm":
+        return [Row("vmap", on("vmap"), 2e4, batches=(1, 64)), Row("native", on("native"), 2e6, batches=(1, 64, 4096))]
     rows = [
         Row("vmap", on("vmap"), 2e6, batches=(1, 4096)),
         Row("xla", on("xla"), 3e7),
@@ -203,7 +209,7 @@ def rows_of(scenario, dtype: str, is_paper: bool) -> list[Row]:
         Row("native", on("native"), 1e8),
         Row("native, one thread", on("native"), 1e8, threads=1, batches=LARGE[1:]),
     ]
-    if not is_paper:
+    if loop != "paper":
         return rows
     first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 1e6, most=16_384)]
     if importlib.util.find_spec("diffrax"):
@@ -244,8 +250,8 @@ def timed(row: Row, values, dt, steps: int, repeats: int) -> tuple[float, float,
 def table(dtype: str, batches, loop: str, quick: bool) -> list[list]:
     """The rows of one loop and type."""
     jax.config.update("jax_enable_x64", dtype == "float64")
-    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024() if loop == "paper" else chain(4), dtype))
-    dt, result, rows = jnp.asarray(1e-3, dtype), [], rows_of(scenario, dtype, loop == "paper")
+    scenario = canonical(ij.astype(LOOPS[loop](), dtype))
+    dt, result, rows = jnp.asarray(1e-3, dtype), [], rows_of(scenario, dtype, loop)
     for runs in batches:
         values, found = draws(scenario, runs, dtype), []
         for row in rows:
@@ -263,7 +269,7 @@ def flat(quick: bool) -> list[list]:
     """`native` on more and more runs, whose speed should not depend on how many there are."""
     jax.config.update("jax_enable_x64", False)
     scenario, dt = canonical(ij.astype(ij.presets.zhang_yan_2024(), "float32")), jnp.asarray(1e-3, "float32")
-    row = next(row for row in rows_of(scenario, "float32", False) if row.name == "native")
+    row = next(row for row in rows_of(scenario, "float32", "chain") if row.name == "native")
     result, steps = [], 20 if quick else 200
     for runs in (4,) if quick else (10_000, 100_000, 1_000_000):
         seconds, wall, cpu = timed(row, draws(scenario, runs, "float32"), dt, steps, 1 if quick else 3)
@@ -278,7 +284,7 @@ def main() -> None:
     parser.add_argument("--json")
     parser.add_argument("--dtypes", default="float32,float64")
     parser.add_argument("--batches", default="1,64,4096,65536")
-    parser.add_argument("--loops", default="paper,chain")
+    parser.add_argument("--loops", default="paper,chain,arm")
     options = parser.parse_args()
     batches = [2] if options.quick else [int(x) for x in options.batches.split(",")]
     rows = []
