@@ -32,6 +32,8 @@ from iblf_jax.scenario import Scenario
 
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a batch can be executed; "auto" is native on CPU, gpu on an NVIDIA GPU, else xla."""
+LONGEST_ALONE = 2500
+"""Operations of a step up to which one run on xla is lowered: a longer one gains less by it than it takes to compile."""
 COMPILED = {"cpu": native, "gpu": gpu}
 """The backend that builds its kernels, by platform."""
 
@@ -164,7 +166,7 @@ def run_alone(scenario: Scenario, folds, dt: jax.Array, *, steps: int, method: s
     options: dict[str, Any] = {"steps": steps, "method": method, "record_every": record_every}
 
     def run_on(executor):
-        return batch.run_alone(executor, scenario, folds, dt, **options)
+        return batch.run_alone(executor, scenario, folds, dt, **options, longest=LONGEST_ALONE if executor is xla.run else None)
 
     def plain():
         return as_one_function(partial(run, **options))(scenario, folds, dt)

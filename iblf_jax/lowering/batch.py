@@ -12,7 +12,7 @@ import numpy as np
 
 from iblf_jax import rollout
 from iblf_jax.closed_loop import LoopState
-from iblf_jax.lowering.program import Program
+from iblf_jax.lowering.program import Program, UnsupportedError
 from iblf_jax.lowering.step import Leaves, Packed, Shapes, lowered, pack, split, unpack
 from iblf_jax.one_function import as_one_function
 from iblf_jax.stability import POWER_ITERATIONS, Growth, growth_rate, growth_start, growth_step
@@ -111,10 +111,15 @@ def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: 
     return outcome if record_every is None else outcome._replace(records=_records(samples, last, steps % record_every == 0))
 
 
-def run_alone(executor: Executor, scenario, folds, dt, *, steps: int, method: str, record_every: int):
-    """`rollout.run` for one run, by a lowered step; raises as `run`.  Start and end are the plain ones, quicker to compile than lowered."""
+def run_alone(executor: Executor, scenario, folds, dt, *, steps: int, method: str, record_every: int, longest: int | None):
+    """`rollout.run` for one run, by a lowered step of at most `longest` operations; raises as `run`.
+
+    Start and end are the plain ones, quicker to compile than lowered.
+    """
     batch = batch_of(executor, scenario, {"initial.q": scenario.initial.q[None]}, folds, dt)
     carry = jax.tree.map(lambda x: x[None], rollout.start(scenario, folds, dt))
+    if longest and len(batch.program(step_function, carry, method, True)[0].nodes) > longest:
+        raise UnsupportedError(f"its step has more than {longest} operations")
     carry, samples = batch.advance(step_function, carry, steps, record_every, method, True)
 
     def end(scenario, folds, dt, carry):
