@@ -153,7 +153,7 @@ class Arm:
     def _check_names(self, n: int) -> None:
         for name, default in (("kinds", ("revolute",) * n), ("links", _numbered("link", n)), ("joints", _numbered("joint", n))):
             given = getattr(self, name)
-            if given == ():
+            if isinstance(given, tuple) and not given:
                 object.__setattr__(self, name, default)
             elif not isinstance(given, tuple) or len(given) != n or not all(isinstance(x, str) and x for x in given):
                 raise checks.fail(f"Arm.{name}", given, f"{n} words, one a link")
