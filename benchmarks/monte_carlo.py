@@ -33,7 +33,7 @@ def study(runs: int, steps: int, backend: str, dtype: str, devices: int) -> dict
     jax.config.update("jax_enable_x64", dtype == "float64")
     jax.config.update("jax_num_cpu_devices", devices)
     import iblf_jax as ij
-    from iblf_jax._blocks import block_size
+    from iblf_jax.studies.blocks import block_size
 
     scenario = ij.presets.zhang_yan_2024()
     start = {"initial.q": ij.offset(ij.normal(0.0, SPREAD))}

@@ -48,15 +48,15 @@ if TYPE_CHECKING:
     from iblf_jax import distributed as distributed
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
-    from iblf_jax._compare import compare as compare
-    from iblf_jax._comparison import Comparison as Comparison
-    from iblf_jax._monte_carlo import monte_carlo as monte_carlo
-    from iblf_jax._sensitivity import sensitivity as sensitivity
-    from iblf_jax._sweep import load_sweep as load_sweep
-    from iblf_jax._sweep import sweep as sweep
     from iblf_jax.certificates import certify as certify
-    from iblf_jax.store import StoreError as StoreError
-    from iblf_jax.study import Study as Study
+    from iblf_jax.studies.compare import compare as compare
+    from iblf_jax.studies.comparison import Comparison as Comparison
+    from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
+    from iblf_jax.studies.sensitivity import sensitivity as sensitivity
+    from iblf_jax.studies.store import StoreError as StoreError
+    from iblf_jax.studies.study import Study as Study
+    from iblf_jax.studies.sweep import load_sweep as load_sweep
+    from iblf_jax.studies.sweep import sweep as sweep
     from iblf_jax.tuning import TuneResult as TuneResult
     from iblf_jax.tuning import cvar as cvar
     from iblf_jax.tuning import falsify as falsify
@@ -70,21 +70,21 @@ if TYPE_CHECKING:
 _ON_FIRST_USE = {
     "certificates": ("iblf_jax.certificates", None),
     "certify": ("iblf_jax.certificates", "certify"),
-    "compare": ("iblf_jax._compare", "compare"),
-    "Comparison": ("iblf_jax._comparison", "Comparison"),
+    "compare": ("iblf_jax.studies.compare", "compare"),
+    "Comparison": ("iblf_jax.studies.comparison", "Comparison"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "distributed": ("iblf_jax.distributed", None),
     "falsify": ("iblf_jax.tuning", "falsify"),
-    "load_sweep": ("iblf_jax._sweep", "load_sweep"),
+    "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
     "load_tuning": ("iblf_jax.tuning_file", "load_tuning"),
-    "monte_carlo": ("iblf_jax._monte_carlo", "monte_carlo"),
+    "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),
     "objectives": ("iblf_jax.tuning.objectives", None),
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
-    "sensitivity": ("iblf_jax._sensitivity", "sensitivity"),
-    "StoreError": ("iblf_jax.store", "StoreError"),
-    "Study": ("iblf_jax.study", "Study"),
-    "sweep": ("iblf_jax._sweep", "sweep"),
+    "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),
+    "StoreError": ("iblf_jax.studies.store", "StoreError"),
+    "Study": ("iblf_jax.studies.study", "Study"),
+    "sweep": ("iblf_jax.studies.sweep", "sweep"),
     "testing": ("iblf_jax.testing", None),
     "tunable": ("iblf_jax.tuning", "tunable"),
     "tune": ("iblf_jax.tuning", "tune"),

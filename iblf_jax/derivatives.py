@@ -11,7 +11,7 @@ are then summed up along the way, at next to no cost.  With w = 2 dt that is the
 **Reverse.**  One pass back through time gives the gradient by any number of parameters.  Only every T^(2/3)-th state is kept; the
 others are computed again, in three nested scans, so that about 3 T^(1/3) states are in memory at a time.
 
-Both go through `rollout.start`, `advance` and `finish`: it is the same loop, step by step.
+Both go through `time_loop.start`, `advance` and `finish`: it is the same loop, step by step.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ import jax.numpy as jnp
 
 from iblf_jax.one_function import SMALL, as_one_function
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import Carry, Outcome, advance, finish, start
 from iblf_jax.scenario import Scenario
+from iblf_jax.time_loop import Carry, Outcome, advance, finish, start
 
 
 class Outer(NamedTuple):
@@ -94,7 +94,7 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
       scenario: canonical.
       varied: path -> value.
       directions: path -> tangents of that value, (D, ...).
-      folds, dt, steps, method: as `rollout.run`.
+      folds, dt, steps, method: as `compact_loop.run`.
     """
     count = len(next(iter(directions.values())))
     first = jax.eval_shape(lambda v: start(with_parameters(scenario, v), folds, dt), varied)
@@ -155,7 +155,7 @@ def value_and_tangents(
       directions: path -> tangents of these values, (D, B, ...), for some or all of the paths.
       folds: the metrics.
       dt: time step, () [s].
-      steps, method: static, as `rollout.run`.
+      steps, method: static, as `compact_loop.run`.
 
     Returns:
       `Tangents` with the run axis first.
@@ -172,10 +172,10 @@ def value_and_tangents(
 
 
 def run_checkpointed(scenario: Scenario, folds, dt, *, steps: int, method: str) -> Outcome:
-    """`rollout.run` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
+    """`compact_loop.run` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
 
     Args:
-      scenario, folds, dt, steps, method: as `rollout.run`.
+      scenario, folds, dt, steps, method: as `compact_loop.run`.
     """
     inner = max(1, round(steps ** (1 / 3)))
     blocks, rest = divmod(steps, inner * inner)

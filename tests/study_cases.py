@@ -108,7 +108,7 @@ def _hinder(args) -> None:
     import signal
     import time
 
-    from iblf_jax.store import Store
+    from iblf_jax.studies.store import Store
 
     plain, written = Store.write, []
 

@@ -10,7 +10,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import barriers, cli, controllers
-from iblf_jax._compare import factor_nearest_one
+from iblf_jax.studies.compare import factor_nearest_one
 
 RUN = {"duration": 2.0, "dt": 1e-3, "record_every": 10}
 

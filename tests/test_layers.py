@@ -1,9 +1,9 @@
 """The layers of the package, held by its imports: they go down only.
 
     6 outside     presets  arms  robot_file  scenario_file  io  codec  plain  plotting/  cli/  testing/
-    5 studies     _compare  _comparison  _monte_carlo  _sweep  tuning/
+    5 studies     studies/  tuning/  distributions  distributed
     4 judgement   certificates
-    3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  rollout  lowering/
+    3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  time_loop  rollout  lowering/
     2 the law     barriers/  observers/  controllers/
     1 the world   robots/  references  bounds  disturbances
     0 ground      pytree  linalg  checks  status
@@ -26,13 +26,22 @@ LAYERS = {
     0: ("pytree", "linalg", "checks", "status", "one_function"),
     1: ("robots", "references", "bounds", "disturbances"),
     2: ("barriers", "observers", "controllers"),
-    3: ("integrators", "scenario", "closed_loop", "stability", "metrics", "results", "paths", "rollout", "derivatives", "lowering"),
-    4: ("certificates",),
-    5: (
-        *("_compare", "_comparison", "_monte_carlo", "_sweep", "_sensitivity", "study", "store", "distributions", "distributed", "tuning"),
-        *("_blocks", "_config", "_dataset", "_designs", "_draws", "_interrupt", "_points", "_progress", "_setup"),
-        *("_statistics", "_summaries"),
+    3: (
+        "integrators",
+        "scenario",
+        "closed_loop",
+        "stability",
+        "metrics",
+        "results",
+        "paths",
+        "time_loop",
+        "compact_loop",
+        "rollout",
+        "derivatives",
+        "lowering",
     ),
+    4: ("certificates",),
+    5: ("studies", "tuning", "distributions", "distributed"),
     6: (
         *("presets", "arms", "robot_file", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain"),
         *("plotting", "cli", "testing", "__main__"),
@@ -45,7 +54,7 @@ ONLY_IN = {
     "optax": ("tuning",),
     "argparse": ("cli",),
     "mujoco": ("robots",),
-    "xarray": ("io", "study", "_sweep", "_dataset", "_summaries", "_sensitivity", "cli", "plotting"),
+    "xarray": ("io", "studies", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""
 
@@ -128,9 +137,9 @@ def calls(source: str, name: str) -> list[int]:
 
 
 def test_time_is_scanned_in_one_place():
-    """lax.scan is a loop over time; `derivatives` steps the same `rollout.advance` with tangents; the power iteration of `stability` and
+    """lax.scan is a loop over time; `derivatives` steps the same `time_loop.advance` with tangents; the power iteration of `stability` and
     the checkers' own scans are not runs."""
-    allowed = {"rollout", "lowering", "derivatives", "stability", "testing"}
+    allowed = {"time_loop", "compact_loop", "lowering", "derivatives", "stability", "testing"}
     users = {module_of(p) for p, text in SOURCES.items() if calls(text, "jax.lax.scan") or calls(text, "lax.scan")}
     assert users <= allowed, users - allowed
 

@@ -12,7 +12,7 @@ import pytest
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax import lowering, rollout
+from iblf_jax import lowering, time_loop
 from iblf_jax.lowering import batch, native, program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.identities import FUNCTIONS
@@ -103,7 +103,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name):
     carry = jax.tree.map(lambda x: x[0], run.start())
     changed, _, dt = run.whole([x[0] for x in run.leaves.lane])
     p, _, _ = run.program(batch.step_function, jax.tree.map(lambda x: x[None], carry), "heun", False)
-    expected = numbers(jax.tree.leaves(jax.jit(lambda c: rollout.advance(changed, STANDARD, "heun", dt, c, index)[0])(carry)))
+    expected = numbers(jax.tree.leaves(jax.jit(lambda c: time_loop.advance(changed, STANDARD, "heun", dt, c, index)[0])(carry)))
     found = evaluate(p, numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index)
     np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
 

@@ -13,8 +13,8 @@ import study_cases as cases
 from scipy import stats
 
 import iblf_jax as ij
-from iblf_jax import _blocks, _statistics
 from iblf_jax.status import FAILED, Status
+from iblf_jax.studies import blocks, statistics
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -68,10 +68,10 @@ def test_two_devices_and_one_agree_bit_for_bit(study, tmp_path, compiled):
 
 
 def test_a_study_compiles_once_whatever_its_numbers(study):
-    before = _blocks._execute._cache_size()
+    before = blocks._execute._cache_size()
     stiffer = ij.with_parameters(SCENARIO, {"controller.K2": 30.0})
     ij.monte_carlo(stiffer, cases.perturbations(0.05, 0.01), runs=300, **cases.options() | {"seed": 9})
-    assert _blocks._execute._cache_size() == before
+    assert blocks._execute._cache_size() == before
 
 
 # ------------------------------------------------------------------------------------------------------------- the draws
@@ -208,7 +208,7 @@ def test_violation_probability_is_clopper_pearson(study):
 
 @pytest.mark.parametrize(("count", "runs"), [(0, 50), (50, 50)])
 def test_clopper_pearson_at_the_ends(count, runs):
-    found = _statistics.probability(np.arange(runs) < count, np.ones(runs, bool), 0.95, "independent", 1)
+    found = statistics.probability(np.arange(runs) < count, np.ones(runs, bool), 0.95, "independent", 1)
     end = 1 - 0.025 ** (1 / runs)
     assert (found.low, found.high) == pytest.approx((0.0, end) if count == 0 else (1 - end, 1.0))
 
@@ -216,12 +216,12 @@ def test_clopper_pearson_at_the_ends(count, runs):
 def test_intervals_of_designs_need_replicates():
     rng = np.random.default_rng(0)
     events, valid = rng.random(800) < 0.2, np.ones(800, bool)
-    assert _statistics.probability(events, valid, 0.95, "sobol", 1).low is None
-    found = _statistics.probability(events, valid, 0.95, "sobol", 8)
+    assert statistics.probability(events, valid, 0.95, "sobol", 1).low is None
+    found = statistics.probability(events, valid, 0.95, "sobol", 8)
     means = events.reshape(8, 100).mean(1)
     expected = stats.t.interval(0.95, 7, means.mean(), stats.sem(means))
     assert (found.low, found.high) == pytest.approx(expected)
-    assert _statistics.probability(np.zeros(800, bool), valid, 0.95, "sobol", 8).low is None
+    assert statistics.probability(np.zeros(800, bool), valid, 0.95, "sobol", 8).low is None
 
 
 def test_inadmissible_draws_are_flagged_and_left_out():

@@ -18,7 +18,7 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax import _interrupt, _sweep, store
+from iblf_jax.studies import interrupt, store, sweep
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -136,8 +136,8 @@ def test_store_opens_with_xarray_and_load(written, table):
 
 
 def test_a_finished_store_is_not_computed_again(finished, table, monkeypatch):
-    monkeypatch.setattr(_sweep, "run_blocks", lambda *_, **__: pytest.fail("computed again"))
-    monkeypatch.setattr(_sweep, "_units", lambda *_: iter(()))
+    monkeypatch.setattr(sweep, "run_blocks", lambda *_, **__: pytest.fail("computed again"))
+    monkeypatch.setattr(sweep, "_units", lambda *_: iter(()))
     assert cases.table(store=finished).identical(table)
 
 
@@ -320,7 +320,7 @@ def test_ctrl_c_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monk
         plain(self, unit, data)
 
     monkeypatch.setattr(store.Store, "write", write)
-    with pytest.raises(_interrupt.Interrupted, match=r"after 3 of 12 units.*Start the same call"):
+    with pytest.raises(interrupt.Interrupted, match=r"after 3 of 12 units.*Start the same call"):
         cases.table(store=path)
     assert "Ctrl-C" in capsys.readouterr().err
     monkeypatch.undo()

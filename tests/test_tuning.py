@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.compact_loop import run as plain_run
 from iblf_jax.metrics import standard
-from iblf_jax.rollout import run as plain_run
-from iblf_jax.rollout import start
 from iblf_jax.scenario import canonical
+from iblf_jax.time_loop import start
 from iblf_jax.tuning import _tune, problem
 from iblf_jax.tuning.newton import box_step
 from iblf_jax.tuning.optimise import Evaluator

@@ -180,7 +180,7 @@ def theorem_1(runs: Pair) -> Claim:
     V1, xi = _along(run, Integral())
     low, high = 0.5 * xi**2, xi**2 / (1.0 - xi**2)
     rounding = 8 * np.finfo(V1.dtype).eps * high + np.finfo(V1.dtype).tiny
-    kept = (low <= V1 + rounding) & (V1 <= high + rounding)
+    kept = (low <= V1 + rounding) & (high + rounding >= V1)
     broken = int(np.sum(~kept))
     at = np.unravel_index(np.argmax(np.abs(xi)), xi.shape)
     detail = (

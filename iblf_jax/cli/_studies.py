@@ -43,9 +43,9 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
     import jax
 
     from iblf_jax import checks, distributed
-    from iblf_jax._interrupt import Interrupted
     from iblf_jax.cli import complain
-    from iblf_jax.store import StoreError, StoreWriteError
+    from iblf_jax.studies.interrupt import Interrupted
+    from iblf_jax.studies.store import StoreError, StoreWriteError
 
     _check_out(args.out)
     if args.devices is not None:

@@ -18,7 +18,7 @@ from iblf_jax.cli._common import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from iblf_jax._comparison import Comparison
+    from iblf_jax.studies.comparison import Comparison
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -40,8 +40,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax._compare import compare
     from iblf_jax.controllers import LAWS
+    from iblf_jax.studies.compare import compare
 
     file = scenario_of(args)
     options = run_options(args, file)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, table, write_netcdf
 
 if TYPE_CHECKING:
-    from iblf_jax.study import Study
+    from iblf_jax.studies.study import Study
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
 
     def work(how: dict[str, Any]) -> int:
         from iblf_jax import distributed
-        from iblf_jax._monte_carlo import monte_carlo
+        from iblf_jax.studies.monte_carlo import monte_carlo
         from iblf_jax.study_file import load_study_file
 
         file = load_study_file(args.file, "study")
@@ -50,8 +50,8 @@ def report(study: Study) -> str:
     """What a study found, as text."""
     import numpy as np
 
-    from iblf_jax._statistics import one_number
     from iblf_jax.cli._common import number
+    from iblf_jax.studies.statistics import one_number
 
     rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
     for name in study.metrics if study.made.any() else ():

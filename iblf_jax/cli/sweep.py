@@ -33,8 +33,8 @@ def run(args: argparse.Namespace) -> int:
 
     def work(how: dict[str, Any]) -> int:
         from iblf_jax import distributed
-        from iblf_jax._sweep import sweep
         from iblf_jax.status import FAILED
+        from iblf_jax.studies.sweep import sweep
         from iblf_jax.study_file import load_study_file
 
         file = load_study_file(args.file, "sweep")

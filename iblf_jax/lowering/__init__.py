@@ -15,20 +15,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import jax
 
-from iblf_jax import checks
+from iblf_jax import checks, compact_loop
 from iblf_jax.derivatives import Tangents
 from iblf_jax.lowering import batch, gpu, native, sensitivities, xla
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.one_function import SMALL, as_one_function
 from iblf_jax.paths import with_parameters
-from iblf_jax.rollout import Outcome, run
 from iblf_jax.scenario import Scenario
+from iblf_jax.time_loop import Outcome
 
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a batch can be executed; "auto" is native on CPU, gpu on an NVIDIA GPU, else xla."""
@@ -144,7 +143,7 @@ def run_batch(
     """
 
     def one(varied):
-        return run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
+        return compact_loop.run(with_parameters(scenario, varied), folds, dt, steps=steps, method=method, record_every=record_every)
 
     def run_on(executor):
         return batch.run(executor, scenario, varied, folds, dt, steps=steps, method=method, record_every=record_every)
@@ -169,12 +168,14 @@ def run_alone(scenario: Scenario, folds, dt: jax.Array, *, steps: int, method: s
         return batch.run_alone(executor, scenario, folds, dt, **options, longest=LONGEST_ALONE if executor is xla.run else None)
 
     def plain():
-        return as_one_function(partial(run, **options))(scenario, folds, dt)
+        return compact_loop.run(scenario, folds, dt, alone=True, **options)
 
     if backend != "xla":
         return with_fallback(backend, run_on, plain)
+    if jax.default_backend() != "cpu" or compact_loop.is_for(scenario, dt):
+        return plain()
     try:
-        return run_on(xla.run) if jax.default_backend() == "cpu" else plain()
+        return run_on(xla.run)
     except UnsupportedError:
         return plain()
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import rollout
+from iblf_jax import time_loop
 from iblf_jax.closed_loop import LoopState
 from iblf_jax.lowering.program import Program, UnsupportedError
 from iblf_jax.lowering.step import Leaves, Packed, Shapes, lowered, pack, split, unpack
@@ -29,8 +29,8 @@ def step_function(treedef, is_lane: tuple[bool, ...], carry_treedef, method: str
         scenario, folds, dt = Leaves(treedef, is_lane, [], []).together(shared, lane)
         carry = jax.tree.unflatten(carry_treedef, carry)
         state = carry.state
-        carry, sample = rollout.advance(scenario, folds, method, dt, carry, index)
-        return jax.tree.leaves(carry), jax.tree.leaves(rollout.record_of(sample, state)) if recorded else []
+        carry, sample = time_loop.advance(scenario, folds, method, dt, carry, index)
+        return jax.tree.leaves(carry), jax.tree.leaves(time_loop.record_of(sample, state)) if recorded else []
 
     return step
 
@@ -89,7 +89,7 @@ class Batch(NamedTuple):
 
     def start(self):
         """The carry before the first step."""
-        return jax.vmap(lambda lane: rollout.start(*self.whole(lane)), axis_size=self.runs)(self.leaves.lane)
+        return jax.vmap(lambda lane: time_loop.start(*self.whole(lane)), axis_size=self.runs)(self.leaves.lane)
 
 
 def batch_of(executor: Executor, scenario, varied, folds, dt) -> Batch:
@@ -99,7 +99,7 @@ def batch_of(executor: Executor, scenario, varied, folds, dt) -> Batch:
 
 
 def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: str, record_every: int | None):
-    """`rollout.run` for every entry of `varied`, by a lowered step.
+    """`compact_loop.run` for every entry of `varied`, by a lowered step.
 
     Raises:
       UnsupportedError: the step does not lower.
@@ -112,19 +112,19 @@ def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: 
 
 
 def run_alone(executor: Executor, scenario, folds, dt, *, steps: int, method: str, record_every: int, longest: int | None):
-    """`rollout.run` for one run, by a lowered step of at most `longest` operations; raises as `run`.
+    """`compact_loop.run` for one run, by a lowered step of at most `longest` operations; raises as `run`.
 
     Start and end are the plain ones, quicker to compile than lowered.
     """
     batch = batch_of(executor, scenario, {"initial.q": scenario.initial.q[None]}, folds, dt)
-    carry = jax.tree.map(lambda x: x[None], rollout.start(scenario, folds, dt))
+    carry = jax.tree.map(lambda x: x[None], time_loop.start(scenario, folds, dt))
     if longest and len(batch.program(step_function, carry, method, True)[0].nodes) > longest:
         raise UnsupportedError(f"its step has more than {longest} operations")
     carry, samples = batch.advance(step_function, carry, steps, record_every, method, True)
 
     def end(scenario, folds, dt, carry):
-        carry, sample, outcome = rollout.finish(scenario, folds, method, dt, steps, carry)
-        return outcome, rollout.record_of(sample, carry.state)
+        carry, sample, outcome = time_loop.finish(scenario, folds, method, dt, steps, carry)
+        return outcome, time_loop.record_of(sample, carry.state)
 
     outcome, last = as_one_function(end)(scenario, folds, dt, jax.tree.map(lambda x: x[0], carry))
     records = _records(samples, jax.tree.map(lambda x: x[None], last), steps % record_every == 0)
@@ -132,23 +132,23 @@ def run_alone(executor: Executor, scenario, folds, dt, *, steps: int, method: st
 
 
 def finish(batch: Batch, method: str, steps: int, carry: Any):
-    """`rollout.finish` for a batch: the outcome, and what would be recorded of the last sample."""
+    """`time_loop.finish` for a batch: the outcome, and what would be recorded of the last sample."""
 
     def observe(lane, carry):
         scenario, folds, dt = batch.whole(lane)
-        carry, sample = rollout.observe_end(scenario, folds, dt, steps, carry)
-        return carry, rollout.record_of(sample, carry.state)
+        carry, sample = time_loop.observe_end(scenario, folds, dt, steps, carry)
+        return carry, time_loop.record_of(sample, carry.state)
 
     carry, last = jax.vmap(observe)(batch.leaves.lane, carry)
     return verdicts(batch, method, carry, critical_modes(batch, steps, carry)), last
 
 
 def verdicts(batch: Batch, method: str, carry: Any, modes: jax.Array):
-    """`rollout.verdict` for a batch."""
+    """`time_loop.verdict` for a batch."""
 
     def judge(lane, carry, modes):
         _, folds, dt = batch.whole(lane)
-        return rollout.verdict(folds, method, dt, carry, modes)
+        return time_loop.verdict(folds, method, dt, carry, modes)
 
     return jax.vmap(judge)(batch.leaves.lane, carry, modes)
 
@@ -158,7 +158,7 @@ def critical_modes(batch: Batch, steps: int, carry: Any) -> jax.Array:
 
     def instants(lane, carry):
         scenario, _, dt = batch.whole(lane)
-        times, states = rollout.critical_instants(scenario, dt, steps, carry)
+        times, states = time_loop.critical_instants(scenario, dt, steps, carry)
         return Instants(jax.vmap(growth_start)(states), times, states)
 
     found, _ = batch.advance(mode_function, jax.vmap(instants)(batch.leaves.lane, carry), POWER_ITERATIONS, None)

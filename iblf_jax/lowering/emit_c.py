@@ -30,7 +30,7 @@ CALLS = (
 SEGMENT, LONG = 5000, 20_000
 """Operations of a function of the native backend, where a step has more than LONG: slower by a third, but built three times as fast."""
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
-NATIVE = (("vector.h", "mathlib.h"), ("driver.h",))
+NATIVE = (("vector.h", "mathlib.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
 

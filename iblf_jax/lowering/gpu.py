@@ -69,7 +69,7 @@ def launcher(program: Program, shared: int, lane: int, image: bytes) -> str:
     padded = image + bytes(-len(image) % 8)
     words = ",".join(map(hex, np.frombuffer(padded, "<u8").tolist()))
     array = f"static const unsigned long long image[] = {{{words}}};\n"
-    return "\n".join([sizes(program, shared, lane), array, header("launch.h")])
+    return "\n".join([sizes(program, shared, lane), array, header("frame.h"), header("launch.h")])
 
 
 @lru_cache(maxsize=64)

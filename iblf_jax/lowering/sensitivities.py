@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax import rollout
+from iblf_jax import time_loop
 from iblf_jax.closed_loop import LoopState, Sample, evaluate
 from iblf_jax.derivatives import Tangents, outer_of, value_and_tangents
 from iblf_jax.lowering import native
@@ -58,13 +58,13 @@ class Directions(NamedTuple):
 class Differentiated(NamedTuple):
     """What goes from step to step: the carry, P tangents of state and accumulators, the products of each `Outer`."""
 
-    carry: rollout.Carry
+    carry: time_loop.Carry
     tangents: list[jax.Array]
     products: list[jax.Array]
     """Upper triangles, row by row, (P (P + 1) / 2,) each."""
 
 
-def _floats(carry: rollout.Carry) -> tuple[list[jax.Array], Callable]:
+def _floats(carry: time_loop.Carry) -> tuple[list[jax.Array], Callable]:
     """The numbers of a carry that have tangents, and the function that puts others in their place."""
     leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
     places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
@@ -102,7 +102,7 @@ def pushed(function: Callable, directions: Directions, scenario, before: Differe
     return jax.vmap(along, out_axes=(None, 0, None))(units, before.tangents if before else [])
 
 
-def _floats_and_rest(carry: rollout.Carry):
+def _floats_and_rest(carry: time_loop.Carry):
     return _floats(carry)[0], carry
 
 
@@ -159,7 +159,7 @@ def derivative_function(treedef, is_lane: tuple[bool, ...], carry_treedef, metho
 
         def one(moved, carry, eps):
             loop = preaccumulated(scenario, directions, eps, carry.state)
-            after, sample = rollout.advance(moved, folds, method, dt, carry, index, loop)
+            after, sample = time_loop.advance(moved, folds, method, dt, carry, index, loop)
             outer = outer_of(folds, carry.accumulators, sample)
             return (_floats(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
 
@@ -195,7 +195,7 @@ def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, fo
 
     def begin(lane):
         scenario, folds, dt = batch.whole(lane)
-        _, tangents, carry = pushed(lambda s, *_: _floats_and_rest(rollout.start(s, folds, dt)), directions, scenario, None, dt.dtype)
+        _, tangents, carry = pushed(lambda s, *_: _floats_and_rest(time_loop.start(s, folds, dt)), directions, scenario, None, dt.dtype)
         return Differentiated(carry, tangents, [jnp.zeros((len(rows),), dt.dtype)] * count)
 
     before = jax.vmap(begin, axis_size=batch.runs)(batch.leaves.lane)
@@ -205,8 +205,8 @@ def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, fo
         scenario, folds, dt = batch.whole(lane)
 
         def metrics(scenario, carry, _):
-            carry, _ = rollout.observe_end(scenario, folds, dt, steps, carry)
-            outcome = rollout.verdict(folds, method, dt, carry, jnp.zeros((1,), dt.dtype))
+            carry, _ = time_loop.observe_end(scenario, folds, dt, steps, carry)
+            outcome = time_loop.verdict(folds, method, dt, carry, jnp.zeros((1,), dt.dtype))
             return _floats_of(outcome.metrics), carry
 
         _, tangents, carry = pushed(metrics, directions, scenario, before, dt.dtype)

@@ -1,6 +1,6 @@
 """The step of a scenario as a scalar program, and the arrays that go in and out of it.
 
-A kernel maps carry to carry over many steps.  What comes before (`rollout.start`) and after (`rollout.finish`) is done once a run
+A kernel maps carry to carry over many steps.  What comes before (`time_loop.start`) and after (`time_loop.finish`) is done once a run
 and stays in jnp.  The leaves of scenario and metrics are inputs of the kernel, never constants: new gains do not recompile.
 """
 

@@ -9,9 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax import _statistics, checks
+from iblf_jax import checks
 from iblf_jax.plotting import _style
-from iblf_jax.study import Study
+from iblf_jax.studies import statistics
+from iblf_jax.studies.study import Study
 
 if TYPE_CHECKING:
     import xarray
@@ -121,7 +122,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
     """
     _check(study)
     names = list(study.metrics) if metrics is None else list(metrics)
-    values = {name: _statistics.one_number(study.metrics, name) for name in names}
+    values = {name: statistics.one_number(study.metrics, name) for name in names}
     if metrics is None:
         values = {name: x for name, x in values.items() if np.isfinite(x).any() and np.ptp(x[np.isfinite(x)]) > 0}
     if not values:
@@ -163,7 +164,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
       ValueError: not a study, or an unknown metric.
     """
     _check(study)
-    drawn = _statistics.columns(study.samples)
+    drawn = statistics.columns(study.samples)
     figure, panels = _grid(len(drawn), 2.2)
     for axes, (path, x) in zip(panels, drawn.items(), strict=True):
         _draw_scatter(axes, study, metric, path, x)
@@ -173,7 +174,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
 
 
 def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarray) -> None:
-    y = _statistics.one_number(study.metrics, metric)
+    y = statistics.one_number(study.metrics, metric)
     failed = np.zeros(study.runs, bool)
     failed[study.failed] = True
     some = study.made & np.isfinite(y)
@@ -184,7 +185,7 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
     axes.scatter(x[bad], y[bad], s=9, marker="x", linewidths=0.8, label="failed", **BAD)
     if metric in ("margin", "xi_margin"):
         axes.axhline(0.0, color=_style.BOUND, linewidth=1.0)
-    rho, _ = _statistics.rank_correlation(x[some], y[some])
+    rho, _ = statistics.rank_correlation(x[some], y[some])
     axes.set_title("" if np.isnan(rho) else f"rank correlation {rho:.2f}")
     axes.locator_params(axis="x", nbins=4)
     axes.set_xlabel(_style.label(path, study.parameter_unit(path)))
@@ -206,8 +207,8 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
       ValueError: not a study, or one without the metric `margin`.
     """
     _check(study)
-    drawn, data = _statistics.columns(study.samples), study.bands(runs=runs)
-    margins = _statistics.one_number(study.metrics, "margin")
+    drawn, data = statistics.columns(study.samples), study.bands(runs=runs)
+    margins = statistics.one_number(study.metrics, "margin")
     count = study.scenario.n + 1 + len(drawn)
     figure, panels = _grid(count, 2.3)
     for joint in range(study.scenario.n):

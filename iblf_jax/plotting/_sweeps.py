@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from iblf_jax import checks
-from iblf_jax._statistics import SMALLER_IS_WORSE
 from iblf_jax.plotting import _style
 from iblf_jax.status import FAILED
+from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
 if TYPE_CHECKING:
     import xarray

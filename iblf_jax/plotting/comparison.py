@@ -21,7 +21,7 @@ from iblf_jax.plotting._panels import QUANTITIES, Window, draw, set_limits
 from iblf_jax.plotting._style import BOUND
 
 if TYPE_CHECKING:
-    from iblf_jax._comparison import Comparison
+    from iblf_jax.studies.comparison import Comparison
 
 SMALLEST = 1e-5
 """Errors below this [rad] are drawn at the foot of the logarithmic axis."""

@@ -23,9 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax._designs import check_seed
-from iblf_jax._draws import Cases, Target, draw, plan, sample_size
-from iblf_jax._progress import bar
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.lowering import BACKENDS
@@ -34,6 +31,9 @@ from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.status import Status
+from iblf_jax.studies.designs import check_seed
+from iblf_jax.studies.draws import Cases, Target, draw, plan, sample_size
+from iblf_jax.studies.progress import bar
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.tangents import by_coordinates
 

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax._progress import bar
 from iblf_jax.distributions import Perturbation
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario
+from iblf_jax.studies.progress import bar
 from iblf_jax.tuning._tune import build, make_method, way_in
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.optimise import Evaluator, Loop

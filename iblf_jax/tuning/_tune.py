@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax._designs import check_seed
-from iblf_jax._draws import Cases, plan
-from iblf_jax._progress import bar
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.studies.designs import check_seed
+from iblf_jax.studies.draws import Cases, plan
+from iblf_jax.studies.progress import bar
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete

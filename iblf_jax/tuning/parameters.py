@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks, paths
-from iblf_jax._draws import check_paths
 from iblf_jax.integrators import tableau
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario
 from iblf_jax.stability import _jacobians
+from iblf_jax.studies.draws import check_paths
 
 CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the paper's law."""

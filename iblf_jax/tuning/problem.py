@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax._draws import Cases, Target, draw, merge, same_place
 from iblf_jax.derivatives import run_checkpointed
 from iblf_jax.lowering import run_batch
 from iblf_jax.paths import with_parameters
 from iblf_jax.status import Status
+from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import Block, values_at
 from iblf_jax.tuning.quantities import Peak, Quantities

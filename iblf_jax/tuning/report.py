@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from iblf_jax._monte_carlo import monte_carlo
-from iblf_jax._statistics import Probability, probability
 from iblf_jax.metrics import Margin
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status
-from iblf_jax.study import VIOLATED
+from iblf_jax.studies.monte_carlo import monte_carlo
+from iblf_jax.studies.statistics import Probability, probability
+from iblf_jax.studies.study import VIOLATED
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.robust import Risk

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks, paths
-from iblf_jax._designs import check_seed
 from iblf_jax.distributions import Perturbation
 from iblf_jax.lowering import run_batch
 from iblf_jax.metrics import as_folds
 from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.studies.designs import check_seed
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.problem import UNSOUND
 from iblf_jax.tuning.quantities import Quantities

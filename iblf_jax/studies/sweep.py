@@ -16,18 +16,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax import _config, checks, distributed
-from iblf_jax._blocks import MEMORY, Results, _execute, block_size, run_blocks
-from iblf_jax._dataset import DRAWN, own_dims, to_dataset
-from iblf_jax._designs import check_sampler, check_seed
-from iblf_jax._interrupt import CtrlC, Interrupted
-from iblf_jax._points import make_points
-from iblf_jax._progress import bar
-from iblf_jax._setup import Setup, prepare
+from iblf_jax import checks, distributed
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.store import Store, StoreError, Variable, load_store, open_store
+from iblf_jax.studies import config as configuration
+from iblf_jax.studies.blocks import MEMORY, Results, _execute, block_size, run_blocks
+from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
+from iblf_jax.studies.designs import check_sampler, check_seed
+from iblf_jax.studies.interrupt import CtrlC, Interrupted
+from iblf_jax.studies.points import make_points
+from iblf_jax.studies.progress import bar
+from iblf_jax.studies.setup import Setup, prepare
+from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
 
 if TYPE_CHECKING:
     import xarray
@@ -124,7 +125,7 @@ def sweep(
     where = make_points(canonical(scenario), grid, design, points, check_seed(seed))
     options: dict[str, Any] = {"metrics": metrics, "backend": backend, "sampler": sampler, "replicates": replicates, "points": where.values}
     setup = prepare(scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options)
-    config = _config.describe(setup, where, design, float(dt))
+    config = configuration.describe(setup, where, design, float(dt))
     how = _How(chunk, memory, devices, progress)
     if store is None:
         return _in_memory(setup, config, how)

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from iblf_jax import _statistics, checks
-from iblf_jax._blocks import block_size, run_blocks
-from iblf_jax._config import describe_component
-from iblf_jax._dataset import own_dims
+from iblf_jax import checks
 from iblf_jax.paths import get, parameters
 from iblf_jax.status import FAILED, Status
+from iblf_jax.studies import statistics
+from iblf_jax.studies.blocks import block_size, run_blocks
+from iblf_jax.studies.config import describe_component
+from iblf_jax.studies.dataset import own_dims
 
 if TYPE_CHECKING:
     import xarray
 
-    from iblf_jax.study import Study
+    from iblf_jax.studies.study import Study
 
 RECORDED = {"q": "rad", "e1": "rad"}
 """What bands are made of, and its unit."""
@@ -61,12 +62,12 @@ def correlations(study: Study, metrics: Sequence[str] | None, exclude_failed: bo
 
     used, said = study.chosen(exclude_failed)
     names = list(study.metrics) if metrics is None else list(metrics)
-    drawn = _statistics.columns(study.samples)
+    drawn = statistics.columns(study.samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
-        y = _statistics.one_number(study.metrics, name)[used]
+        y = statistics.one_number(study.metrics, name)[used]
         for i, x in enumerate(drawn.values()):
-            found[i, j] = _statistics.rank_correlation(x[used], y)
+            found[i, j] = statistics.rank_correlation(x[used], y)
     dims = ("parameter", "metric")
     variables = {"correlation": (dims, found[..., 0], {"units": "1"}), "p_value": (dims, found[..., 1], {"units": "1"})}
     return xarray.Dataset(variables, {"parameter": list(drawn), "metric": names}, said | {"of": "the worst joint of each metric"})

@@ -14,14 +14,14 @@ import jax
 import numpy as np
 
 from iblf_jax import checks, distributed
-from iblf_jax._blocks import MEMORY, Results, block_size, run_blocks
-from iblf_jax._designs import check_sampler
-from iblf_jax._progress import bar
-from iblf_jax._setup import prepare
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario
-from iblf_jax.study import Study
+from iblf_jax.studies.blocks import MEMORY, Results, block_size, run_blocks
+from iblf_jax.studies.designs import check_sampler
+from iblf_jax.studies.progress import bar
+from iblf_jax.studies.setup import prepare
+from iblf_jax.studies.study import Study
 
 
 def monte_carlo(

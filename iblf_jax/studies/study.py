@@ -17,16 +17,17 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax import _statistics, _summaries, checks, paths
-from iblf_jax._blocks import Results, block_size, run_blocks
-from iblf_jax._setup import Setup
-from iblf_jax._statistics import Probability
+from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.rollout import trajectory
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.studies import statistics, summaries
+from iblf_jax.studies.blocks import Results, block_size, run_blocks
+from iblf_jax.studies.setup import Setup
+from iblf_jax.studies.statistics import Probability
 
 if TYPE_CHECKING:
     import xarray
@@ -160,8 +161,8 @@ class Study:
         happened = self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
         if happened.shape != (self.runs,) or happened.dtype != bool:
             raise checks.fail("event", event, f"flags of Status, or {self.runs} booleans")
-        confidence = _statistics.check_confidence(confidence)
-        return _statistics.probability(happened, self.made, confidence, self.setup.sampler, self.setup.replicates)
+        confidence = statistics.check_confidence(confidence)
+        return statistics.probability(happened, self.made, confidence, self.setup.sampler, self.setup.replicates)
 
     def worst(self, count: int = 10, metric: str = "margin") -> np.ndarray:
         """Numbers of the worst runs, worst first: smallest margin, or largest of another metric, of the worst joint.
@@ -179,8 +180,8 @@ class Study:
         Source: design of this package.
         """
         count = checks.positive_integer("count", count)
-        values = _statistics.one_number(self.metrics, metric)
-        order = np.argsort(values if metric in _statistics.SMALLER_IS_WORSE else -values, kind="stable")
+        values = statistics.one_number(self.metrics, metric)
+        order = np.argsort(values if metric in statistics.SMALLER_IS_WORSE else -values, kind="stable")
         return order[self.made[order]][:count]
 
     def parameter_unit(self, path: str) -> str:
@@ -204,7 +205,7 @@ class Study:
         Raises:
           ValueError: numbers outside [0, 1].
         """
-        return _summaries.metric_quantiles(self, quantiles, exclude_failed)
+        return summaries.metric_quantiles(self, quantiles, exclude_failed)
 
     def correlations(self, metrics: Sequence[str] | None = None, *, exclude_failed: bool = False) -> xarray.Dataset:
         """Spearman's rank correlation of every drawn parameter with every metric (its worst joint), and the p-value.
@@ -216,7 +217,7 @@ class Study:
         Raises:
           ValueError: an unknown metric.
         """
-        return _summaries.correlations(self, metrics, exclude_failed)
+        return summaries.correlations(self, metrics, exclude_failed)
 
     def bands(
         self,
@@ -237,11 +238,11 @@ class Study:
         Raises:
           ValueError: bad arguments, or no run that is left.
         """
-        return _summaries.bands(self, quantiles, runs, samples, exclude_failed)
+        return summaries.bands(self, quantiles, runs, samples, exclude_failed)
 
     def to_xarray(self) -> xarray.Dataset:
         """All runs as an `xarray.Dataset`: metrics and status along `run` (and `joint`), the drawn values as coordinates."""
-        return _summaries.to_xarray(self)
+        return summaries.to_xarray(self)
 
     def plot(self, **options: Any) -> Any:
         """Overview figure: the tube with bands, margins, and margin against each parameter.  Options as `plotting.study_overview`."""

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax._comparison import Comparison
 from iblf_jax.controllers import LAWS, Controller, law_by_name
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.metrics import AboveGravity, standard
@@ -31,6 +30,7 @@ from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.studies.comparison import Comparison
 
 RATIO = math.sqrt(2.0)
 """Grid of factors: powers of this."""

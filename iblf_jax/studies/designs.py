@@ -1,6 +1,6 @@
 """Where the uniform numbers of a study come from: independent draws, a Latin hypercube or Sobol points.
 
-Independent draws are made run by run inside the compiled block (`_draws`).  A design covers the unit cube more evenly, so means
+Independent draws are made run by run inside the compiled block (`draws`).  A design covers the unit cube more evenly, so means
 converge faster, but its points are not independent: no Clopper-Pearson interval holds.  So a designed study is made of
 `replicates` designs, scrambled independently, and its intervals come from the spread between them.
 

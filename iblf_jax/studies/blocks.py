@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax._draws import Cases, Lanes, Target, draw, merge
 from iblf_jax.lowering import run_batch, settled
 from iblf_jax.status import Status, flag
+from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
 BLOCK = {"cpu": 256}
 """Runs in a block, by platform."""

@@ -27,7 +27,7 @@ def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Ma
     """The Dataset from flat data.
 
     Args:
-      config: what `_config.describe` gave.
+      config: what `config.describe` gave.
       flat: name -> (cases, ...); case = point * runs + run.
       units: name -> unit.
       done: which cases are there, (cases,) bool.

@@ -1,4 +1,4 @@
-"""The time loop for long closed loops (`rollout.run_compactly`) is the time loop: same records, metrics, verdicts and derivatives."""
+"""The time loop for long closed loops (`compact_loop.run_compactly`) is the time loop: same records, metrics, verdicts and derivatives."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import one_function, rollout, stability
+from iblf_jax import compact_loop, one_function, rollout, stability, time_loop
 from iblf_jax.metrics import as_folds
 from iblf_jax.scenario import canonical
 from iblf_jax.status import Status
@@ -20,8 +20,8 @@ def both(scenario, method="rk4", record_every=1, alone=True, steps=50, dt=1e-3):
     scenario, step = canonical(scenario), jnp.asarray(dt)
     folds = as_folds(None, step.dtype)
     options = {"steps": steps, "record_every": record_every, "method": method}
-    plain = jax.jit(partial(rollout.run, **options))(scenario, folds, step)
-    return plain, jax.jit(partial(rollout.run_compactly, alone=alone, **options))(scenario, folds, step)
+    plain = jax.jit(partial(time_loop.scan_steps, **options))(scenario, folds, step)
+    return plain, jax.jit(partial(compact_loop.run_compactly, alone=alone, **options))(scenario, folds, step)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
 def test_long_loops_take_it(paper, monkeypatch):
     """By its length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)
-    monkeypatch.setattr(rollout, "_is_long", lambda *args: True)
+    monkeypatch.setattr(compact_loop, "is_for", lambda *args: True)
     rollout._run_compiled.clear_cache()
     try:
 

@@ -1,7 +1,7 @@
 """The points of a sweep: a full grid of values, or a random or Latin-hypercube design over distributions.
 
 A grid has one dimension a path, and its points are numbered with the last path running fastest.  A design has the one dimension
-"point"; point j draws as run j of a study does (`_draws`), from a key of its own.
+"point"; point j draws as run j of a study does (`draws`), from a key of its own.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import jax
 import numpy as np
 
 from iblf_jax import checks, paths
-from iblf_jax._designs import split, unit_points
-from iblf_jax._draws import Cases, Lanes, Target, check_paths, draw, plan, sample_size
 from iblf_jax.distributions import Perturbation, is_distribution, value
 from iblf_jax.scenario import Scenario
+from iblf_jax.studies.designs import split, unit_points
+from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, plan, sample_size
 
 DESIGNS = ("grid", "random", "latin_hypercube")
 POINT = "point"

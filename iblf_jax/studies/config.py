@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax._blocks import _execute, block_size
-from iblf_jax._points import Points
-from iblf_jax._setup import Setup
 from iblf_jax.paths import get, parameters, unit_at
 from iblf_jax.pytree import is_leaf_field
+from iblf_jax.studies.blocks import _execute, block_size
+from iblf_jax.studies.points import Points
+from iblf_jax.studies.setup import Setup
 
 
 def describe_component(part: Any) -> Any:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax._blocks import Program, Shared, block_size, with_settled_backend
-from iblf_jax._designs import check_seed, split, unit_points
-from iblf_jax._draws import Cases, Lanes, plan, sample_size
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.metrics import Fold, as_folds
 from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.studies.blocks import Program, Shared, block_size, with_settled_backend
+from iblf_jax.studies.designs import check_seed, split, unit_points
+from iblf_jax.studies.draws import Cases, Lanes, plan, sample_size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,18 +21,19 @@ import jax
 import numpy as np
 from scipy import stats
 
-from iblf_jax import _statistics, checks
-from iblf_jax._blocks import MEMORY, block_size, run_blocks
-from iblf_jax._designs import check_seed, split
-from iblf_jax._draws import sample_size
-from iblf_jax._progress import bar
-from iblf_jax._setup import Setup, prepare
+from iblf_jax import checks
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.results import Metrics
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED
-from iblf_jax.study import metric_units
+from iblf_jax.studies import statistics
+from iblf_jax.studies.blocks import MEMORY, block_size, run_blocks
+from iblf_jax.studies.designs import check_seed, split
+from iblf_jax.studies.draws import sample_size
+from iblf_jax.studies.progress import bar
+from iblf_jax.studies.setup import Setup, prepare
+from iblf_jax.studies.study import metric_units
 
 if TYPE_CHECKING:
     import xarray
@@ -168,7 +169,7 @@ def _evaluate(setup: Setup, u: np.ndarray, shapes: dict, output: Any, options: d
     metrics: dict[str, Any] = {name: np.concatenate([p.metrics[name] for p in parts])[: len(u)] for name in parts[0].metrics}
     status = np.concatenate([p.status for p in parts])[: len(u)]
     if isinstance(output, str):
-        y = _statistics.one_number(metrics, output)
+        y = statistics.one_number(metrics, output)
     else:
         y = np.asarray(output(Metrics(metrics, metric_units(setup.shared.folds))))
     name = output if isinstance(output, str) else "output"

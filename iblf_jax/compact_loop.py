@@ -1,0 +1,99 @@
+"""The time loop for long closed loops, and the choice between the two.
+
+An arm of seven joints has ten thousand operations an evaluation, and the plain loop holds several of them: compiling is then what takes
+the time.  Here the closed loop is there once, as a piece of its own (`one_function`).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax.closed_loop import evaluate, initial_state
+from iblf_jax.integrators import stages
+from iblf_jax.one_function import as_one_function, is_long
+from iblf_jax.scenario import Scenario
+from iblf_jax.stability import fastest_mode_by_differences
+from iblf_jax.time_loop import Carry, Nearest, Outcome, critical_instants, folded, keep_if, moved, record_of, scan_steps, verdict
+
+_evaluate_once = jax.jit(evaluate)
+"""`closed_loop.evaluate`, traced once however often it is called."""
+
+
+def is_for(scenario: Scenario, dt) -> bool:
+    """Whether the closed loop is so long that it is for `run_compactly`."""
+    return is_long(_evaluate_once, scenario, jnp.zeros_like(dt), initial_state(scenario), dt)
+
+
+def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool = False) -> Outcome:
+    """As `time_loop.scan_steps`, for a closed loop of so many operations that compiling is what takes the time.
+
+    The closed loop is there once, in a loop over the stages of the integrator, and once more where its modes are measured.  So the
+    sample at the end is that of a step that is not made, and the accumulators begin with the first sample.  `alone` says that nobody
+    will batch it from outside: then its pieces become machine functions.
+    """
+    piece = as_one_function if alone else lambda function: function
+    every = min(record_every or 1, steps + 1)
+    state, zero = initial_state(scenario), jnp.zeros_like(dt)
+    shapes = jax.eval_shape(_evaluate_once, scenario, zero, state, dt)
+    _, whole_sample = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[1]))
+    _, whole = ravel_pytree(state)
+    weights = tuple(jnp.asarray(w, dt.dtype) for w in stages(method))
+
+    @piece
+    def loop(scenario, t, x, covered):
+        return tuple(ravel_pytree(part)[0] for part in _evaluate_once(scenario, t, whole(x), covered))
+
+    @piece
+    def after(carry, record, index, sample, stepped):
+        sample = whole_sample(sample)
+        begun = carry._replace(accumulators=keep_if(index > 0, carry.accumulators, tuple(fold.init(sample) for fold in folds)))
+        there = moved(folded(folds, sample, begun), whole(stepped), index < steps)
+        record = keep_if(index % every == 0, record_of(sample, carry.state), record) if record_every else None
+        return keep_if(index <= steps, there, carry), record
+
+    def one(carried, index):
+        carry, record = carried
+        t, x = index.astype(dt.dtype) * dt, ravel_pytree(carry.state)[0]
+        covered = jnp.where(index < steps, dt, zero)
+
+        def stage(slope_and_sum, weights):
+            (k, total), (c, a, b) = slope_and_sum, weights
+            k, sample = loop(scenario, t + c * dt, x + dt * (a * k), covered)
+            return (k, total + b * k), sample
+
+        (_, total), samples = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
+        return after(carry, record, index, samples[0], x + dt * total), None
+
+    def block(carried, first):
+        carried, _ = jax.lax.scan(one, carried, first + jnp.arange(every))
+        return carried, carried[1]
+
+    blank = jax.eval_shape(lambda sample: tuple(fold.init(sample) for fold in folds), shapes[1])
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
+    carry = Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(dt), zero, jax.lax.stop_gradient(state)))
+    record = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(record_of, shapes[1], state)) if record_every else None
+    (carry, _), records = jax.lax.scan(block, (carry, record), every * jnp.arange(steps // every + 1))
+    times, states = critical_instants(scenario, dt, steps, carry)
+
+    def mode(instant):
+        t, state = instant
+        return fastest_mode_by_differences(lambda x: loop(scenario, t, x, zero)[0], ravel_pytree(state)[0])
+
+    modes = jax.lax.map(mode, (times, states))
+    return verdict(folds, method, dt, carry, modes)._replace(records=records)
+
+
+def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool = False) -> Outcome:
+    """The whole time loop for one run, pure and unchecked.
+
+    Records are stacked every `record_every` steps; with None there are none, and memory does not grow with time.  `alone` says that
+    nobody will batch it from outside, so that it, or its pieces, may become machine functions.
+    """
+    if is_for(scenario, dt):
+        return run_compactly(scenario, folds, dt, steps=steps, record_every=record_every, method=method, alone=alone)
+    one = partial(scan_steps, steps=steps, record_every=record_every, method=method)
+    return (as_one_function(one) if alone else one)(scenario, folds, dt)

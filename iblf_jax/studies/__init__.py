@@ -1,0 +1,12 @@
+"""Studies: many runs of a scenario, and what they say together.
+
+    what is asked    compare (laws), monte_carlo (random parameters), sweep (a grid of them), sensitivity (which parameter matters)
+    what comes back  comparison, study, dataset (the table of a sweep)
+    cases            designs -> draws, points: which parameters case i has; setup: all of it checked and ready
+    running          blocks: the one compiled shape; progress, interrupt
+    keeping          config -> store: a sweep on disk that survives a kill
+    numbers          statistics, summaries
+
+The public names are those of `iblf_jax`; distributions of parameters are in `iblf_jax.distributions`, several processes in
+`iblf_jax.distributed`.
+"""
