@@ -129,9 +129,14 @@ def loaded(library: Path) -> ctypes.CDLL:
         raise ToolchainError(f"a kernel does not load: {error}") from None
 
 
+def processors() -> int:
+    """Processors that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def threads() -> int:
-    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the processors that this process may run on."""
+    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the process's processors, divided among its CPU devices."""
     wanted = os.environ.get("IBLF_JAX_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, processors() // jax.local_device_count("cpu"))
