@@ -11,6 +11,7 @@ integrator) the compiler drops the rest.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -70,6 +71,7 @@ def initial_state(scenario: Scenario) -> LoopState:
     return LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), scenario.observer.init(q, dq, scenario.model))
 
 
+@partial(jax.jit, inline=True)
 def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0) -> tuple[LoopState, Sample]:
     """The rate of the state and the sample at time t.
 

@@ -47,7 +47,7 @@ EXPORTED int cuLaunchKernel(void *kernel, unsigned blocks, unsigned by, unsigned
         iblf_jax_signals(at<const word *>(a, 0), at<int64_t>(a, 1), at<int64_t>(a, 2), at<word *>(a, 3));
       else
         iblf_jax_advance(at<const word *>(a, 0), at<const word *>(a, 1), at<const real *>(a, 2), at<const real *>(a, 3),
-                         at<const int32_t *>(a, 4), at<real *>(a, 5), at<int32_t *>(a, 6), at<real *>(a, 7), at<int64_t>(a, 8),
+                         at<const int32_t *>(a, 4), at<real *>(a, 5), at<int32_t *>(a, 6), at<record_arrays>(a, 7), at<int64_t>(a, 8),
                          at<int64_t>(a, 9), at<int64_t>(a, 10), at<int64_t>(a, 11));
     }
   return FINE;

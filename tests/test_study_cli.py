@@ -10,7 +10,8 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax import cli, store, study_file
+from iblf_jax import cli, study_file
+from iblf_jax.studies import store
 
 STUDY = """
 preset = "zhang_yan_2024"

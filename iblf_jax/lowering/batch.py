@@ -17,7 +17,7 @@ from iblf_jax.lowering.step import Leaves, Packed, Shapes, lowered, pack, split,
 from iblf_jax.one_function import as_one_function
 from iblf_jax.stability import POWER_ITERATIONS, Growth, growth_rate, growth_start, growth_step
 
-Executor = Callable[[Program, jax.Array, jax.Array, Packed, int, int | None], tuple[Packed, jax.Array]]
+Executor = Callable[[Program, jax.Array, jax.Array, Packed, int, int | None], tuple[Packed, list[jax.Array]]]
 """Runs a program: `native.run` or `xla.run`."""
 
 
@@ -78,8 +78,8 @@ class Batch(NamedTuple):
         program = lowered(step, np.dtype(self.dtype), Shapes.of(self.leaves.shared), Shapes.of(self.leaves.lane, 1), shapes, self.sparse)
         return program, shapes, treedef
 
-    def advance(self, make: Callable, carry: Any, steps: int, every: int | None, *options) -> tuple[Any, jax.Array]:
-        """The carry after `steps` steps, and samples."""
+    def advance(self, make: Callable, carry: Any, steps: int, every: int | None, *options) -> tuple[Any, list[jax.Array]]:
+        """The carry after `steps` steps, and the recorded arrays (see `native.run`)."""
         program, shapes, treedef = self.program(make, carry, *options)
         shared = [jnp.ravel(x).astype(self.dtype) for x in self.leaves.shared]
         lane = pack(self.leaves.lane, Shapes.of(self.leaves.lane, 1), self.dtype, self.runs).floats
@@ -165,14 +165,13 @@ def critical_modes(batch: Batch, steps: int, carry: Any) -> jax.Array:
     return jax.vmap(jax.vmap(growth_rate))(found.growth)
 
 
-def _records(samples: jax.Array, last: Any, with_last: bool) -> Any:
+def _records(recorded: list[jax.Array], last: Any, with_last: bool) -> Any:
     """The recorded arrays, run axis first, then time; `last` is the sample at the end, which closes a whole number of periods."""
     flat, treedef = jax.tree.flatten(last)
-    rows, _, runs = samples.shape
-    used, result = 0, []
-    for x in flat:
-        size = int(np.prod(x.shape[1:]))
-        part = samples[:, used : used + size].transpose(2, 0, 1).reshape(runs, rows, *x.shape[1:]).astype(x.dtype)
-        used += size
-        result.append(jnp.concatenate([part, x[:, None]], axis=1) if with_last else part)
+    result = []
+    for array, x in zip(recorded, flat, strict=True):
+        samples, _, runs = array.shape
+        if with_last:
+            array = jax.lax.dynamic_update_slice(array, x.reshape(1, runs, -1).swapaxes(1, 2).astype(array.dtype), (samples - 1, 0, 0))
+        result.append(array.transpose(2, 0, 1).reshape(runs, samples, *x.shape[1:]).astype(x.dtype))
     return jax.tree.unflatten(treedef, result)

@@ -30,8 +30,8 @@ CALLS = (
 SEGMENT, LONG = 5000, 20_000
 """Operations of a function of the native backend, where a step has more than LONG: slower by a third, but built three times as fast."""
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
-NATIVE = (("vector.h", "mathlib.h"), ("frame.h", "driver.h"))
-CUDA = (("scalar.h", "mathlib.h"), ("kernels.h",))
+NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
+CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
 
 
@@ -142,10 +142,11 @@ class Layout(NamedTuple):
 def sizes(program: Program, shared_leaves: int, lane_leaves: int) -> str:
     """The definitions of the sizes that the headers ask for."""
     constants, columns, floats, ints = map(len, Layout.of(program))
-    values = {
+    values: dict[str, object] = {
         "SHARED_LEAVES": shared_leaves, "LEAVES": lane_leaves, "FLOATS": floats, "INTS": ints, "CONSTANTS": constants,
-        "COLUMNS": columns, "SAMPLES": len(program.samples), "DOUBLE": int(program.dtype == np.float64),
+        "COLUMNS": columns, "DOUBLE": int(program.dtype == np.float64),
     }  # fmt: skip
+    values["RECORDED"], values["RECORDED_SIZES"] = len(program.recorded), f"{{{', '.join(map(str, [*program.recorded, 0]))}}}"
     return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
@@ -191,7 +192,7 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
 
 HEAD_OF_ADVANCE = (
     "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
-    "                    int64_t first, int64_t every, real *records, int64_t runs, int64_t run)"
+    "                    int64_t first, int64_t every, record_arrays records, int64_t runs, int64_t run)"
 )
 
 
@@ -303,10 +304,8 @@ def _advance_in_segments(e: _Emitter, constants: list[int], columns: list[int], 
 def _record(e: _Emitter, names: dict[int, str]) -> None:
     """The samples of a step that is recorded, written for the runs that exist."""
     e.lines.append("  if (every > 0 && (first + s) % every == 0) {")
-    e.lines.append("  real *out = records + (first + s) / every * SAMPLES * runs + run;")
-    e.lines.append("  int live = run + W <= runs ? W : (int)(runs - run);")
     inner = dict(names)
     e.statements(inner, e.program.samples)
-    for k, i in enumerate(e.program.samples):
-        e.lines.append(f"  store_some(out + {k} * runs, {inner[i]}, live);")
+    e.lines.append(f"  F sample[] = {{{', '.join(inner[i] for i in e.program.samples)}}};")
+    e.lines.append("  write_sample(&records, sample, (first + s) / every, runs, run);")
     e.lines.append("  }")

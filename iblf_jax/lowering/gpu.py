@@ -20,7 +20,7 @@ import numpy as np
 from iblf_jax.lowering import nvrtc
 from iblf_jax.lowering.emit_c import CUDA, Layout, header, sizes, source
 from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.step import Packed
+from iblf_jax.lowering.step import Packed, record_shapes
 from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded
 
 NAME = "gpu"
@@ -103,15 +103,17 @@ def call(name: str, program: Program, shared: jax.Array, lane: jax.Array, carry:
     """`run` by the launcher of a name, with so many threads in a block."""
     layout = Layout.of(program)
     runs = carry.floats.shape[1]
-    rows = -(-steps // every) if every else 0
-    shapes = [(rows, len(program.samples) * runs), (1, len(layout.constants)), (max(min(steps, STRETCH), 1), len(layout.columns))]
-    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + [jax.ShapeDtypeStruct(shape, program.dtype) for shape in shapes]
+    room = [(1, len(layout.constants)), (max(min(steps, STRETCH), 1), len(layout.columns))]
+    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + [jax.ShapeDtypeStruct(shape, program.dtype) for shape in room]
+    outputs += record_shapes(program, runs, steps, every)
     attributes = {"steps": np.int64(steps), "every": np.int64(every or 0), "threads": np.int64(threads)}
-    floats, ints, samples, _, _ = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, **attributes)
-    return Packed(floats, ints), samples.reshape(rows, len(program.samples), runs)
+    floats, ints, _, _, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, **attributes)
+    return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]
 
 
-def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
+def run(
+    program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None
+) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs; arguments and results as `native.run`."""
     name = kernel(program, shared.size, lane.shape[0], architecture())
     processors = getattr(jax.local_devices()[0], "core_count", PROCESSORS)

@@ -14,7 +14,7 @@ import numpy as np
 
 from iblf_jax.lowering.emit_c import source
 from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.step import Packed
+from iblf_jax.lowering.step import Packed, record_shapes
 from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded, threads
 
 NAME = "native"
@@ -52,7 +52,9 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
     return name
 
 
-def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
+def run(
+    program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None
+) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs.
 
     Args:
@@ -64,17 +66,13 @@ def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, ste
       every: sample every so-many-th step, or None.
 
     Returns:
-      The rows after the last step, and the samples, (rows, samples, runs).
+      The rows after the last step, and the recorded arrays, (samples, numbers, runs): of every `every`-th step, and a last row for whoever
+      looks at the end, if the end is such a step.
     """
     runs = carry.floats.shape[1]
     narrow = runs * program.dtype.itemsize <= 16
     name = kernel(program, shared.size, lane.shape[0], narrow)
-    rows = -(-steps // every) if every else 0
-    outputs = (
-        jax.ShapeDtypeStruct(carry.floats.shape, carry.floats.dtype),
-        jax.ShapeDtypeStruct(carry.ints.shape, carry.ints.dtype),
-        jax.ShapeDtypeStruct((rows, len(program.samples) * runs), carry.floats.dtype),
-    )
+    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(program, runs, steps, every)
     settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
-    floats, ints, samples = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, carry.floats, carry.ints, jnp.asarray(settings))
-    return Packed(floats, ints), samples.reshape(rows, len(program.samples), runs)
+    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, jnp.asarray(settings))
+    return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]

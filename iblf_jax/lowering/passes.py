@@ -26,7 +26,7 @@ def rebuilt(program: Program, rule) -> Program:
             made = rule(b, node, args, i)
             new.append(b.emit(node.op, *args, kind=node.kind) if made is None else made)
     carry_in = [new[a] if a >= 0 else -1 for a, _ in program.carry]
-    return finished(b, carry_in, [new[o] for _, o in program.carry], [new[s] for s in program.samples])
+    return finished(b, carry_in, [new[o] for _, o in program.carry], [new[s] for s in program.samples], program.recorded)
 
 
 def with_reciprocals(program: Program) -> Program:

@@ -95,6 +95,7 @@ class Program(NamedTuple):
       carry: (input node, output node) of every number that goes from step to step; input -1 where the step does not read it.
       samples: output nodes that a record may ask for.
       kinds: kind of every carried number.
+      recorded: how many of the samples each recorded array has, in order.
     """
 
     dtype: np.dtype
@@ -102,6 +103,7 @@ class Program(NamedTuple):
     carry: tuple[tuple[int, int], ...]
     samples: tuple[int, ...]
     kinds: tuple[str, ...]
+    recorded: tuple[int, ...] = ()
 
     def classes(self) -> list[int]:
         """The class of every node (head of this module); a carried number that a step leaves alone is of class LANE."""
@@ -127,7 +129,7 @@ class Program(NamedTuple):
         return result
 
 
-def finished(builder: Builder, carry_in: list[int], carry_out: list[int], samples: list[int]) -> Program:
+def finished(builder: Builder, carry_in: list[int], carry_out: list[int], samples: list[int], recorded: tuple[int, ...] = ()) -> Program:
     """The program of the given outputs, without what they do not need, in depth-first order.
 
     The order matters to a compiler with few registers: a number is computed shortly before its first use.
@@ -151,7 +153,7 @@ def finished(builder: Builder, carry_in: list[int], carry_out: list[int], sample
     nodes = tuple(builder.nodes[i]._replace(args=tuple(place[a] for a in builder.nodes[i].args)) for i in order)
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
-    return Program(builder.dtype, nodes, carry, tuple(place[s] for s in samples), kinds)
+    return Program(builder.dtype, nodes, carry, tuple(place[s] for s in samples), kinds, recorded)
 
 
 def frontier(program: Program, classes: list[int], of: int, used_by: Callable[[int], bool]) -> list[int]:

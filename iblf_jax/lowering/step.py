@@ -107,7 +107,7 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
     samples = [_as_float(b, int(i)) for ids in out[n_carry:] for i in ids.ravel()]
     if Shapes.of(shapes[0]).kinds() != carry.kinds():
         raise UnsupportedError("the step changes the types of what it carries")
-    return with_reciprocals(finished(b, read, carry_out, samples))
+    return with_reciprocals(finished(b, read, carry_out, samples, tuple(ids.size for ids in out[n_carry:])))
 
 
 def _accepted(kind: str, array_dtype, op: str, dtype) -> str:
@@ -153,3 +153,8 @@ def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
         rows = (packed.floats if group == "f" else packed.ints)[start : start + size]
         result.append(rows.T.reshape(runs, *shape).astype(dtype))
     return result
+
+
+def record_shapes(program: Program, runs: int, steps: int, every: int | None) -> list[jax.ShapeDtypeStruct]:
+    """(samples, numbers * runs) of each recorded array, the sample at the end included if it is one; none without `every`."""
+    return [jax.ShapeDtypeStruct((steps // every + 1, size * runs), program.dtype) for size in program.recorded] if every else []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
+from itertools import accumulate
 from typing import Any
 
 import jax
@@ -28,7 +29,9 @@ STRETCH = 4096
 """Steps whose signals are tabulated at once, at most."""
 
 
-def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
+def run(
+    program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None
+) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs; arguments and results as `native.run`.  The last block repeats the last run.
 
     Raises:
@@ -49,11 +52,11 @@ def run(program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, ste
         return rows.reshape(*rows.shape[:-2], blocks * width)[..., :runs]
 
     done, samples = _in_blocks(program, shared, apart(lane), jax.tree.map(apart, carry), steps, every)
-    return jax.tree.map(together, done), together(samples)
+    return jax.tree.map(together, done), jax.tree.map(together, samples)
 
 
-def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every: int | None) -> tuple[Packed, jax.Array]:
-    """All steps of some blocks: (blocks, rows, width) in, and out; samples (blocks, samples, rows, width)."""
+def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every: int | None) -> tuple[Packed, list[jax.Array]]:
+    """All steps of some blocks: (blocks, rows, width) in, and out; recorded arrays (blocks, samples, numbers, width)."""
     classes = program.classes()
     once = {i: shared[n.value] for i, n in enumerate(program.nodes) if n.op == "shared"}
     Evaluator(program, ()).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
@@ -73,12 +76,14 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
     parts = []
     if whole:
         starts = length * jnp.arange(whole, dtype=jnp.int32)
-        carry, rows = lax.scan(partial(stretch, count=length), carry, starts)
-        parts.append(jnp.moveaxis(rows, 0, 1).reshape(rows.shape[1], whole * rows.shape[2], *rows.shape[3:]))
+        carry, arrays = lax.scan(partial(stretch, count=length), carry, starts)
+        parts.append([jnp.moveaxis(x, 0, 1).reshape(x.shape[1], whole * x.shape[2], *x.shape[3:]) for x in arrays])
     if rest:
-        carry, rows = stretch(carry, jnp.int32(whole * length), rest)
-        parts.append(rows)
-    return carry, parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
+        carry, arrays = stretch(carry, jnp.int32(whole * length), rest)
+        parts.append(arrays)
+    if every and steps % every == 0:
+        parts.append([jnp.zeros_like(x[:, :1]) for x in parts[0]])
+    return carry, [jnp.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)]
 
 
 def _stretch_length(steps: int, every: int) -> int:
@@ -90,7 +95,9 @@ def _stretch_length(steps: int, every: int) -> int:
     return exact if exact > most // 16 else most
 
 
-def _block(program: Program, once, columns, table: Table, lane: jax.Array, carry: Packed, every: int | None) -> tuple[Packed, jax.Array]:
+def _block(
+    program: Program, once, columns, table: Table, lane: jax.Array, carry: Packed, every: int | None
+) -> tuple[Packed, list[jax.Array]]:
     """One block of runs through the steps of a table."""
     width = carry.floats.shape[1]
     evaluator = Evaluator(program, (width,))
@@ -123,7 +130,8 @@ def _block(program: Program, once, columns, table: Table, lane: jax.Array, carry
     (state, records), _ = lax.scan(step, ([values[c] for c in moving], records), (table, places))
     for c, x in zip(moving, state, strict=True):
         values[c] = x
-    return _joined(program, values, width), records[:rows]
+    ends = accumulate(program.recorded if every else ())
+    return _joined(program, values, width), [records[:rows, end - size : end] for end, size in zip(ends, program.recorded, strict=False)]
 
 
 def _entries(program: Program, columns: list[int], row: Table) -> dict[int, Any]:

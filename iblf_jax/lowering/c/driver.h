@@ -1,5 +1,5 @@
-/* Runs all blocks of W runs through all steps, on several threads.  The generated part gives CONSTANTS, LEAVES, FLOATS, INTS, COLUMNS,
-   SAMPLES (sizes), shared_constants, shared_signals (a table of what only time decides) and advance (W runs over some steps).
+/* Runs all blocks of W runs through all steps, on several threads.  The generated part gives CONSTANTS, LEAVES, FLOATS, INTS, COLUMNS
+   (sizes), record_arrays, shared_constants, shared_signals (a table of what only time decides) and advance (W runs over some steps).
 
    A group of blocks goes through all steps before the next one, a stretch of steps at a time: its states and the stretch's table stay
    in the cache.  A block that has fewer than W runs repeats its last one; the copies are not written back. */
@@ -9,7 +9,8 @@
 typedef struct {
   const real *shared, *leaves, *floats_in;
   const int32_t *ints_in;
-  real *floats_out, *records;
+  real *floats_out;
+  record_arrays records;
   int32_t *ints_out;
   int64_t runs, blocks, groups, group_blocks, first, steps, every;
   int64_t next;
@@ -95,10 +96,10 @@ static void run_all(job *j, int64_t threads) {
 }
 
 /* Operands: shared (1, n), leaves (LEAVES, runs), floats (FLOATS, runs), ints (INTS, runs), settings (1, 4) = first step, steps, record
-   every, threads.  Results: floats, ints, records (rows, SAMPLES * runs). */
+   every, threads.  Results: floats, ints, and the recorded arrays (rows or more, numbers * runs). */
 extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel(XLA_FFI_CallFrame *frame) {
   if (is_question(frame)) return NULL;
-  if (frame->args.size != 5 || frame->rets.size != 3) return failure(frame, "iblf_jax kernel: wrong number of operands");
+  if (frame->args.size != 5 || frame->rets.size != 2 + RECORDED) return failure(frame, "iblf_jax kernel: wrong number of operands");
   XLA_FFI_Buffer **in = (XLA_FFI_Buffer **)frame->args.args, **out = (XLA_FFI_Buffer **)frame->rets.rets;
   if (in[2]->rank != 2 || in[4]->rank != 2) return failure(frame, "iblf_jax kernel: wrong rank");
   int64_t runs = in[2]->dims[1];
@@ -109,11 +110,11 @@ extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel
   int64_t rows = j.every > 0 ? (j.steps + j.every - 1) / j.every : 0;
   if (!has_shape(in[0], 1, SHARED_LEAVES) || !has_shape(in[1], LEAVES, runs) || !has_shape(in[2], FLOATS, runs) ||
       !has_shape(in[3], INTS, runs) || !has_shape(in[4], 1, 4) || !has_shape(out[0], FLOATS, runs) || !has_shape(out[1], INTS, runs) ||
-      !has_shape(out[2], rows, SAMPLES * runs))
+      !has_records(out + 2, rows, runs))
     return failure(frame, "iblf_jax kernel: wrong shapes");
   j.shared = (const real *)in[0]->data; j.leaves = (const real *)in[1]->data; j.floats_in = (const real *)in[2]->data;
   j.ints_in = (const int32_t *)in[3]->data; j.floats_out = (real *)out[0]->data; j.ints_out = (int32_t *)out[1]->data;
-  j.records = (real *)out[2]->data;
+  for (int i = 0; i < RECORDED; i++) j.records.at[i] = (real *)out[2 + i]->data;
   run_all(&j, settings[3]);
   return j.failed ? failure(frame, "iblf_jax kernel: out of memory") : NULL;
 }

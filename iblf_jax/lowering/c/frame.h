@@ -1,4 +1,5 @@
-/* What a kernel says to XLA and hears from it: errors, shapes, the version of the interface. */
+/* What a kernel says to XLA and hears from it: errors, shapes, the version of the interface.  The generated part gives
+   RECORDED and RECORDED_SIZES: how many arrays are recorded, and how many numbers each has. */
 #include <stdint.h>
 #include <string.h>
 
@@ -15,6 +16,14 @@ static XLA_FFI_Error *failure(XLA_FFI_CallFrame *frame, const char *text) {
 
 static int has_shape(const XLA_FFI_Buffer *b, int64_t rows, int64_t columns) {
   return b->rank == 2 && b->dims[0] == rows && b->dims[1] == columns;
+}
+
+/* Whether arrays are the recorded ones, with room for so many rows: (rows or more, numbers * runs) each. */
+static int has_records(XLA_FFI_Buffer **arrays, int64_t rows, int64_t runs) {
+  static const int64_t sizes[] = RECORDED_SIZES;
+  for (int i = 0; i < RECORDED; i++)
+    if (arrays[i]->rank != 2 || arrays[i]->dims[0] < rows || arrays[i]->dims[1] != sizes[i] * runs) return 0;
+  return 1;
 }
 
 /* Whether XLA asks for the version of the interface only; the answer is given. */

@@ -1,4 +1,4 @@
-/* The kernels of a rollout.  The generated part gives CONSTANTS, LEAVES, FLOATS, INTS, COLUMNS, SAMPLES (sizes), shared_constants,
+/* The kernels of a rollout.  The generated part gives CONSTANTS, LEAVES, FLOATS, INTS, COLUMNS (sizes), record_arrays, shared_constants,
    shared_signals (a row of what only time decides) and advance (one run over some steps).
 
    A thread takes one run through a stretch of steps with all its numbers in registers.  Arrays hold one row a number and the run fastest,
@@ -20,7 +20,7 @@ extern "C" __global__ void iblf_jax_signals(const word *constants, int64_t first
    without it ptxas gives a step that needs more than those 32, and keeps the rest in memory. */
 extern "C" __global__ void __launch_bounds__(MOST_THREADS, 1)
 iblf_jax_advance(const word *__restrict__ constants, const word *__restrict__ table, const real *__restrict__ leaves_in,
-                 const real *floats_in, const int32_t *ints_in, real *floats_out, int32_t *ints_out, real *records, int64_t runs,
+                 const real *floats_in, const int32_t *ints_in, real *floats_out, int32_t *ints_out, record_arrays records, int64_t runs,
                  int64_t first, int64_t count, int64_t every) {
   int64_t run = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
   F leaves[LEAVES + 1], floats[FLOATS + 1];

@@ -1,4 +1,4 @@
-/* Launches the kernels of kernels.h from within XLA.  The generated part gives SHARED_LEAVES ... SAMPLES (sizes), DOUBLE, and `image`, the
+/* Launches the kernels of kernels.h from within XLA.  The generated part gives SHARED_LEAVES ... COLUMNS (sizes), DOUBLE, and `image`, the
    kernels' machine code.
 
    CUDA's driver is the one that runs in this process already; it is found by name, so that this file builds without CUDA.  The image is
@@ -78,21 +78,22 @@ static int launched(void *kernel, int64_t count, int64_t threads, void *stream, 
   return succeeded("launch", cu_launch(kernel, (unsigned)blocks, 1, 1, (unsigned)threads, 1, 1, 0, stream, arguments, NULL), text, size);
 }
 
-/* Operands: shared (1, SHARED_LEAVES), leaves (LEAVES, runs), floats (FLOATS, runs), ints (INTS, runs).  Results: floats, ints, records
-   (rows, SAMPLES * runs), and room for constants (1, CONSTANTS) and for the signals of a stretch of steps (stretch, COLUMNS), both of word.
+/* Operands: shared (1, SHARED_LEAVES), leaves (LEAVES, runs), floats (FLOATS, runs), ints (INTS, runs).  Results: floats, ints, room for
+   constants (1, CONSTANTS) and for the signals of a stretch of steps (stretch, COLUMNS), both of word, and the recorded arrays (rows or
+   more, numbers * runs).
    Attributes: steps, every (0: no records), threads (in a block). */
 extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel(XLA_FFI_CallFrame *frame) {
   if (is_question(frame)) return NULL;
-  if (frame->args.size != 4 || frame->rets.size != 5) return failure(frame, "iblf_jax kernel: wrong number of operands");
+  if (frame->args.size != 4 || frame->rets.size != 4 + RECORDED) return failure(frame, "iblf_jax kernel: wrong number of operands");
   XLA_FFI_Buffer **in = (XLA_FFI_Buffer **)frame->args.args, **out = (XLA_FFI_Buffer **)frame->rets.rets;
-  if (in[2]->rank != 2 || out[4]->rank != 2) return failure(frame, "iblf_jax kernel: wrong rank");
-  int64_t runs = in[2]->dims[1], stretch = out[4]->dims[0];
+  if (in[2]->rank != 2 || out[3]->rank != 2) return failure(frame, "iblf_jax kernel: wrong rank");
+  int64_t runs = in[2]->dims[1], stretch = out[3]->dims[0];
   int64_t steps = attribute(frame, "steps"), every = attribute(frame, "every"), threads = attribute(frame, "threads");
   if (steps < 0 || every < 0 || threads < 1 || threads > 1024) return failure(frame, "iblf_jax kernel: wrong attributes");
   int64_t rows = every > 0 ? (steps + every - 1) / every : 0;
   if (!has_shape(in[0], 1, SHARED_LEAVES) || !has_shape(in[1], LEAVES, runs) || !has_shape(in[2], FLOATS, runs) ||
       !has_shape(in[3], INTS, runs) || !has_shape(out[0], FLOATS, runs) || !has_shape(out[1], INTS, runs) ||
-      !has_shape(out[2], rows, SAMPLES * runs) || !has_shape(out[3], 1, CONSTANTS) || !has_shape(out[4], stretch, COLUMNS) || stretch < 1)
+      !has_shape(out[2], 1, CONSTANTS) || !has_shape(out[3], stretch, COLUMNS) || stretch < 1 || !has_records(out + 4, rows, runs))
     return failure(frame, "iblf_jax kernel: wrong shapes");
   if (runs == 0) return NULL;
 
@@ -106,8 +107,10 @@ extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel
   if (error) return error;
 
   char text[512];
-  void *stream = asked.stream, *shared = in[0]->data, *leaves = in[1]->data, *records = out[2]->data, *constants = out[3]->data;
-  void *table = out[4]->data, *floats_in = in[2]->data, *ints_in = in[3]->data, *floats = out[0]->data, *ints = out[1]->data;
+  void *stream = asked.stream, *shared = in[0]->data, *leaves = in[1]->data, *constants = out[2]->data;
+  void *table = out[3]->data, *floats_in = in[2]->data, *ints_in = in[3]->data, *floats = out[0]->data, *ints = out[1]->data;
+  struct { void *at[RECORDED + 1]; } records;
+  for (int i = 0; i < RECORDED; i++) records.at[i] = out[4 + i]->data;
   void *for_constants[] = {&shared, &constants};
   if (!launched(constants_kernel, 1, 1, stream, for_constants, text, sizeof text)) return failure(frame, text);
   int64_t first = 0;

@@ -31,6 +31,7 @@ typedef union { real f; integer i; } word;
 #define W 1
 #define INLINE static __device__ __forceinline__
 #define FUNCTION INLINE
+#define SEPARATE INLINE
 #define MASK(comparison) (-(I)(comparison))
 #define AT(x, l) (x)
 #define splat(x) ((F)(x))
@@ -38,6 +39,6 @@ typedef union { real f; integer i; } word;
 #define from(first) (first)
 #define to_float(x) ((F)(x))
 #define to_int(x) ((I)(x))
-#define store_some(place, x, count) (*(place) = (x))
+#define store_some(place, x, count) ((void)(count), (void)(*(place) = (x)))
 #define LANEWISE(name, call) INLINE F name(F x) { return FN(call)(x); }
 #define LANEWISE2(name, call) INLINE F name(F x, F y) { return FN(call)(x, y); }

@@ -35,13 +35,17 @@ typedef union { real f; integer i; } word;
 
 #define INLINE static inline __attribute__((always_inline))
 #define FUNCTION static
+#define SEPARATE static __attribute__((noinline))
 #define MASK(comparison) (comparison)
 #define AT(x, l) (x)[l]
 INLINE F splat(real x) { return x - (F){}; }
 INLINE I splat_i(integer x) { return x - (I){}; }
 INLINE F load(const real *p) { F x; memcpy(&x, p, sizeof x); return x; }
 INLINE void store(real *p, F x) { memcpy(p, &x, sizeof x); }
-INLINE void store_some(real *p, F x, int count) { memcpy(p, &x, count * sizeof(real)); }
+INLINE void store_some(real *p, F x, int count) {
+  if (count == W) store(p, x);
+  else for (int l = 0; l < count; l++) p[l] = x[l];
+}
 INLINE I from(integer first) { I x; for (int l = 0; l < W; l++) x[l] = first + l; return x; }
 INLINE I bits(F x) { return (I)x; }
 INLINE F from_bits(I x) { return (F)x; }
