@@ -43,7 +43,7 @@ def _run_lowered(scenario, folds, dt, *, steps, record_every, method, backend):
     return run_alone(scenario, folds, dt, steps=steps, record_every=record_every, method=method, backend=backend)
 
 
-SINGLE_RUN_BACKENDS = ("xla", "native", "gpu")
+SINGLE_RUN_BACKENDS = ("auto", "xla", "native", "gpu")
 """How `simulate` can execute one run."""
 
 
@@ -56,7 +56,7 @@ def simulate(
     record_every: int = 1,
     metrics: Sequence[Fold] | None = None,
     throw: bool = False,
-    backend: str = "xla",
+    backend: str = "auto",
 ) -> Rollout:
     """Runs a scenario with a fixed step and returns everything that can be looked at.
 
@@ -73,9 +73,9 @@ def simulate(
       record_every: record every so-many-th step; metrics and status cover every step whatever is recorded.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
-      backend: "xla", or "native": the same program as generated code, several times faster once the system's compiler has built it
-        (seconds, once for a structure; kept on disk), or "gpu": the same as one kernel on an NVIDIA GPU.  Inside your own `jit`, `vmap`
-        or `grad` a run is always on xla.
+      backend: "native": generated code, built by the system's compiler once for a structure and kept on disk; "xla": the same program
+        without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native for laws on robots of few
+        joints where there is a compiler, else xla.  Inside your own `jit`, `vmap` or `grad` a run is always on xla.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -103,7 +103,7 @@ def simulate(
     return result
 
 
-def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "xla") -> Rollout:
+def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "auto") -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     options = {"steps": steps, "record_every": record_every, "method": method}
     if checks.is_concrete((scenario, folds)):

@@ -227,15 +227,13 @@ def test_runs_as_the_planar_robot_does():
     np.testing.assert_allclose(run.tau, other.tau, atol=1e-7)
 
 
-@pytest.mark.parametrize("backend", ["xla", "native"])
-def test_batches_of_arms_agree_with_single_runs(backend):
+def test_batches_of_arms_agree_with_single_runs():
     scenario = scenario_with(two_link_in_space())
     study = ij.monte_carlo(
         scenario,
         {"plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)), "plant.joint[0].damping": ij.value(ij.uniform(0.0, 0.5))},
         runs=3,
         seed=0,
-        backend=backend,
         **SHORT_RUN,
     )
     for i in range(3):

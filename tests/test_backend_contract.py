@@ -48,7 +48,10 @@ def test_backends_agree_with_the_reference(name, dtype):
     ok = expected.status & int(FAILED) == 0
     assert np.any(ok), expected.status
     assert np.any(~ok), expected.status
-    for backend in ["xla", "native"] if has_compiler() else ["xla"]:
+    scenario, varied, folds, dt = arguments
+    asked = ["xla", "native"] if has_compiler() else ["xla"]
+    taken = {lowering.settled(backend, scenario, varied, folds, dt, method="rk4") for backend in asked}
+    for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap
         found = jax.tree.map(np.asarray, outcome_of(*arguments, backend=backend))
         np.testing.assert_array_equal(found.status, expected.status, err_msg=backend)
         times = (x.metrics["first_violation_time"] for x in (found, expected))

@@ -26,7 +26,7 @@ def both(scenario, method="rk4", record_every=1, alone=True, steps=50, dt=1e-3):
 
 @pytest.mark.parametrize(
     ("method", "record_every", "alone"),
-    [("rk4", 1, True), ("rk4", 7, False), ("heun", 10, True), ("euler", None, True), ("heun", 10**9, False)],
+    [("rk4", 7, False), ("heun", 1, True), ("euler", None, True)],
 )
 def test_it_is_the_same_run(paper, method, record_every, alone):
     plain, compact = both(ij.with_parameters(paper, {"initial.dq": [0.3, -0.2]}), method, record_every, alone)

@@ -74,7 +74,7 @@ def test_xla_agrees_with_the_reference():
     np.testing.assert_array_equal(found.status, expected.status)
 
 
-@pytest.mark.parametrize("every", [None, 2, 30])
+@pytest.mark.parametrize("every", [2, 30])
 def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
     monkeypatch.setattr(lowering.xla, "BLOCK", 2)
     monkeypatch.setattr(lowering.xla, "STRETCH", 4)

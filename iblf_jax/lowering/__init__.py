@@ -32,7 +32,7 @@ from iblf_jax.time_loop import Outcome
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a batch can be executed; "auto" is native on CPU, gpu on an NVIDIA GPU, else xla."""
 LONGEST_ALONE = 2500
-"""Operations of a step up to which one run on xla is lowered: a longer one gains less by it than it takes to compile."""
+"""Operations of a step up to which one run is lowered unasked: a longer one gains less by it than it takes to compile."""
 COMPILED = {"cpu": native, "gpu": gpu}
 """The backend that builds its kernels, by platform."""
 
@@ -160,23 +160,24 @@ def run_alone(scenario: Scenario, folds, dt: jax.Array, *, steps: int, method: s
 
     Args:
       scenario, folds, dt, steps, method, record_every: as `run_batch`, of one run.
-      backend: "native" or "gpu", which fall back with a warning, or "xla", which falls back to the plain run without one.
+      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native for short steps where there is a
+        compiler.  What is long or does not lower is, on these two, the plain run, without a warning.
     """
     options: dict[str, Any] = {"steps": steps, "method": method, "record_every": record_every}
 
-    def run_on(executor):
-        return batch.run_alone(executor, scenario, folds, dt, **options, longest=LONGEST_ALONE if executor is xla.run else None)
+    def run_on(executor, longest=None):
+        return batch.run_alone(executor, scenario, folds, dt, **options, longest=longest)
 
     def plain():
         return compact_loop.run(scenario, folds, dt, alone=True, **options)
 
-    if backend != "xla":
+    if backend in ("native", "gpu"):
         return with_fallback(backend, run_on, plain)
     if jax.default_backend() != "cpu" or compact_loop.is_for(scenario, dt):
         return plain()
     try:
-        return run_on(xla.run)
-    except UnsupportedError:
+        return run_on(native.run if backend == "auto" and not native.unavailable() else xla.run, LONGEST_ALONE)
+    except (UnsupportedError, ToolchainError):
         return plain()
 
 
