@@ -93,7 +93,7 @@ def tune(
         nothing is smoothed, and with adam.
       iterations: steps of the optimiser at most.
       tolerance: relative change of the loss below which a start has settled.
-      patience: stop after so many steps without a better result.
+      patience: stop (before the last sharpening: sharpen) after so many steps without a better result.
       learning_rate: of adam, in squashed coordinates.
       report_runs, report_seed: fresh runs for the report, and their seed (seed + 1 if not given).
       confidence: of the report's intervals.

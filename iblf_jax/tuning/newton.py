@@ -25,7 +25,7 @@ from iblf_jax.tuning.parameters import Box
 FIRST_RADIUS = 1.0
 """|s_i| of the first step: a factor e for a gain."""
 LARGEST_RADIUS = 4.0
-ASTRAY = 2.0
+ASTRAY = 20.0
 """A trial that raises the loss by more than so many times what it was foretold to lower it is nothing to learn from."""
 FLATTEST = 1e-6
 """Smallest eigenvalue of the model's matrix, relative to its largest."""

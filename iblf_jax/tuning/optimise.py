@@ -9,8 +9,8 @@ objective among those that keep the requirements and the bounds, or, while none 
 
 The smooth maximum in the loss lies above the maximum by smoothing times a logarithm, so its bottom is not where the maximum's is; but it
 is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once all starts have settled at the
-tolerance ROUGH (or after INNER steps), the smoothing is divided by SHARPER, the better half of the starts goes on and the others are
-given up.  What counts as the best is judged without smoothing throughout.
+tolerance ROUGH (or after INNER steps, HASTY where several are left to choose from), the smoothing is divided by SHARPER, the better half of
+the starts goes on and the others are given up.  What counts as the best is judged without smoothing throughout.
 
 A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
 from there and gives the same numbers, bit by bit, as one that was not.
@@ -39,8 +39,9 @@ LARGEST_MU = 1e6
 OUTER = 12
 """Updates of the multipliers at most."""
 SHARPER = 4.0
-ROUGH = 1e-3
-"""Tolerance of the steps before the last sharpening: what is found there is a place to go on from."""
+ROUGH, HASTY = 1e-3, 6
+"""Tolerance before the last sharpening, and steps at most of several starts without requirements: what is found there is a place to go on
+from, and good enough to choose by."""
 LANES = 16
 """Runs that are evaluated at once at least, where starts run out one by one: what a processor's vectors hold."""
 
@@ -143,7 +144,8 @@ class Loop:
         while int(state["iteration"]) < iterations:
             done, stale = bool(np.all(state["finished"])), int(state["stale"]) >= patience
             if int(state["stage"]) < self.sharpenings:
-                many = state["lam"].shape[1] == 0 and int(state["stage_steps"]) >= INNER
+                most = HASTY if np.sum(~state["retired"]) > 1 else INNER
+                many = state["lam"].shape[1] == 0 and int(state["stage_steps"]) >= most
                 if done or stale or many:
                     self._sharpen()
             elif done or stale:
