@@ -5,9 +5,9 @@ for nothing, and A makes up for what it leaves out (the second derivatives of th
 
     A <- A + r r^T / (r.s),      r = (g_new - g) - B s,
 
-also after steps that are rejected, unless the loss there is so far above what was foretold that it says nothing about here.  The step
-minimises the model over |s_i| <= delta and the limits of the gains; delta grows and shrinks with how well the model foretold the loss.
-A trial that makes a run unsound has an infinite loss, so it is rejected and delta shrinks: numbers that are not finite never reach z.
+also after steps that are rejected.  The step minimises the model over |s_i| <= delta and the limits of the gains; delta grows and
+shrinks with how well the model foretold the loss.  A trial that makes a run unsound has an infinite loss, so it is rejected and
+delta shrinks: numbers that are not finite never reach z.
 
 Source: J. E. Dennis, D. M. Gay, R. E. Welsch, ACM Trans. Math. Softw. 7 (1981) 348-368 (structured secant updates);
 A. R. Conn, N. I. M. Gould, P. L. Toint, Math. Program. 50 (1991) 177-195 (rank-one updates in trust regions).
@@ -25,8 +25,6 @@ from iblf_jax.tuning.parameters import Box
 FIRST_RADIUS = 1.0
 """|s_i| of the first step: a factor e for a gain."""
 LARGEST_RADIUS = 4.0
-ASTRAY = 20.0
-"""A trial that raises the loss by more than so many times what it was foretold to lower it is nothing to learn from."""
 FLATTEST = 1e-6
 """Smallest eigenvalue of the model's matrix, relative to its largest."""
 
@@ -116,7 +114,7 @@ class Newton:
             return
         step = trial - state["z"][s]
         gain = (state["loss"][s] - loss) / foretold if sound and foretold > 0 else -np.inf
-        if gain > -ASTRAY:
+        if sound:
             self._learn(state, s, step, gradient)
         if gain > 1e-4:
             state["z"][s], state["loss"][s], state["gradient"][s], state["matrix"][s] = trial, loss, gradient, matrix
