@@ -1,6 +1,6 @@
 """Gain tuning against black-box search, on the same compiled rollout.
 
-    python benchmarks/tuning.py [--quick] [--problem two_link|chain_4|chain_7] [--json FILE]
+    python benchmarks/tuning.py [--quick] [--problem two_link|chain_4|chain_7] [--starts 8] [--seeds 3] [--json FILE]
 
 The loss, without smoothing, is
 
@@ -8,19 +8,24 @@ The loss, without smoothing, is
 
 (E the integral of |tau|^2, p the largest |tau| over joints and time; 0: at the starting gains).  Rectangle sums at 1 ms: tau as it is
 applied at the start of a step, e1 as it is reached at its end.  With e1 at the start of a step too, the error of the start, which no
-gain changes, would be a part of the ISE and J 0.003 larger.  Columns: the best J of each method; rollout-equivalents and seconds until
-it was within 0.5 % of the best J of all methods (compile time apart).  One rollout-equivalent is one value of J; a value with its
-derivatives counts by its cost, measured in the same run.
+gain changes, would be a part of the ISE and J 0.003 larger.  Columns: the best J of each search; rollout-equivalents and seconds until
+it was within 0.5 % of the best J of all searches (compile time apart), and until it ended.  One rollout-equivalent is one value of J; a
+value with its derivatives counts by its cost, measured in the same run, for as many lanes as `tune` evaluates at once.
 
-Peers: CMA-ES (`cma`) and Optuna's TPE, in logarithms of the gains, from the same start, within the same limits; CMA-ES over several
-seeds, of which the median counts.
+Peers: CMA-ES (`cma`) and Optuna's TPE, in logarithms of the gains, from the same start, within the same limits.  On the chain of four the
+loss has several valleys: `tune` has eight starts there, and several seeds as CMA-ES has.  The last table says how many searches of
+each method came within 0.5 %, and the expected rollouts to get there by searching with one seed after another until one does,
+
+    rollouts of all searches, each up to the goal or to its end / number of searches that reached it
+
+(if none did: more than the rollouts of all of them).
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -35,6 +40,13 @@ from iblf_jax import bounds, controllers, disturbances, observers, references, r
 from iblf_jax.tuning import _tune, problem
 
 WITHIN = 1.005
+SMOOTHING = 0.012
+"""Of the peak, in the loss that `tune` starts with."""
+BUDGET = {"two_link": (1500, 1500), "chain_4": (4000, 1500), "chain_7": (6000, 1500)}
+"""Values of one search by CMA-ES and by TPE, whose own work grows with the square of their number."""
+STARTS = {"two_link": 1, "chain_4": 8, "chain_7": 1}
+BACKEND = {"two_link": "auto", "chain_4": "auto", "chain_7": "native"}
+"""With "auto" no C compiler works on derivatives of 200,000 operations, which takes it some minutes."""
 FOUND_LIMITS = (0.1, 1e3)
 """Where no upper limit is given to the searches: far above what any of them wants."""
 
@@ -94,8 +106,26 @@ class Loss:
         return self.weight * ij.objectives.tracking() + 0.5 * effort + 10 * peak
 
 
+class Search(NamedTuple):
+    """What a search saw, value by value or step by step."""
+
+    method: str
+    seed: int
+    seen: np.ndarray
+    """J."""
+    spent: np.ndarray
+    """Rollout-equivalents so far."""
+    times: np.ndarray
+    """Seconds so far."""
+
+    def reached(self, goal: float) -> int | None:
+        """When it came to the goal."""
+        hit = np.flatnonzero(self.seen <= goal)
+        return int(hit[0]) if len(hit) else None
+
+
 class Judge:
-    """J without smoothing at many points; every value counted and timed."""
+    """J at many points; every value counted and timed."""
 
     def __init__(self, built: _tune.Problem, offset: float):
         self.built, self.offset = built, offset
@@ -106,14 +136,18 @@ class Judge:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """J at points (S, p) or (p,)."""
         found = problem.value(self.built.shared, self.built.lanes(np.atleast_2d(points)), plan=self.built.plan)
-        losses = np.where(np.asarray(found.sound), np.asarray(found.loss) - self.offset, 1e6)
+        losses = np.where(np.asarray(found.sound), np.asarray(found.objective) - self.offset, 1e6)
         losses = np.where(np.isfinite(losses), losses, 1e6)
         self.seen += losses.tolist()
         self.times += [time.perf_counter() - self.began] * len(losses)
         return losses
 
+    def search(self, method: str, seed: int) -> Search:
+        """What was seen."""
+        return Search(method, seed, np.asarray(self.seen), 1.0 + np.arange(len(self.seen)), np.asarray(self.times))
 
-def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) -> Judge:
+
+def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) -> Search:
     """CMA-ES, first step size 0.5 in logarithms, otherwise as it comes."""
     import cma
 
@@ -125,10 +159,10 @@ def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) ->
     while not search.stop() and len(judge.seen) < evaluations:
         points = search.ask()
         search.tell(points, judge(np.stack(points)).tolist())
-    return judge
+    return judge.search("CMA-ES", seed)
 
 
-def run_tpe(built: _tune.Problem, offset: float, evaluations: int, seed: int) -> Judge:
+def run_tpe(built: _tune.Problem, offset: float, evaluations: int, seed: int) -> Search:
     """Optuna's TPE from the same start."""
     import optuna
 
@@ -145,83 +179,83 @@ def run_tpe(built: _tune.Problem, offset: float, evaluations: int, seed: int) ->
         return float(judge(np.asarray(z))[0])
 
     study.optimize(target, n_trials=evaluations)
-    return judge
+    return judge.search("Optuna TPE", seed)
 
 
-def run_ours(scenario, parameters, duration: float, hard: _tune.Problem, loss: Loss, iterations: int, smoothing: float):
-    """`tune` with its defaults: J of every trial, seconds of every trial, after a first call that compiles."""
-    times: list[float] = []
+def run_ours(problem_: tuple, starts: int, backend: str, loss: Loss, cost: float, iterations: int, seeds: range) -> list[Search]:
+    """`tune` with each seed: the best J of every step, after a first call that compiles."""
+    scenario, parameters, duration = problem_
 
-    def once(iterations, callback=None):
-        return ij.tune(
-            scenario,
-            parameters,
-            loss.objective(smoothing),
-            duration=duration,
-            iterations=iterations,
-            patience=100,
-            progress=False,
-            callback=callback,
-        )
+    def once(seed: int, iterations: int, callback=None):
+        options = {"starts": starts, "backend": backend, "seed": seed, "patience": 100, "progress": False}
+        timing = {"duration": duration, "iterations": iterations, "callback": callback}
+        return ij.tune(scenario, parameters, loss.objective(SMOOTHING), **timing, **options)
 
-    once(1)
-    began = time.perf_counter()
-    best = once(iterations, lambda loop: times.append(time.perf_counter() - began))
-    judge = Judge(hard, loss.offset)
-    judge(best.history["z"][:, 0])
-    judge.times = times
-    return judge, best
+    def timed(seed: int) -> Search:
+        times: list[float] = []
+        began = time.perf_counter()
+        history = once(seed, iterations, lambda loop: times.append(time.perf_counter() - began)).history
+        seen = np.where(history["sound"], history["objective"] - loss.offset, 1e6).min(axis=1)
+        return Search("iblf_jax tune", seed, seen, cost * history["evaluations"], np.asarray(times))
+
+    once(seeds[0], 1)
+    return [timed(seed) for seed in seeds]
 
 
-def reached(judge: Judge, goal: float) -> int | None:
-    """How many values it took to come to the goal."""
-    hit = np.flatnonzero(np.asarray(judge.seen) <= goal)
-    return int(hit[0]) + 1 if len(hit) else None
-
-
-def compare(name: str, quick: bool) -> list[list[Any]]:
-    """The rows of one problem."""
+def compare(name: str, quick: bool, starts: int, seeds: int) -> tuple[list[list[Any]], list[list[Any]]]:
+    """The rows of one problem: of every search, and of every method."""
     scenario, parameters, duration = problem_of(name, quick)
-    timing = {"duration": duration, "dt": 1e-3, "method": "rk4"}
+    timing = {"duration": duration, "dt": 1e-3, "method": "rk4", "backend": BACKEND[name]}
     loss = Loss(scenario, duration)
-    hard = _tune.build(scenario, parameters, loss.objective(1e-6), None, 1, 0, "mean", timing)
-    lanes, size = hard.lanes(hard.box.z[None]), len(hard.box.z)
+    built = _tune.build(scenario, parameters, loss.objective(SMOOTHING), None, 1, 0, "mean", timing)
+    lanes, size = built.lanes(np.stack([built.box.z] * starts)), len(built.box.z)
     calls = {
-        "value": lambda: problem.value(hard.shared, lanes, plan=hard.plan),
-        "slope": lambda: problem.slope(hard.shared, lanes, plan=hard.plan),
+        "value": lambda: problem.value(built.shared, lanes, plan=built.plan),
+        "slope": lambda: problem.slope(built.shared, lanes, plan=built.plan),
     }
-    seconds = interleaved(calls, 2 if quick else 10)
+    seconds = interleaved(calls, 2 if quick else 20)
     cost = seconds["slope"] / seconds["value"]
-    budget = (40, 20) if quick else {"two_link": (1500, 1500), "chain_4": (4000, 1500), "chain_7": (6000, 1500)}[name]
-    ours, tuned = run_ours(scenario, parameters, duration, hard, loss, 4 if quick else 80, 0.012)
-    peers = {f"CMA-ES seed {s}": run_cma(hard, loss.offset, budget[0], s) for s in ((1,) if quick else (1, 2, 3))}
-    peers["Optuna TPE"] = run_tpe(hard, loss.offset, budget[1], 1)
-    goal = WITHIN * min(min(j.seen) for j in (ours, *peers.values()))
-    rows = [_row(name, size, f"iblf_jax {tuned.optimiser}", ours, goal, cost)]
-    rows += [_row(name, size, peer, judge, goal, 1.0) for peer, judge in peers.items()]
-    counts = [r[5] for r in rows if str(r[2]).startswith("CMA") and r[5] != "never"]
-    if counts and rows[0][5] != "never":
-        ratio = np.median(counts) / rows[0][5]
-        print(f"{name}: derivative with value costs {cost:.2f} values; CMA-ES (median) needs {ratio:.2f} x the rollouts")
-    return rows
+    values, trials = (40, 20) if quick else BUDGET[name]
+    own = range(seeds if starts > 1 else 1)
+    searches = run_ours((scenario, parameters, duration), starts, BACKEND[name], loss, cost, 4 if quick else 80, own)
+    searches += [run_cma(built, loss.offset, values, seed) for seed in range(1, seeds + 1)]
+    searches.append(run_tpe(built, loss.offset, trials, 1))
+    goal = WITHIN * min(float(s.seen.min()) for s in searches)
+    methods = list(dict.fromkeys(s.method for s in searches))
+    of_methods = [_method_row(name, method, [s for s in searches if s.method == method], goal) for method in methods]
+    return [_row(name, size, search, goal, cost) for search in searches], of_methods
 
 
-def _row(name: str, size: int, method: str, judge: Judge, goal: float, cost: float) -> list[Any]:
-    count = reached(judge, goal)
-    within: list[Any] = ["never", "never"] if count is None else [cost * count, judge.times[count - 1]]
-    return [name, size, method, float(judge.seen[0]), float(min(judge.seen)), *within, cost]
+def _row(name: str, size: int, search: Search, goal: float, cost: float) -> list[Any]:
+    at = search.reached(goal)
+    within: list[Any] = ["never", "never"] if at is None else [float(search.spent[at]), float(search.times[at])]
+    ends = [float(search.spent[-1]), float(search.times[-1]), cost if search.method.startswith("iblf") else 1.0]
+    return [name, size, f"{search.method}, seed {search.seed}", float(search.seen[0]), float(search.seen.min()), *within, *ends]
+
+
+def _method_row(name: str, method: str, searches: list[Search], goal: float) -> list[Any]:
+    """How many searches reached the goal, and the expected rollouts to get there."""
+    at = [s.reached(goal) for s in searches]
+    reached = sum(a is not None for a in at)
+    spent = sum(float(s.spent[-1 if a is None else a]) for s, a in zip(searches, at, strict=True))
+    median = float(np.median([s.seen.min() for s in searches]))
+    return [name, method, f"{reached} of {len(searches)}", median, spent / reached if reached else f"> {spent:.0f}"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="half a second of motion, few values")
     parser.add_argument("--problem", choices=("two_link", "chain_4", "chain_7"), help="one problem only")
+    parser.add_argument("--starts", type=int, help="starts of tune; 8 on the chain of four and 1 elsewhere if not given")
+    parser.add_argument("--seeds", type=int, default=3, help="searches by CMA-ES, and by tune where it has several starts")
     parser.add_argument("--json", help="also write the table to this file")
     args = parser.parse_args()
     names = [args.problem] if args.problem else ["two_link"] if args.quick else ["two_link", "chain_4", "chain_7"]
-    rows = [row for name in names for row in compare(name, args.quick)]
-    columns = ["problem", "gains", "method", "first J", "best J", "rollouts to 0.5 %", "seconds to 0.5 %", "cost of one"]
-    report("Gain tuning", columns, rows, args.json)
+    found = [compare(name, args.quick, args.starts or STARTS[name], 1 if args.quick else args.seeds) for name in names]
+    columns = ["problem", "gains", "search", "first J", "best J", "rollouts to 0.5 %", "seconds to 0.5 %", "rollouts", "seconds"]
+    report("Gain tuning", [*columns, "cost of one"], [row for rows, _ in found for row in rows], args.json)
+    columns = ["problem", "method", "within 0.5 %", "median best J", "expected rollouts to 0.5 %"]
+    report("Methods", columns, [row for _, rows in found for row in rows], None)
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "mar
 REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "violation_probability_below")
 TABLES = ("tune", "objective", "requirement", "perturbations")
 ARGUMENTS = (
-    *("runs", "seed", "resample", "optimiser", "mode", "starts", "iterations", "tolerance", "patience"),
+    *("runs", "seed", "resample", "optimiser", "mode", "starts", "sharpenings", "iterations", "tolerance", "patience"),
     *("learning_rate", "backend", "report_runs", "report_seed", "confidence"),
 )
 """What [tune] may hold besides `parameters`, `risk` and `level`."""

@@ -19,7 +19,7 @@ from iblf_jax.scenario import canonical
 from iblf_jax.time_loop import start
 from iblf_jax.tuning import _tune, problem
 from iblf_jax.tuning.newton import box_step
-from iblf_jax.tuning.optimise import Evaluator
+from iblf_jax.tuning.optimise import Evaluator, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.quantities import Integral, Peak, Quantities
 from iblf_jax.tuning.robust import Risk, combine
@@ -298,6 +298,71 @@ def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
         assert found.value.sound[0]
     np.testing.assert_allclose(z[0], Bowl.bottom, atol=1e-6)
     assert state["settled"][0] and 10 < bowl.evaluations < 400
+
+
+class Corner:
+    """An evaluator of max(x, -2 x), x = z - 0.3, smoothed as its objective says: the smooth maximum has its bottom elsewhere."""
+
+    def __init__(self, starts):
+        goal = jax.tree.map(jnp.asarray, objectives.peak_torque(1.0, smoothing=0.2))
+        self.shared = problem.Shared(None, goal, jnp.asarray(1e-3))
+        self.plan = problem.Plan((), (), 1, "euler", Risk("mean"), ())
+        self.lanes = problem.Lane(np.zeros((starts, 1)), np.zeros((starts, 1), np.uint32), np.ones((starts, 1)), np.zeros((starts, 0)), 1.0)
+        self.needed, self.evaluations = np.ones(starts, bool), 0
+
+    def __call__(self, z):
+        T = float(self.shared.objective.terms[0].quantity.smoothing)
+        y, slope = np.concatenate([z - 0.3, -2 * (z - 0.3)], axis=1), np.array([1.0, -2.0])
+        exact, weight = y.max(axis=1), np.exp((y - y.max(axis=1, keepdims=True)) / T)
+        loss = exact + T * np.log(weight.sum(axis=1))
+        weight /= weight.sum(axis=1, keepdims=True)
+        mean = weight @ slope
+        curved = (weight @ slope**2 - mean**2) / T
+        self.evaluations += int(self.needed.sum())
+        none = np.zeros((len(z), 0))
+        value = problem.Value(loss, exact, exact[:, None], none, none, np.ones(len(z)), self.needed.copy(), exact[:, None])
+        return problem.Slope(value, mean[:, None], curved[:, None, None])
+
+
+def followed(starts, sharpenings, steps=60, resumed=None, stop=None):
+    box = Box(np.zeros(1), np.full(1, -3.0), np.full(1, 3.0))
+    loop = Loop(Corner(len(starts)), _tune.make_method("newton", box, 60, 1e-6, 0.1), np.asarray(starts)[:, None], sharpenings=sharpenings)
+    if resumed:
+        load_checkpoint(resumed, loop, "mark")
+    loop.run(stop or steps, tolerance=1e-6, patience=60, on_step=lambda _: None)
+    return loop
+
+
+def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path):
+    starts = [1.0, -0.5, 2.0, -2.0]
+    blurred, sharp = followed(starts[:1], 0), followed(starts, 4)
+    assert abs(blurred.state["best_z"][0, 0] - 0.3) > 0.02
+    assert abs(sharp.state["best_z"][np.argmin(sharp.state["best_key"][:, 1]), 0] - 0.3) < 2e-3
+    assert sharp.state["retired"].sum() == 3 and sharp.state["stage"] == 4
+    assert sharp.evaluator.evaluations < 0.6 * len(starts) * len(sharp.history["loss"])
+    half = followed(starts, 4, stop=len(sharp.history["loss"]) // 2)
+    assert 0 < half.state["stage"] < 4
+    save_checkpoint(tmp_path / "half.npz", half, "mark")
+    again = followed(starts, 4, resumed=tmp_path / "half.npz")
+    np.testing.assert_array_equal(again.history["z"], sharp.history["z"])
+    np.testing.assert_array_equal(again.history["loss"], sharp.history["loss"])
+
+
+def test_only_needed_starts_are_evaluated_in_groups_of_one_shape(nominal):
+    lanes = nominal.lanes(np.arange(20.0)[:, None] * np.ones(6))
+    evaluator, shapes = Evaluator(nominal.plan, nominal.shared, lanes, "forward"), set()
+
+    def derive(shared, lanes):
+        shapes.add(lanes.z.shape)
+        z, sound = np.asarray(lanes.z), np.ones(len(lanes.z), bool)
+        return problem.Slope(problem.Value(*[z[:, 0]] * 6, sound, z), z, z[:, :, None])
+
+    evaluator.derive = derive
+    evaluator.needed[[3, 7]] = False
+    found = evaluator(lanes.z)
+    assert shapes == {(16, 6)} and evaluator.evaluations == 18
+    np.testing.assert_array_equal(found.value.loss, np.where(evaluator.needed, np.arange(20.0), np.inf))
+    np.testing.assert_array_equal(found.value.sound, evaluator.needed)
 
 
 @pytest.mark.slow

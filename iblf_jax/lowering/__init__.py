@@ -196,7 +196,7 @@ def run_batch_jvp(
 
     Args:
       scenario, varied, folds, dt, steps, method: as `run_batch`.
-      backend: as `run_batch`; "auto" runs long programs (many joints, many directions), which take minutes to compile, on vmap.
+      backend: as `run_batch`; "auto" runs long programs (many joints and directions), which take minutes to compile, on vmap.
       directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run: direction p moves each of these
         leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
 
@@ -211,7 +211,7 @@ def run_batch_jvp(
     options: dict[str, Any] = {"steps": steps, "method": method}
 
     def run_on(executor):
-        if backend == "auto" and not sensitivities.is_short(scenario, varied, along, folds, dt, method=method):
+        if backend == "auto" and not sensitivities.is_short(executor, scenario, varied, along, folds, dt, method=method):
             return plain()
         return sensitivities.lowered_jvp(executor, scenario, varied, along, folds, dt, **options)
 

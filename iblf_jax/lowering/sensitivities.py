@@ -24,8 +24,9 @@ from iblf_jax.lowering.batch import Executor, batch_of, critical_modes, step_fun
 from iblf_jax.lowering.step import Leaves
 from iblf_jax.paths import get, with_parameters
 
-LARGEST = 60_000
-"""Operations of a step with its derivatives up to which "auto" lowers it: compilers take minutes over longer ones."""
+LARGEST, LARGEST_IN_PIECES = 60_000, 150_000
+"""Operations of a step, times one and its tangents, up to which "auto" lowers its derivatives: compilers take minutes over longer ones,
+the native backend, which cuts a step into pieces, half a one.  Equal numbers are computed once, so that about a third is left of them."""
 FLAGS = ("guard_active", "saturated")
 """Fields of a sample that are no numbers."""
 
@@ -176,15 +177,15 @@ def _floats_of(metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
     return {name: x for name, x in metrics.items() if jnp.issubdtype(x.dtype, jnp.floating)}
 
 
-def is_short(scenario, varied, directions: Directions, folds, dt, *, method: str) -> bool:
-    """Whether the derivatives' program is short enough to be compiled in seconds: each tangent costs about as much as the value.
+def is_short(executor: Executor, scenario, varied, directions: Directions, folds, dt, *, method: str) -> bool:
+    """Whether the derivatives' program is short enough for an executor to be compiled in about a minute at most.
 
     Raises:
       UnsupportedError: the step does not lower.
     """
-    batch = batch_of(native.run, scenario, varied, folds, dt)
+    batch = batch_of(executor, scenario, varied, folds, dt)
     program, _, _ = batch.program(step_function, jax.eval_shape(batch.start), method, False)
-    return len(program.nodes) * (1 + directions.tangents) <= LARGEST
+    return len(program.nodes) * (1 + directions.tangents) <= (LARGEST_IN_PIECES if executor is native.run else LARGEST)
 
 
 def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, folds, dt, *, steps: int, method: str) -> Tangents:

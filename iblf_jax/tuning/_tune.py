@@ -24,7 +24,7 @@ from iblf_jax.studies.draws import Cases, plan
 from iblf_jax.studies.progress import bar
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
-from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete
+from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, Tunable, layout, names_of, values_at
 from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, Slope, gradient, slope, value
@@ -55,6 +55,7 @@ def tune(
     optimiser: str = "auto",
     mode: str = "auto",
     starts: int = 1,
+    sharpenings: int = 2,
     iterations: int = 60,
     tolerance: float = 1e-5,
     patience: int = 15,
@@ -86,10 +87,13 @@ def tune(
       optimiser: "newton" (Gauss-Newton in a trust region), "lbfgs", "adam", or "auto": newton where forward mode is used, else lbfgs, and
         adam where runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
-      starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch.
+      starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch; at each
+        sharpening the better half goes on.
+      sharpenings: how many times the smoothing of the objective's peaks is divided by 4, each time once the starts have settled; 0 where
+        nothing is smoothed, and with adam.
       iterations: steps of the optimiser at most.
       tolerance: relative change of the loss below which a start has settled.
-      patience: stop after so many steps without a better result.
+      patience: stop (before the last sharpening: sharpen) after so many steps without a better result.
       learning_rate: of adam, in squashed coordinates.
       report_runs, report_seed: fresh runs for the report, and their seed (seed + 1 if not given).
       confidence: of the report's intervals.
@@ -112,9 +116,12 @@ def tune(
     iterations, starts = checks.positive_integer("iterations", iterations), checks.positive_integer("starts", starts)
     z = starting_points(problem.box, starts, seed)
     evaluator = Evaluator(problem.plan, problem.shared, problem.lanes(z), mode)
-    loop = Loop(evaluator, make_method(optimiser, problem.box, iterations, tolerance, learning_rate), z, resample=resample)
+    method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
+    stages = checks.positive_integer("sharpenings", sharpenings) if sharpenings else 0
+    stages = stages if method_.settles and is_smoothed(problem.shared.objective) else 0
+    loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
     loop.rescue = partial(way_in, problem, seed)
-    options = (optimiser, mode, starts, tolerance, learning_rate, resample, iterations if optimiser == "adam" else 0)
+    options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
     mark = fingerprint(problem.plan, problem.shared, options)
     if checkpoint is not None and Path(checkpoint).exists():
         load_checkpoint(checkpoint, loop, mark)

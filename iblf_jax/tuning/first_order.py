@@ -89,6 +89,10 @@ class LBFGS:
         _put(state["inner"], self.optimiser.init(jnp.asarray(state["w"][start])), start)
         state["settled"][start] = False
 
+    def retire(self, state, start: int) -> None:
+        """No more line searches from one start."""
+        state["settled"][start] = True
+
     def _search(self, shared, lanes, w, inner, *, derive):
         """One line search for one start; lanes has one row."""
 

@@ -70,6 +70,10 @@ class Newton:
         state["secant"][start] = 0.0
         state["radius"][start] = max(state["radius"][start], 0.1 * self.radius)
 
+    def retire(self, state: dict[str, np.ndarray], start: int) -> None:
+        """One start is given up: no more trials."""
+        state["settled"][start] = True
+
     def step(self, evaluate: Any, state: dict[str, np.ndarray]):
         """One trial for every start.
 

@@ -17,6 +17,7 @@ in the loss g is driven below zero by an augmented Lagrangian (`optimise`), in t
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -148,6 +149,23 @@ def _completed(t: Term, x: Any) -> Term:
     if isinstance(quantity, Peak) and t.scale is None:
         quantity = Peak(scale, quantity.signal, quantity.joints, quantity.after, quantity.smoothing)
     return Term(quantity, t.weight, scale, limit, t.sharpness, t.shape, t.name)
+
+
+def sharper(objective: Objective, factor: float) -> Objective:
+    """The objective with the smoothing of every peak in it multiplied by a factor; all else, and the structure, stays."""
+
+    def mended(part: Any) -> Any:
+        smoothing = getattr(part.quantity, "smoothing", None)
+        if smoothing is None:
+            return part
+        return dataclasses.replace(part, quantity=dataclasses.replace(part.quantity, smoothing=factor * smoothing))
+
+    return Objective(tuple(map(mended, objective.terms)), tuple(map(mended, objective.requirements)))
+
+
+def is_smoothed(objective: Objective) -> bool:
+    """Whether a quantity of the objective is smoothed, so that `sharper` changes it."""
+    return any(getattr(quantity, "smoothing", None) is not None for quantity in objective.quantities)
 
 
 def _plain(name: str, quantity: Quantity, scale: Any) -> Objective:

@@ -1,4 +1,4 @@
-"""The loop of a tuning: steps of a method, multipliers of the requirements, the best so far, early stop, checkpoint and resume.
+"""The loop of a tuning: steps of a method, multipliers, sharper and sharper peaks, the best so far, early stop, checkpoint and resume.
 
 Requirements are driven in by an augmented Lagrangian: whenever a start has settled (or after INNER steps),
 
@@ -6,6 +6,11 @@ Requirements are driven in by an augmented Lagrangian: whenever a start has sett
 
 so a start that breaks them finds its way in while the penalty stays finite everywhere.  The best so far is the one with the lowest
 objective among those that keep the requirements and the bounds, or, while none does, the one that breaks them least.
+
+The smooth maximum in the loss lies above the maximum by smoothing times a logarithm, so its bottom is not where the maximum's is; but it
+is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once all starts have settled at the
+tolerance ROUGH (or after INNER steps, HASTY where several are left to choose from), the smoothing is divided by SHARPER, the better half of
+the starts goes on and the others are given up.  What counts as the best is judged without smoothing throughout.
 
 A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
 from there and gives the same numbers, bit by bit, as one that was not.
@@ -24,6 +29,7 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.tuning import problem
+from iblf_jax.tuning.objectives import sharper
 from iblf_jax.tuning.problem import Lane, Plan, Shared, Slope
 
 INNER = 12
@@ -32,6 +38,12 @@ FIRST_MU = 10.0
 LARGEST_MU = 1e6
 OUTER = 12
 """Updates of the multipliers at most."""
+SHARPER = 4.0
+ROUGH, HASTY = 1e-3, 6
+"""Tolerance before the last sharpening, and steps at most of several starts without requirements: what is found there is a place to go on
+from, and good enough to choose by."""
+LANES = 16
+"""Runs that are evaluated at once at least, where starts run out one by one: what a processor's vectors hold."""
 
 
 class Evaluator:
@@ -41,16 +53,40 @@ class Evaluator:
         self.plan, self.shared, self.lanes = plan, shared, lanes
         self.derive = Derive(problem.slope if mode == "forward" else problem.gradient, plan)
         self.evaluations = 0
+        starts, runs = lanes.index.shape
+        self.group = min(starts, -(-LANES // runs))
+        self.needed = np.ones(starts, bool)
+        """Which starts are evaluated; the others come back unsound."""
 
     def __call__(self, z: np.ndarray) -> Slope:
-        """Value and derivatives at z, (S, p)."""
-        self.evaluations += len(z)
-        found = self.derive(self.shared, self.lanes._replace(z=np.asarray(z, self.shared.dt.dtype)))
-        return jax.tree.map(np.asarray, found)
+        """Value and derivatives at z, (S, p), a group of needed starts at a time, so that all calls are of one compiled shape."""
+        wanted = np.flatnonzero(self.needed)
+        self.evaluations += len(wanted)
+        lanes = self.lanes._replace(z=np.asarray(z, self.shared.dt.dtype))
+        parts = []
+        for first in range(0, len(wanted), self.group):
+            rows = np.resize(wanted[first : first + self.group], self.group)
+            found = self.derive(self.shared, jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], lanes))
+            parts.append(jax.tree.map(np.asarray, found))
+        found = jax.tree.map(lambda *x: np.concatenate(x)[: len(wanted)], *parts)
+        return found if len(wanted) == len(z) else _spread(found, wanted, len(z))
 
     def row(self, s: int) -> tuple[Shared, Lane]:
         """What belongs to one start."""
         return self.shared, jax.tree.map(lambda x: np.asarray(x)[s : s + 1], self.lanes)
+
+
+def _spread(found: Slope, rows: np.ndarray, starts: int) -> Slope:
+    """What was found for some starts, among all of them; the others are unsound, with losses that are infinite."""
+
+    def placed(x: np.ndarray) -> np.ndarray:
+        whole = np.full((starts, *x.shape[1:]), np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
+        whole[rows] = x
+        return whole
+
+    found = jax.tree.map(placed, found)
+    found.value.loss[~found.value.sound] = np.inf
+    return found
 
 
 class Derive:
@@ -73,8 +109,9 @@ class Derive:
 class Loop:
     """State of a tuning, all of it arrays in `state`; `run` goes on from wherever it is."""
 
-    def __init__(self, evaluator: Evaluator, method: Any, z: np.ndarray, *, resample: bool = False):
+    def __init__(self, evaluator: Evaluator, method: Any, z: np.ndarray, *, resample: bool = False, sharpenings: int = 0):
         self.evaluator, self.method, self.resample = evaluator, method, resample
+        self.smoothest, self.sharpenings = evaluator.shared.objective, sharpenings
         starts, count = len(z), len(evaluator.plan.shares)
         terms = len(evaluator.shared.objective.terms)
         self.runs = evaluator.lanes.index.shape[1]
@@ -88,7 +125,10 @@ class Loop:
             "outer": np.zeros(starts, int),
             "worst": np.full(starts, np.inf),
             "finished": np.zeros(starts, bool),
+            "retired": np.zeros(starts, bool),
             "stale": np.asarray(0),
+            "stage": np.asarray(0),
+            "stage_steps": np.asarray(0),
             "best_z": z.copy(),
             "best_key": np.full((starts, 2), np.inf),
             "best_terms": np.full((starts, terms), np.nan),
@@ -102,13 +142,40 @@ class Loop:
         """Steps until done; returns why it stopped."""
         state = self.state
         while int(state["iteration"]) < iterations:
-            if np.all(state["finished"]):
-                return "converged"
-            if int(state["stale"]) >= patience:
-                return f"no improvement in {patience} steps"
+            done, stale = bool(np.all(state["finished"])), int(state["stale"]) >= patience
+            if int(state["stage"]) < self.sharpenings:
+                most = HASTY if np.sum(~state["retired"]) > 1 else INNER
+                many = state["lam"].shape[1] == 0 and int(state["stage_steps"]) >= most
+                if done or stale or many:
+                    self._sharpen()
+            elif done or stale:
+                return "converged" if done else f"no improvement in {patience} steps"
+            self._enter(tolerance)
             self._step(tolerance)
             on_step(self)
         return "converged" if np.all(state["finished"]) else "iterations used up"
+
+    def _enter(self, tolerance: float) -> None:
+        """Makes loss and tolerance those of the stage that the state says."""
+        stage = int(self.state["stage"])
+        if self.sharpenings:
+            objective = sharper(self.smoothest, SHARPER**-stage)
+            self.evaluator.shared = self.evaluator.shared._replace(objective=objective)
+            self.method.tolerance = tolerance if stage == self.sharpenings else max(tolerance, ROUGH)
+
+    def _sharpen(self) -> None:
+        """On to a sharper loss, with the better half of the starts that are left."""
+        state = self.state
+        left = np.flatnonzero(~state["retired"])
+        order = sorted(left.tolist(), key=lambda s: tuple(state["best_key"][s]))
+        for s in order[: -(-len(order) // 2)]:
+            state["finished"][s] = False
+            state["since"][s], state["outer"][s] = 0, 0
+            self.method.restart(state["method"], s)
+        for s in order[-(-len(order) // 2) :]:
+            state["finished"][s] = state["retired"][s] = True
+            self.method.retire(state["method"], s)
+        state["stage"], state["stage_steps"], state["stale"] = state["stage"] + 1, np.asarray(0), np.asarray(0)
 
     def _step(self, tolerance: float) -> None:
         state, evaluator = self.state, self.evaluator
@@ -116,7 +183,7 @@ class Loop:
         if self.resample:
             index = np.broadcast_to(np.arange(self.runs, dtype=np.uint32) + np.uint32(self.runs * int(state["iteration"])), index.shape)
         evaluator.lanes = evaluator.lanes._replace(lam=state["lam"].copy(), mu=state["mu"].copy(), index=index)
-        before = evaluator.evaluations
+        before, evaluator.needed = evaluator.evaluations, ~state["finished"]
         z, found = self.method.step(evaluator, state["method"])
         state["evaluations"] = state["evaluations"] + (evaluator.evaluations - before)
         improved = self._keep_best(z, found, tolerance)
@@ -127,7 +194,7 @@ class Loop:
             state["method"] = self.method.init(better)
         for s in range(len(z) if better is None else 0):
             self._outer(s, found)
-        state["iteration"] = state["iteration"] + 1
+        state["iteration"], state["stage_steps"] = state["iteration"] + 1, state["stage_steps"] + 1
 
     def _keep_best(self, z: np.ndarray, found: Slope, tolerance: float) -> bool:
         state, improved = self.state, False

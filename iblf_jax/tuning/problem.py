@@ -77,9 +77,9 @@ class Value(NamedTuple):
     loss: Any
     """L, infinite where a run was unsound."""
     objective: Any
-    """L without requirements."""
+    """L without requirements and without smoothing: what results are compared by."""
     terms: Any
-    """Each unweighted term, averaged over the runs, (n_terms,)."""
+    """Each unweighted term without smoothing, averaged over the runs, (n_terms,)."""
     excess: Any
     """G_r from the smooth quantities, (n_requirements,)."""
     exact_excess: Any
@@ -151,8 +151,8 @@ def _value(plan: Plan, shared: Shared, lane: Lane, smooth, exact, status) -> Val
     sound = jnp.all(status & int(UNSOUND) == 0) & jnp.all(jnp.isfinite(smooth))
     return Value(
         jnp.where(sound, _loss(plan, shared, lane, smooth), jnp.inf),
-        _objective(plan, shared, lane, smooth),
-        jnp.mean(jax.vmap(shared.objective.values)(smooth), axis=0),
+        _objective(plan, shared, lane, exact),
+        jnp.mean(jax.vmap(shared.objective.values)(exact), axis=0),
         _excesses(plan, shared.objective, smooth),
         _excesses(plan, shared.objective, exact),
         -jnp.max(exact[:, -1]),
