@@ -311,18 +311,20 @@ def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table
     assert computed == list(range(5, 12))
 
 
-def test_ctrl_c_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monkeypatch, capsys):
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monkeypatch, capsys, number, word):
     path, plain = tmp_path / "sweep.zarr", store.Store.write
 
     def write(self, unit, data):
         if unit == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         plain(self, unit, data)
 
     monkeypatch.setattr(store.Store, "write", write)
     with pytest.raises(interrupt.Interrupted, match=r"after 3 of 12 units.*Start the same call"):
         cases.table(store=path)
-    assert "Ctrl-C" in capsys.readouterr().err
+    assert word in capsys.readouterr().err
     monkeypatch.undo()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert cases.table(store=path).identical(table)
