@@ -18,6 +18,7 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
+from iblf_jax.lowering import native, toolchain
 from iblf_jax.studies import interrupt, store, sweep
 
 SCENARIO = ij.presets.zhang_yan_2024()
@@ -169,6 +170,16 @@ def test_another_scenario_law_or_backend_is_refused(finished):
     assert ij.load_sweep(finished).attrs["backend"] in ("native", "xla"), "what it ran on, not what was asked for"
 
 
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_another_processor_is_named(finished, table, monkeypatch):
+    if ij.load_sweep(finished).attrs["backend"] != "native":
+        pytest.skip("the store is not tied to a processor")
+    monkeypatch.setattr(toolchain, "_processor", lambda: "model name : Another 9000\nflags : avx")
+    with pytest.raises(ij.StoreError, match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*xla") as caught:
+        cases.table(store=finished)
+    assert "program" not in str(caught.value)
+
+
 def chunks(path, name="margin"):
     return sorted(file for file in (path / name / "c").rglob("*") if file.is_file())
 
@@ -218,7 +229,8 @@ def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
     with pytest.raises(ij.StoreError, match="cannot be written"):
         cases.table(store=tmp_path / "file" / "sweep.zarr")
     if os.getuid() == 0:
-        monkeypatch.setattr(store.os, "access", lambda *_: False)
+        plain = os.access
+        monkeypatch.setattr(store.os, "access", lambda path, mode: Path(path) != finished and plain(path, mode))
     else:
         finished.chmod(0o500)
     with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
