@@ -1,11 +1,13 @@
 """Monte-Carlo: runs a second and resident memory, against what one would do otherwise.
 
-    python benchmarks/monte_carlo.py [--quick] [--json FILE] [--budget S] [--backend NAME]
+    python benchmarks/monte_carlo.py [--quick] [--json FILE] [--budget S] [--backend NAME] [--parts runs devices]
 
 One study: the paper's loop, 10 s at 1 ms, with a random start.  Rows of this package are made in a process each, so that the memory is
 theirs: 1e3 to 1e6 runs.  Where the whole length does not fit into the budget of a row, its runs are shorter and runs/s is extrapolated
-by the number of steps; memory does not depend on the length.  The others: a Python loop over SciPy's LSODA, the same in a process
-pool (16 runs timed), and diffrax under vmap (Tsit5, adaptive; 64 runs timed).  The last column says what was extrapolated.
+by the number of steps; memory does not depend on the length.  Then, for each backend and type, what two CPU devices of one process give
+over one, beside what two processes on a core each give over one of them: the machine does not have more.  The others: a Python loop
+over SciPy's LSODA, the same in a process pool (16 runs timed), and diffrax under vmap (Tsit5, adaptive; 64 runs timed).  The last
+column says what was extrapolated.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ import numpy as np
 
 DURATION, DT = 10.0, 1e-3
 SPREAD = 0.02
-COLUMNS = ["way", "runs", "runs/s", "times the Python loop", "resident MB", "measured"]
+COLUMNS = ["way", "runs", "runs/s", "times the Python loop", "resident MB", "remark"]
+SIZES = {"native": 20_480, "xla": 10_240, "vmap": 2_048}
+"""Runs of 1 s that one device is timed on: seconds."""
 
 
 def study(runs: int, steps: int, backend: str, dtype: str, devices: int) -> dict[str, float]:
@@ -44,13 +48,88 @@ def study(runs: int, steps: int, backend: str, dtype: str, devices: int) -> dict
     return {"seconds": time.perf_counter() - begin, "megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
-def in_its_own_process(**words) -> dict[str, float]:
+PIPES = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+
+
+def _command(name: str, **words) -> list[str]:
+    """Calls a function of this file in a process of its own, which prints what it returns."""
     here = os.path.dirname(os.path.abspath(__file__))
     code = (
-        "import sys, json; sys.path.insert(0, sys.argv[1]); import monte_carlo as m; print(json.dumps(m.study(**json.loads(sys.argv[2]))))"
+        "import sys, json; sys.path.insert(0, sys.argv[1]); import monte_carlo as m; "
+        "print(json.dumps(getattr(m, sys.argv[2])(**json.loads(sys.argv[3]))))"
     )
-    done = subprocess.run([sys.executable, "-c", code, here, json.dumps(words)], check=True, capture_output=True, text=True)
+    return [sys.executable, "-c", code, here, name, json.dumps(words)]
+
+
+def in_its_own_process(name: str = "study", **words) -> dict[str, float]:
+    done = subprocess.run(_command(name, **words), check=True, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def two_devices(backend: str, dtype: str, runs: int, steps: int, repeats: int) -> dict[str, float]:
+    """Seconds of one study in this process on one and on two of its devices, and in one and in two processes on a core each."""
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", 2)
+    words = {"backend": backend, "dtype": dtype, "runs": runs, "steps": steps}
+    workers = [subprocess.Popen(_command("worker", core=core, **words), **PIPES) for core in two_cores()]
+    here = _study(**words)
+    for worker in workers:
+        worker.stdout.readline()
+
+    def together(some) -> None:
+        for worker in some:
+            worker.stdin.write("go\n")
+            worker.stdin.flush()
+        for worker in some:
+            worker.stdout.readline()
+
+    from _timing import interleaved
+
+    calls = {
+        "one": lambda: here(jax.devices()[:1]),
+        "two": lambda: here(jax.devices()),
+        "process": lambda: together(workers[:1]),
+        "processes": lambda: together(workers),
+    }
+    found = interleaved(calls, repeats)
+    for worker in workers:
+        worker.stdin.close()
+        worker.wait()
+    return found
+
+
+def two_cores() -> list[int]:
+    """Two cores of this process."""
+    return sorted(os.sched_getaffinity(0))[:2]
+
+
+def worker(core: int, **words) -> None:
+    """Keeps to one core and runs the study for every line that comes in."""
+    os.sched_setaffinity(0, {core})
+    run = _study(**words)
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        run()
+        print("done", flush=True)
+
+
+def _study(backend: str, dtype: str, runs: int, steps: int):
+    """A study with a mass and the start drawn, as a function of the devices; compiled for all of them."""
+    import jax
+
+    jax.config.update("jax_enable_x64", dtype == "float64")
+    import iblf_jax as ij
+    from iblf_jax.studies.blocks import block_size
+
+    ways = {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)), "initial.q": ij.offset(ij.normal(0.0, SPREAD))}
+    options = {"duration": steps * DT, "dt": DT, "backend": backend, "progress": False}
+
+    def run(devices=None, runs=runs) -> None:
+        ij.monte_carlo(ij.presets.zhang_yan_2024(), ways, runs=runs, devices=devices, **options)
+
+    run(runs=2 * block_size())
+    return run
 
 
 def scipy_run(seed: int, duration: float = DURATION) -> float:
@@ -124,12 +203,27 @@ def ours(args: argparse.Namespace, reference: float) -> list[list]:
     return rows
 
 
+def devices(args: argparse.Namespace, reference: float) -> list[list]:
+    """What a second device gives, backend by backend."""
+    rows = []
+    for backend in ("native",) if args.quick else SIZES:
+        for dtype in ("float32",) if args.quick else ("float64", "float32"):
+            steps, runs = (20, 512) if args.quick else (round(1.0 / DT), SIZES[backend])
+            found = in_its_own_process("two_devices", backend=backend, dtype=dtype, runs=runs, steps=steps, repeats=1 if args.quick else 5)
+            speed = runs / found["two"] * steps * DT / DURATION
+            gain, most = found["one"] / found["two"], 2 * found["process"] / found["processes"]
+            said = f"{gain:.2f} times one device; two processes {most:.2f} times one (runs of {steps * DT:g} s)"
+            rows.append([f"{backend}, {dtype}, 2 devices", runs, speed, speed / reference, "-", said])
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small numbers and short runs")
     parser.add_argument("--json", help="also write the table to this file")
     parser.add_argument("--budget", type=float, help="seconds for a row (default 60; quick 0.2)")
     parser.add_argument("--backend", default="auto")
+    parser.add_argument("--parts", nargs="+", choices=("runs", "devices"), default=("runs", "devices"), help="rows of this package")
     args = parser.parse_args()
     args.budget = args.budget or (0.2 if args.quick else 60.0)
     count, lanes, duration = (2, 2, 0.2) if args.quick else (16, 64, DURATION)
@@ -144,7 +238,10 @@ def main() -> None:
         rows.append(["diffrax, vmap", lanes, speed, speed / reference, "-", said.replace(f"{count} runs", f"{lanes} runs")])
     except ImportError:
         print("diffrax is not installed: pip install 'iblf_jax[bench]'")
-    rows += ours(args, reference)
+    if "runs" in args.parts:
+        rows += ours(args, reference)
+    if "devices" in args.parts and len(os.sched_getaffinity(0)) > 1:
+        rows += devices(args, reference)
     from _timing import report
 
     report(f"Runs of {DURATION:g} s at {DT:g} s, random start", COLUMNS, rows, args.json)

@@ -1,8 +1,6 @@
 """`python -m iblf_jax`: the same as the console script `iblf-jax`."""
 
-import sys
-
-from iblf_jax.cli import main
+from iblf_jax.cli import entry
 
 if __name__ == "__main__":
-    sys.exit(main())
+    entry()

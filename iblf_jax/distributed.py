@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -60,8 +61,9 @@ def initialize(
 ) -> None:
     """Makes this process one of a job; call it before anything else that uses JAX.
 
-    Under SLURM, Open MPI and on TPUs nothing need be given: JAX finds out by itself.  Elsewhere every process gets the same
-    `coordinator` and `num_processes`, and its own `process_id`.
+    Under SLURM (in processes that `srun` started), Open MPI and on TPUs nothing need be given: JAX finds out by itself.  Elsewhere
+    every process gets the same `coordinator` and `num_processes`, and its own `process_id`.  SLURM's processes meet at a port that JAX
+    takes from the number of the job: two `srun` at a time in one job need a $JAX_COORDINATOR_PORT each.
 
     Args:
       coordinator: address of process 0, "host:port".
@@ -93,13 +95,16 @@ def initialize(
         )
     except ValueError as error:
         _say_bye(watcher)
-        raise ValueError(f"{error} Give coordinator, num_processes and process_id: no cluster was found that says them.") from error
+        mend = "Start the processes with srun." if "SLURM_JOB_ID" in os.environ else "Give coordinator, num_processes and process_id."
+        raise ValueError(f"No cluster was found that says where the processes meet: {error} {mend}") from error
     except RuntimeError as error:
         _say_bye(watcher)
         raise ProcessLostError(
             f"Not all processes of the job came within {start} s, or the coordinator is not at {coordinator}: {error}"
         ) from error
     sys.excepthook = _leave_on_error
+    if threading.current_thread() is threading.main_thread():  # JAX's runtime swallows SIGTERM, with which a cluster asks a job to end
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 
 def _check_job(coordinator: Any, num_processes: Any, process_id: Any) -> None:

@@ -9,6 +9,7 @@ import argparse
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,38 @@ GRID = {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
 RUNS = 500
 """3000 cases: 12 blocks of 256."""
 UNIT = 256
+
+STUDY = """
+preset = "zhang_yan_2024"
+[run]
+duration = 0.02
+method = "euler"
+[perturbations]
+"plant.mass[1]" = { factor = "normal", mean = 1.0, std = 0.1 }
+initial.q = { offset = "normal", std = 0.05 }
+[study]
+runs = 300
+seed = 3
+"""
+SWEEP = (
+    STUDY.replace("[study]", "[sweep]")
+    + """
+unit = 256
+[grid]
+"controller.K2" = [10.0, 20.0, 40.0]
+observer.kf = [10.0, 20.0]
+"""
+)
+"""The same for the command line, with the standard metrics."""
+
+
+def from_file(text, **more):
+    """The sweep of a file, in this process."""
+    import iblf_jax as ij
+    from iblf_jax import study_file
+
+    file = study_file.study_from_dict(tomllib.loads(text), "sweep")
+    return ij.sweep(file.scenario, file.grid, perturbations=file.perturbations, **file.options | more)
 
 
 def study(runs=600, ways=None, **more):
@@ -72,7 +105,12 @@ def environment(cache: Path, **more: str) -> dict[str, str]:
 
 def start(cache: Path, *words: str, **more: str) -> subprocess.Popen:
     """Starts this file as a script."""
-    command = [sys.executable, __file__, *words]
+    return start_python(cache, __file__, *words, **more)
+
+
+def start_python(cache: Path, *words: str, **more: str) -> subprocess.Popen:
+    """Starts Python with these words."""
+    command = [sys.executable, *words]
     return subprocess.Popen(command, env=environment(cache, **more), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -7,7 +7,9 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import study_cases as cases
@@ -26,6 +28,11 @@ def free_address():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+def is_free(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) != 0
 
 
 def job(compiled, tmp_path, words, more=((), ()), devices="2"):
@@ -69,6 +76,36 @@ def test_a_study_over_two_processes(compiled, tmp_path):
     expected = dict(study.metrics) | study.samples | {"status": study.status}
     for i in (0, 1):
         assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), expected)
+
+
+def test_slurm_says_where_the_processes_meet(tmp_path):
+    """Two processes with the variables that `srun` gives them, and `--distributed` alone."""
+    file, path = tmp_path / "sweep.toml", tmp_path / "sweep.zarr"
+    file.write_text(cases.SWEEP)
+    one = cases.arrays(cases.from_file(cases.SWEEP))
+    last = 2**16 - 2**12  # JAX takes the port from the number of the job
+    port = next(last + i for i in range(2**12) if is_free(last + i))
+    common = {"SLURM_JOB_ID": str(port - last), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
+    words = ("-m", "iblf_jax", "sweep", str(file), "--store", str(path), "--distributed", "--quiet")
+    both = [cases.start_python(Path(jax.config.jax_compilation_cache_dir), *words, **common, SLURM_PROCID=i, SLURM_LOCALID=i) for i in "01"]
+    for rank, process in enumerate(both):
+        out, errors = process.communicate(timeout=300)
+        assert process.returncode == 1, errors  # some runs leave their bounds
+        assert ("1800 runs" in out) == (rank == 0)
+    found = ij.load_sweep(path)
+    assert found.attrs["computed_cases"] == 1800
+    assert cases.same(cases.arrays(found), one)
+
+
+def test_a_job_that_srun_did_not_start_is_told_so(monkeypatch):
+    monkeypatch.setenv("SLURM_JOB_ID", "1")
+
+    def initialize(*_, **__):
+        raise ValueError("coordinator_address should be defined.")
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    with pytest.raises(ValueError, match="Start the processes with srun"):
+        distributed.initialize()
 
 
 def test_a_stalled_process_is_not_waited_for_for_ever(monkeypatch):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import signal
+import time
 import tomllib
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import study_cases as cases
@@ -13,27 +17,7 @@ import iblf_jax as ij
 from iblf_jax import cli, study_file
 from iblf_jax.studies import store
 
-STUDY = """
-preset = "zhang_yan_2024"
-[run]
-duration = 0.02
-method = "euler"
-[perturbations]
-"plant.mass[1]" = { factor = "normal", mean = 1.0, std = 0.1 }
-initial.q = { offset = "normal", std = 0.05 }
-[study]
-runs = 300
-seed = 3
-"""
-SWEEP = (
-    STUDY.replace("[study]", "[sweep]")
-    + """
-unit = 256
-[grid]
-"controller.K2" = [10.0, 20.0, 40.0]
-observer.kf = [10.0, 20.0]
-"""
-)
+STUDY, SWEEP = cases.STUDY, cases.SWEEP
 CALM = SWEEP.replace("std = 0.05", "std = 0.001").replace("300", "3")
 
 
@@ -110,6 +94,49 @@ def test_every_run_ok_is_zero_interrupted_is_130_and_full_is_3(command, monkeypa
     monkeypatch.setattr(store.Store, "write", full)
     code, _, err = command("sweep", "sweep.toml", "--store", "s.zarr", "--quiet")
     assert (code, err) == (3, "iblf-jax: error: no space left\n")
+
+
+def test_ctrl_c_from_outside(command, tmp_path):
+    """As a user does it: a process, SIGINT after its first unit, the same command again."""
+    text = SWEEP.replace("300", "2000")
+    (tmp_path / "sweep.toml").write_text(text)
+    words = ("sweep", "sweep.toml", "--store", "s.zarr", "--quiet")
+    process = cases.start_python(Path(jax.config.jax_compilation_cache_dir), "-m", "iblf_jax", *words)
+    while not (tmp_path / "s.zarr/done/c/0").exists() and process.poll() is None:
+        time.sleep(0.001)
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, ""), errors
+    assert re.search(r"Stopped after \d+ of 47 units.*Start the same call or command again", errors)
+    assert "Traceback" not in errors
+    assert 0 < ij.load_sweep("s.zarr").attrs["computed_cases"] < 12000
+    assert command(*words)[0] == 1
+    assert ij.load_sweep("s.zarr").identical(cases.from_file(text))
+
+
+def test_ctrl_c_while_a_study_compiles(command, tmp_path):
+    """XLA goes on in a thread of its own, and would crash if JAX were taken down under it."""
+    code = """
+import os, signal, sys, threading, jax
+from iblf_jax import cli
+from iblf_jax.studies import monte_carlo
+
+def compile_for_long(*_, **__):
+    def f(x):
+        for i in range(2000):
+            x = jax.numpy.sin(x + i)
+        return x
+    lowered = jax.jit(f).lower(1.0)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    lowered.compile()
+
+monte_carlo.monte_carlo = compile_for_long
+sys.argv[1:] = ["montecarlo", "study.toml"]
+cli.entry()
+"""
+    process = cases.start_python(tmp_path / "nothing_compiled", "-c", code)
+    assert process.communicate(timeout=60) == ("", "iblf-jax: error: interrupted\n")
+    assert process.returncode == 130
 
 
 @pytest.mark.parametrize(

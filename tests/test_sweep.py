@@ -18,6 +18,7 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
+from iblf_jax.lowering import native, toolchain
 from iblf_jax.studies import interrupt, store, sweep
 
 SCENARIO = ij.presets.zhang_yan_2024()
@@ -169,6 +170,16 @@ def test_another_scenario_law_or_backend_is_refused(finished):
     assert ij.load_sweep(finished).attrs["backend"] in ("native", "xla"), "what it ran on, not what was asked for"
 
 
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_another_processor_is_named(finished, table, monkeypatch):
+    if ij.load_sweep(finished).attrs["backend"] != "native":
+        pytest.skip("the store is not tied to a processor")
+    monkeypatch.setattr(toolchain, "_processor", lambda: "model name : Another 9000\nflags : avx")
+    with pytest.raises(ij.StoreError, match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*xla") as caught:
+        cases.table(store=finished)
+    assert "program" not in str(caught.value)
+
+
 def chunks(path, name="margin"):
     return sorted(file for file in (path / name / "c").rglob("*") if file.is_file())
 
@@ -218,7 +229,8 @@ def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
     with pytest.raises(ij.StoreError, match="cannot be written"):
         cases.table(store=tmp_path / "file" / "sweep.zarr")
     if os.getuid() == 0:
-        monkeypatch.setattr(store.os, "access", lambda *_: False)
+        plain = os.access
+        monkeypatch.setattr(store.os, "access", lambda path, mode: Path(path) != finished and plain(path, mode))
     else:
         finished.chmod(0o500)
     with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
@@ -311,18 +323,20 @@ def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table
     assert computed == list(range(5, 12))
 
 
-def test_ctrl_c_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monkeypatch, capsys):
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monkeypatch, capsys, number, word):
     path, plain = tmp_path / "sweep.zarr", store.Store.write
 
     def write(self, unit, data):
         if unit == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         plain(self, unit, data)
 
     monkeypatch.setattr(store.Store, "write", write)
     with pytest.raises(interrupt.Interrupted, match=r"after 3 of 12 units.*Start the same call"):
         cases.table(store=path)
-    assert "Ctrl-C" in capsys.readouterr().err
+    assert word in capsys.readouterr().err
     monkeypatch.undo()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert cases.table(store=path).identical(table)

@@ -19,6 +19,8 @@ from typing import NoReturn
 
 import jax
 
+INTERRUPTED = 130
+
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
 
@@ -64,8 +66,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             complain(f"the machine gave up: {error}. A shorter --duration or a larger --record-every takes less memory.")
         except KeyboardInterrupt:
             complain("interrupted")
-            return 130
+            return INTERRUPTED
     return 2
+
+
+def entry() -> NoReturn:
+    """A process of its own for one command: ends with `main`'s exit code.
+
+    An interrupted one ends without taking JAX down: XLA may be compiling in a thread, and crashes when its client goes.
+    """
+    code = main()
+    if code == INTERRUPTED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _warn_once(message: str, said: set[str]) -> None:

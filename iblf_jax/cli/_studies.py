@@ -43,8 +43,7 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
     import jax
 
     from iblf_jax import checks, distributed
-    from iblf_jax.cli import complain
-    from iblf_jax.studies.interrupt import Interrupted
+    from iblf_jax.cli import INTERRUPTED, complain
     from iblf_jax.studies.store import StoreError, StoreWriteError
 
     _check_out(args.out)
@@ -55,9 +54,9 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
         if args.distributed or any(word is not None for word in job):
             distributed.initialize(*job, heartbeat=args.heartbeat)
         code = work({"chunk": args.chunk, "progress": False if args.quiet or distributed.rank() else None})
-    except Interrupted as stop:
-        complain(str(stop))
-        code = 130
+    except KeyboardInterrupt as stop:
+        complain(str(stop) or "interrupted")
+        code = INTERRUPTED
     except (StoreWriteError, distributed.ProcessLostError) as error:
         complain(str(error))
         code = UNFINISHED

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -99,16 +100,25 @@ def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds, 
     Raises:
       ValueError: an unknown backend.
     """
-    found = []
+    flat, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
+    return _settled(backend, method, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
 
-    def trace(varied):
+
+@lru_cache(maxsize=64)
+def _settled(backend: str, method: str, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
+    """`settled` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
+
+    def trace(leaves):
+        scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
+
         def run_on(executor):
             batch.run(executor, scenario, varied, folds, dt, steps=1, method=method, record_every=None)
             return {gpu.run: "gpu", native.run: "native", xla.run: "xla"}[executor]
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))
 
-    jax.eval_shape(trace, dict(varied))
+    found: list[str] = []
+    jax.eval_shape(trace, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     return found[-1]
 
 

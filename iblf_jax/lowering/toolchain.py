@@ -57,6 +57,14 @@ def _processor() -> str:
         return platform.processor() + platform.machine()
 
 
+def built_for() -> dict[str, str]:
+    """What a kernel is tied to, in words; ToolchainError if there is no compiler."""
+    found, path = _processor(), compiler()
+    names = [line.partition(":")[2].strip() for line in found.splitlines() if line.startswith(("model name", "CPU part"))]
+    features = hashlib.sha256(found.encode()).hexdigest()[:8]
+    return {"processor": f"{', '.join(names) or platform.machine()}, features {features}", "compiler": f"{_version(path)}, {path}"}
+
+
 def _run(command: list[str]) -> str:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False, stdin=subprocess.DEVNULL)

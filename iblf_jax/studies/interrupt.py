@@ -1,40 +1,43 @@
-"""Ctrl-C between two units: the first one asks, the second one insists."""
+"""Asked to stop between two units: the first signal asks, the second one insists."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from types import FrameType, TracebackType
+from typing import Any
+
+SIGNALS = {signal.SIGINT: ("Ctrl-C", signal.default_int_handler), signal.SIGTERM: ("SIGTERM", signal.SIG_DFL)}
+"""Signals that ask, what they are called, and who handles them where nobody else does.  A cluster sends SIGTERM before it kills."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A sweep that was stopped by Ctrl-C after a unit; the message says how to go on."""
+    """A sweep that was stopped after a unit; the message says how to go on."""
 
 
-class CtrlC:
-    """While this context is open, the first Ctrl-C only sets `asked`; the second one interrupts as usual.
+class StopRequest:
+    """While this context is open, the first Ctrl-C or SIGTERM only sets `asked`; the second one interrupts at once.
 
     Signals reach the main thread only; elsewhere, and where somebody else handles or ignores them, this does nothing.
     """
 
-    def __init__(self, active: bool = True):
+    def __init__(self) -> None:
         self.asked = False
-        ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        self._active = active and ours
+        self._before: dict[signal.Signals, Any] = {}
 
-    def __enter__(self) -> CtrlC:
-        if self._active:
-            self._before = signal.signal(signal.SIGINT, self._handle)
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            ours = [number for number, (_, usual) in SIGNALS.items() if signal.getsignal(number) is usual]
+            self._before = {number: signal.signal(number, self._handle) for number in ours}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self._active:
-            signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-        import sys
-
-        sys.stderr.write("\nCtrl-C: stopping after the unit at hand; again to stop at once.\n")
+        sys.stderr.write(f"\n{SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand; again to stop at once.\n")

@@ -24,7 +24,7 @@ from iblf_jax.studies import config as configuration
 from iblf_jax.studies.blocks import MEMORY, Results, _execute, block_size, run_blocks
 from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
 from iblf_jax.studies.designs import check_sampler, check_seed
-from iblf_jax.studies.interrupt import CtrlC, Interrupted
+from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.setup import Setup, prepare
@@ -112,7 +112,7 @@ def sweep(
     Raises:
       ValueError: bad arguments; the message names the field, the value and the mend.
       StoreError: a store of another configuration, a foreign or unwritable one, a full disk.  What was written stays valid.
-      Interrupted: Ctrl-C; with a store only after the unit at hand, and the message says how to go on.
+      Interrupted: Ctrl-C or SIGTERM with a store, after the unit at hand; the message says how to go on.
 
     Source: design of this package.
     """
@@ -218,14 +218,21 @@ def _into_store(setup: Setup, config: dict[str, Any], how: _How, path: str | os.
         )
     mine = distributed.share(pending)
     done, longest, begin = 0, 0.0, time.monotonic()
-    with CtrlC() as ctrl_c, bar(how.progress, setup.cases, setup.cases - sum(_length(store, u) for u in pending)) as shown:
+    with StopRequest() as stop, bar(how.progress, setup.cases, setup.cases - sum(_length(store, u) for u in pending)) as shown:
         for data, span in _units(setup, mine, size, how, shown):
             store.write(span.start // size, data)
             done, longest, begin = done + 1, max(longest, time.monotonic() - begin), time.monotonic()
-            if ctrl_c.asked and done < len(mine):
+            if stop.asked and done < len(mine):
                 raise _interrupted(store)
+
+        def progress() -> int:
+            found = int(store.marks().sum())
+            if stop.asked and found < store.units:
+                raise _interrupted(store)
+            return found
+
         if distributed.size() > 1:
-            distributed.wait_for(lambda: int(store.marks().sum()), store.units, longest, str(path))
+            distributed.wait_for(progress, store.units, longest, str(path))
     return _dataset(store)
 
 
