@@ -1,15 +1,24 @@
 /* Where samples go.  The generated part gives RECORDED and RECORDED_SIZES: how many arrays are recorded, and how many numbers each has. */
 typedef struct { real *at[RECORDED + 1]; } record_arrays;
 
-/* One sample of W runs, array after array, into a row of the arrays, each (rows, numbers, runs), for the runs that exist.  On a CPU no part
-   of the loop over steps, whose registers it would take. */
-SEPARATE void write_sample(const record_arrays *records, const F *sample, int64_t row, int64_t runs, int64_t run) {
+/* One sample of the `live` first of W runs, array after array, into a row of the arrays, each (rows, numbers, runs). */
+template <typename count> INLINE void write_some(const record_arrays *records, const F *sample, int64_t row, int64_t runs, int64_t run, count live) {
   const int sizes[] = RECORDED_SIZES;
-  int live = run + W <= runs ? W : (int)(runs - run);
+  int n = 0;
 #pragma unroll
+#pragma GCC unroll 1000
   for (int i = 0; i < RECORDED; i++) {
     real *place = records->at[i] + row * sizes[i] * runs + run;
 #pragma unroll
-    for (int k = 0; k < sizes[i]; k++) store_some(place + k * runs, *sample++, live);
+#pragma GCC unroll 1000
+    for (int k = 0; k < sizes[i]; k++) store_some(place + k * runs, sample[n++], live);
   }
+}
+
+/* The same for the runs that exist.  On a CPU no part of the loop over steps, whose registers it would take. */
+SEPARATE void write_sample(const record_arrays *records, const F *sample, int64_t row, int64_t runs, int64_t run) {
+  int64_t live = runs - run;
+  if (live >= W) write_some(records, sample, row, runs, run, all_runs());
+  else if (live == 1) write_some(records, sample, row, runs, run, one_run());
+  else write_some(records, sample, row, runs, run, (int)live);
 }

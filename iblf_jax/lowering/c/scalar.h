@@ -39,6 +39,8 @@ typedef union { real f; integer i; } word;
 #define from(first) (first)
 #define to_float(x) ((F)(x))
 #define to_int(x) ((I)(x))
-#define store_some(place, x, count) ((void)(count), (void)(*(place) = (x)))
+struct all_runs {};
+struct one_run {};
+template <typename count> INLINE void store_some(real *p, F x, count) { *p = x; }
 #define LANEWISE(name, call) INLINE F name(F x) { return FN(call)(x); }
 #define LANEWISE2(name, call) INLINE F name(F x, F y) { return FN(call)(x, y); }

@@ -42,10 +42,11 @@ INLINE F splat(real x) { return x - (F){}; }
 INLINE I splat_i(integer x) { return x - (I){}; }
 INLINE F load(const real *p) { F x; memcpy(&x, p, sizeof x); return x; }
 INLINE void store(real *p, F x) { memcpy(p, &x, sizeof x); }
-INLINE void store_some(real *p, F x, int count) {
-  if (count == W) store(p, x);
-  else for (int l = 0; l < count; l++) p[l] = x[l];
-}
+struct all_runs {};
+struct one_run {};
+INLINE void store_some(real *p, F x, all_runs) { store(p, x); }
+INLINE void store_some(real *p, F x, one_run) { *p = x[0]; }
+INLINE void store_some(real *p, F x, int count) { for (int l = 0; l < count; l++) p[l] = x[l]; }
 INLINE I from(integer first) { I x; for (int l = 0; l < W; l++) x[l] = first + l; return x; }
 INLINE I bits(F x) { return (I)x; }
 INLINE F from_bits(I x) { return (F)x; }
