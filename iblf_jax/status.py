@@ -18,7 +18,7 @@ class Status(enum.IntFlag):
     BOUND_VIOLATED = 1
     """A joint touched or left its bound."""
     NOT_FINITE = 2
-    """The state ran away (NaN, infinity, or a joint faster than VELOCITY_LIMIT); it was frozen at its last good value."""
+    """The state ran away (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is no number); it was frozen at its last good value."""
     STEP_TOO_LARGE = 4
     """dt is beyond the stability limit of the integrator for the fastest mode of the closed loop."""
     INFEASIBLE_REFERENCE = 8

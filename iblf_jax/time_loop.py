@@ -62,6 +62,7 @@ def sample_status(sample: Sample) -> jax.Array:
         | flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
         | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
+        | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
     )
 
 
