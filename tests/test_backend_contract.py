@@ -36,10 +36,14 @@ def outcome_of(scenario, varied, folds, dt, backend):
 
 ONE_TYPE = {"ur5": "float32", "iiwa14": "float64"}
 """Arms of many joints take minutes to compile: each in one type."""
-CASES = [(name, dtype) for name in ij.presets.PRESETS for dtype in TOLERANCE if dtype == ONE_TYPE.get(name, dtype)]
+CASES = [
+    pytest.param(name, dtype, marks=pytest.mark.release if name in ONE_TYPE else pytest.mark.slow)
+    for name in ij.presets.PRESETS
+    for dtype in TOLERANCE
+    if dtype == ONE_TYPE.get(name, dtype)
+]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_backends_agree_with_the_reference(name, dtype):
     scenario = canonical(ij.astype(ij.presets.PRESETS[name](), dtype))
