@@ -119,7 +119,7 @@ def _relative_error(axes: Axes, traces: Traces) -> None:
     axes.axhspan(-1.08, -1.0, color=BROKEN, linewidth=0, zorder=0)
     axes.set_ylim(-1.08, 1.6)
     _frame(axes, traces.t, r"relative error $\xi$", "1")
-    small = {"fontsize": 6.5, "handlelength": 1.8, "columnspacing": 0.8} if n > 5 else {}
+    small = {"fontsize": 6.5, "handlelength": 1.8, "columnspacing": 0.8}
     axes.legend(loc="upper center", ncols=4 if n > 5 else 3, **LEGEND, **small)
 
 
