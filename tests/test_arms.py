@@ -109,7 +109,7 @@ def test_the_law_keeps_to_the_actuators(scenario):
     np.testing.assert_array_equal(scenario.controller.limit, scenario.model.effort)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_certificate_holds(name, scenario):
     """The corrected law, all the way: every line that applies."""
     certificate = ij.certify(scenario, ij.simulate(scenario, **RUN))
@@ -187,7 +187,7 @@ UNKNOWN = {"plant.link[iiwa_link_4].mass": ij.factor(ij.uniform(0.8, 1.2)), "ini
 BRIEF = {"duration": 0.02, "dt": 1e-3, "progress": False}
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_monte_carlo_and_sweep():
     """Every run of a batch is the run alone.  (On vmap: the C compiler takes minutes over seven joints.)"""
     scenario = ij.presets.iiwa14()
