@@ -95,7 +95,6 @@ def main() -> None:
     for backend in compiled:
         calls[f"{backend}, user's call"] = lambda b=backend: ij.simulate(scenario, duration=duration, dt=1e-3, backend=b).q
         calls[f"{backend}, compiled"] = lambda b=backend: compiled[b](scenario, folds, dt)
-    for backend in ("xla", "native"):
         ij.simulate(scenario, duration=duration, dt=1e-3, backend=backend)
     best = interleaved(calls, repeats)
     reference = best["LSODA, NumPy loop"]

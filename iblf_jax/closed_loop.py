@@ -71,7 +71,7 @@ def initial_state(scenario: Scenario) -> LoopState:
     return LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), scenario.observer.init(q, dq, scenario.model))
 
 
-@partial(jax.jit, inline=True)
+@partial(jax.jit, inline=True)  # so that it is traced once for all the places that call it, and leaves no call behind
 def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0) -> tuple[LoopState, Sample]:
     """The rate of the state and the sample at time t.
 

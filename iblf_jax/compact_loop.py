@@ -20,7 +20,7 @@ from iblf_jax.stability import fastest_mode_by_differences
 from iblf_jax.time_loop import Carry, Nearest, Outcome, critical_instants, folded, keep_if, moved, record_of, scan_steps, verdict
 
 _evaluate_once = jax.jit(evaluate)
-"""`closed_loop.evaluate`, traced once however often it is called."""
+"""`closed_loop.evaluate` as a call that stays one: copied to where it is called, a long loop takes longer to trace."""
 
 
 def is_for(scenario: Scenario, dt) -> bool:

@@ -53,6 +53,12 @@ def short_run(paper) -> ij.Rollout:
 
 
 @pytest.fixture(scope="session")
+def compiled(tmp_path_factory):
+    """A folder for compiled programs, shared between the processes of all tests."""
+    return tmp_path_factory.getbasetemp() / "compiled"
+
+
+@pytest.fixture(scope="session")
 def reference_data() -> dict[str, np.ndarray]:
     """The paper's run by an independent program (SciPy DOP853, rtol 1e-12)."""
     with np.load(ROOT / "tests" / "data" / "paper_reference.npz") as data:

@@ -18,12 +18,6 @@ import iblf_jax as ij
 from iblf_jax import distributed
 
 
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """A folder for compiled programs, shared between the processes of all tests."""
-    return tmp_path_factory.getbasetemp() / "compiled"
-
-
 def free_address():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

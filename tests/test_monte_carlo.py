@@ -25,12 +25,6 @@ def study():
     return cases.study()
 
 
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """A folder for compiled programs, shared between the processes of all tests."""
-    return tmp_path_factory.getbasetemp() / "compiled"
-
-
 def results(study):
     return dict(study.metrics) | study.samples | {"status": study.status, "mode": study.fastest_mode}
 

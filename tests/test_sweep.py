@@ -42,12 +42,6 @@ def finished(written, tmp_path):
     return Path(shutil.copytree(written, tmp_path / "sweep.zarr"))
 
 
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """A folder for compiled programs, shared between the processes of all tests."""
-    return tmp_path_factory.getbasetemp() / "compiled"
-
-
 def once(**more):
     """A small sweep without perturbed runs."""
     return ij.sweep(SCENARIO, more.pop("grid", cases.GRID), **cases.options() | more)
