@@ -85,6 +85,8 @@ def evaluate(p: program.Program, shared, lane, carry, index):
                 known.append(np.asarray(args[0]).astype({"f": p.dtype, "i": int, "b": bool}[node.kind]))
             elif node.op == "not":
                 known.append(~args[0])
+            elif node.op == "lookup":
+                known.append(np.asarray(node.value, p.dtype)[np.clip(args[0], 0, len(node.value) - 1)])
             else:
                 known.append(FUNCTIONS[node.op](*args))
     return [known[o] for _, o in p.carry]
@@ -123,6 +125,7 @@ def lowered_function(f, *arrays):
 
 
 X, Y, K = np.linspace(-1.4, 1.3, 6).reshape(2, 3), np.linspace(0.2, 0.9, 6).reshape(3, 2), np.arange(3)
+TABLE = np.linspace(3.0, 4.0, 400).reshape(2, 200)
 CASES = {
     "matmul": (lambda x, y: x @ y, X, Y),
     "einsum": (lambda x, y: jnp.einsum("ij,jk->ki", x, y), X, Y),
@@ -135,6 +138,10 @@ CASES = {
     "elementary": (lambda y: jnp.tanh(y) + jnp.arctan2(y, 1 - y) + jnp.log1p(y) + jax.scipy.special.erf(y) + jax.nn.sigmoid(y), Y),
     "pad and stack": (lambda x: jnp.stack([jnp.pad(x, 1), jnp.pad(x, ((0, 2), (1, 1)))]), X),
     "own index": (lambda x, k: x[:, k[1]] + jax.lax.dynamic_slice(x, (k[0], k[1]), (1, 1))[0, 0], X, K),
+    "table": (lambda k: jnp.asarray(TABLE)[:, 90 * k[2]] * jax.lax.dynamic_slice(jnp.asarray(TABLE), (1, 70 * k[1]), (1, 2))[0], K),
+    "table, outside": (lambda k: jnp.asarray(TABLE)[0, 900 * k[2]] + jnp.asarray(TABLE)[0, -900 * k[2]], K),
+    "tables": (lambda k: jax.vmap(lambda i: jnp.asarray(TABLE)[:, 90 * i])(k) + jnp.asarray(TABLE)[1, 60 * k][:, None], K),
+    "filled gather": (lambda x: jnp.take(x, jnp.asarray([0, 2]), axis=1), X),
     "scan": (lambda x: jax.lax.scan(lambda c, r: (c + r, c * r), jnp.zeros(3), x, reverse=True)[1], X),
     "cond": (lambda x: jax.lax.cond(x[0, 0] > 0, jnp.sin, jnp.cos, x), X),
     "switch": (lambda x, k: jax.lax.switch(k[2], [jnp.sin, jnp.cos, jnp.exp], x), X, K),
@@ -155,6 +162,8 @@ REFUSED = {
     "while": lambda x: jax.lax.while_loop(lambda c: c < 3, lambda c: c + 1, x[0, 0]),
     "too long": lambda x: jax.lax.scan(lambda c, _: (c * 2, None), x[0, 0], length=1000)[0],
     "sort": lambda x: jnp.sort(x)[0],
+    "too many": lambda x: jnp.tile(x[0], 30)[x[0, 0].astype(jnp.int32)],
+    "filled": lambda x: jnp.take(x[0], x[0, 0].astype(jnp.int32)),
     "float32": lambda x: x.astype(jnp.float32)[0, 0] * 2,
     "uint32": lambda x: jnp.sum(x).astype(jnp.uint32) * jnp.uint32(2),
 }

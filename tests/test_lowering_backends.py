@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import stat
 import warnings
@@ -61,19 +62,21 @@ def assert_same(found, expected, tolerance):
 
 
 @needs_compiler
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_native_agrees_with_the_reference(dtype):
     found, expected = batch(dtype), batch(dtype, "vmap")
     assert_same(found, expected, TOLERANCE[dtype])
     np.testing.assert_array_equal(found.status, expected.status)
 
 
+@pytest.mark.slow
 def test_xla_agrees_with_the_reference():
     found, expected = batch(backend="xla"), batch(backend="vmap")
     assert_same(found, expected, TOLERANCE["float64"])
     np.testing.assert_array_equal(found.status, expected.status)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [2, 30])
 def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
     monkeypatch.setattr(lowering.xla, "BLOCK", 2)
@@ -87,6 +90,20 @@ def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["xla", pytest.param("native", marks=needs_compiler)])
+def test_a_spline_is_looked_up(backend):
+    times = np.linspace(0.0, 0.04, 9)
+    spline = ij.references.WaypointSpline(tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1)))
+    scenario, dt = canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)), jnp.asarray(1e-3)
+    options = {"steps": 50, "method": "heun", "record_every": 10}
+    varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
+    assert lowering.settled(backend, scenario, varied, (), dt, method="heun") == backend
+    found, expected = (lowering.run_batch(scenario, varied, (), dt, backend=b, **options) for b in (backend, "vmap"))
+    assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
+
+
+@pytest.mark.slow
 @needs_compiler
 def test_native_records_what_simulate_records():
     steps, every = 50, 7
@@ -102,6 +119,7 @@ def test_native_records_what_simulate_records():
     assert controller == ()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_results_do_not_depend_on_place_or_number_of_runs():
     values = draws(83)
@@ -136,6 +154,7 @@ def test_a_step_that_is_too_large_is_seen_by_every_backend():
     assert np.any(found.status & ij.Status.STEP_TOO_LARGE)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_one_run_and_threads():
     one = batch(values=draws(1))
@@ -148,6 +167,7 @@ def test_one_run_and_threads():
     assert_same(one, jax.tree.map(lambda x: x[:1], batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()})), 1e-12)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("record_every", [None, 100])
 def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
@@ -162,6 +182,7 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
     native.kernel.cache_clear()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_forward_sensitivities():
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
@@ -234,6 +255,7 @@ def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
         toolchain.cache_directory()
 
 
+@pytest.mark.slow
 def test_one_run_on_the_native_backend_is_the_run(paper):
     """Records, metrics and status of `simulate(backend="native")` are those of xla; another value of a leaf builds nothing new."""
     for scenario in (paper, ij.with_parameters(paper, {"controller.K2": 30.0, "plant.mass[1]": 1.1})):

@@ -41,11 +41,16 @@ def literal(node: Node, dtype: np.dtype) -> str:
         return f"splat_i({-1 if node.value else 0})"
     if node.kind == "i":
         return f"splat_i({node.value})"
-    if math.isnan(node.value):
-        return "splat(NAN)"
-    if math.isinf(node.value):
-        return f"splat({'-' if node.value < 0 else ''}INFINITY)"
-    return f"splat({node.value.hex()}{'f' if dtype == np.float32 else ''})"
+    return f"splat({number(node.value, dtype)})"
+
+
+def number(value: float, dtype: np.dtype) -> str:
+    """A constant of one run."""
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return f"{'-' if value < 0 else ''}INFINITY"
+    return f"{value.hex()}{'f' if dtype == np.float32 else ''}"
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
@@ -82,6 +87,13 @@ class _Emitter:
         self.program = program
         self.classes = program.classes()
         self.lines: list[str] = []
+        tables = dict.fromkeys(node.value for node in program.nodes if node.op == "lookup")
+        self.tables = {table: f"table_{k}" for k, table in enumerate(tables)}
+
+    def definitions(self) -> str:
+        """The tables of constants that statements look into."""
+        values = {name: ", ".join(number(x, self.program.dtype) for x in table) for table, name in self.tables.items()}
+        return "\n".join(f"TABLE {name}[] = {{{text}}};" for name, text in values.items())
 
     def needed(self, names: dict[int, str], wanted: Iterable[int]) -> list[int]:
         """The nodes without a name that `wanted` needs, in order."""
@@ -102,7 +114,11 @@ class _Emitter:
             if node.op == "const":
                 names[i] = literal(node, self.program.dtype)
                 continue
-            text = expression(node, [names[a] for a in node.args], [nodes[a].kind for a in node.args])
+            args = [names[a] for a in node.args]
+            if node.op == "lookup":
+                text = f"f_lookup({self.tables[node.value]}, {len(node.value)}, {args[0]})"
+            else:
+                text = expression(node, args, [nodes[a].kind for a in node.args])
             self.lines.append(f"  {'F' if node.kind == 'f' else 'I'} v{i} = {text};")
             names[i] = f"v{i}"
 
@@ -154,7 +170,7 @@ def source(program: Program, shared_leaves: int, lane_leaves: int, target: tuple
     """The whole C source of a program's kernel for a target, NATIVE or CUDA."""
     e, layout = _Emitter(program), Layout.of(program)
     before, after = target
-    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before)]
+    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before), e.definitions()]
     is_long = target is NATIVE and len(program.nodes) > LONG
     parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
     parts += [(_advance_in_segments if is_long else _advance)(e, *layout)]

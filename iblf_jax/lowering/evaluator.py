@@ -106,13 +106,21 @@ class Evaluator:
         read_later = {a for i in later for a in nodes[i].args}
         outputs = [i for i in order if i in read_later or i in stored]
         inputs = sorted({a for i in order for a in nodes[i].args} - here)
+        tables: dict[tuple, list[int]] = {}
+        for i in order:
+            if nodes[i].op == "lookup":
+                tables.setdefault((nodes[i].args, len(nodes[i].value)), []).append(i)
         entries = {i: known[i] for i in inputs if isinstance(known[i], Entry)}
         arrays = {i: known[i] for i in inputs if i not in entries}
 
         def body(row, arrays):
             local = arrays | {i: x.read(row) for i, x in entries.items()}
             for i in order:
-                local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
+                if nodes[i].op != "lookup":
+                    local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
+                elif i not in local:
+                    together = tables[nodes[i].args, len(nodes[i].value)]
+                    local |= zip(together, self._looked_up(together, local[nodes[i].args[0]]), strict=True)
             return [local[i] for i in outputs]
 
         results = lax.optimization_barrier(as_function(body)(row, arrays)) if self.bordered else body(row, arrays)
@@ -123,6 +131,14 @@ class Evaluator:
         if node.op == "convert":
             return lax.convert_element_type(args[0], self.types[node.kind])
         return self.functions[node.op](*args)
+
+    def _looked_up(self, lookups: list[int], index: Any) -> jax.Array:
+        """The values of lookups by one index, in one gather: XLA makes a loop of each."""
+        tables = jnp.asarray([self.program.nodes[i].value for i in lookups], self.program.dtype)
+        columns = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(1,), start_index_map=(1,))
+        index = lax.optimization_barrier(jnp.broadcast_to(index, self.shape))
+        places = lax.expand_dims(index, (len(self.shape),))
+        return lax.optimization_barrier(lax.gather(tables, places, columns, (len(lookups), 1), mode=lax.GatherScatterMode.CLIP))
 
 
 def on_cpu() -> bool:

@@ -22,6 +22,8 @@ def rebuilt(program: Program, rule) -> Program:
             new.append(b.constant(node.value, node.kind))
         elif node.op in INPUTS:
             new.append(b.input(node.op, node.value, node.kind))
+        elif node.op == "lookup":
+            new.append(b.lookup(node.value, *args))
         else:
             made = rule(b, node, args, i)
             new.append(b.emit(node.op, *args, kind=node.kind) if made is None else made)

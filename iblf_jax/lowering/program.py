@@ -32,7 +32,9 @@ class UnsupportedError(Exception):
 
 
 class Node(NamedTuple):
-    """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a constant or an input's index."""
+    """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a constant, an input's index, or the
+    numbers among which a "lookup" chooses by its whole-numbered argument (the nearest end, outside).
+    """
 
     op: str
     args: tuple[int, ...]
@@ -72,6 +74,10 @@ class Builder:
         if op in ("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"):
             args = tuple(sorted(args)) if op not in ("max", "min") else args
         return self._add(Node(op, args, kind), None)
+
+    def lookup(self, table: tuple[float, ...], index: int) -> int:
+        """The node of table[index], for an index that only the run knows."""
+        return self._add(Node("lookup", (index,), "f", table), table)
 
     def value(self, node: int):
         """The value of a constant node, else None."""

@@ -1,6 +1,7 @@
 """Rules for the primitives that only move numbers about: they run here and now, on node numbers.
 
-An index that is known only in the run (the piece of a spline at time t) becomes a choice among the entries that it can mean.
+An index that is known only in the run (the piece of a spline at time t) becomes a choice among the entries that it can mean, or a
+lookup where all of these are constants.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from iblf_jax.lowering.from_jaxpr import Ids, choose, constants
 from iblf_jax.lowering.program import Builder, UnsupportedError
 
 MOST_CHOICES = 64
-"""Entries among which an index of the run may choose."""
+"""Entries among which indices of the run may choose."""
+LONGEST_TABLE = 4096
+"""Constants among which one may."""
 
 
 def _reshape(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
@@ -81,30 +84,64 @@ def _now(eqn, *operands):
         return np.asarray(eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params), np.int64)
 
 
-def _chosen(b: Builder, index: Ids, size: int, at: Callable, known: dict[int, int] | None = None) -> Ids:
-    """`at(values of the index)`; where the run alone knows an entry, a choice among its values 0 ... size - 1."""
-    known = known or {}
+def _chosen(b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None) -> Ids:
+    """`at(values of the index)`, of entries of x; where the run alone knows an index, a choice among its values 0 ... longest axis - 1."""
+    known, size = known or {}, max(x.shape, default=1)
     flat = [known.get(i, b.value(i)) for i in index.ravel().tolist()]
     unknown = [i for i, v in zip(index.ravel().tolist(), flat, strict=True) if v is None]
     if not unknown:
         return at(np.asarray(flat, np.int32).reshape(index.shape))
-    if size ** len({*unknown, *known}) > MOST_CHOICES:
-        raise UnsupportedError(f"indices that only the run knows choose among more than {MOST_CHOICES} entries")
+    choices = size ** len({*unknown, *known})
+    is_table = choices == size and all(b.value(i) is not None and b.nodes[i].kind == "f" for i in x.ravel().tolist())
+    if choices > (LONGEST_TABLE if is_table else MOST_CHOICES):
+        raise UnsupportedError(f"indices that only the run knows choose among {choices} entries, which is too many")
     node = unknown[0]
-    cases = [_chosen(b, index, size, at, known | {node: v}) for v in range(size)]
+    cases = [_chosen(b, x, index, at, known | {node: v}) for v in range(size)]
+    if is_table:
+        columns = np.stack([case.ravel() for case in cases], axis=1).tolist()
+        return np.asarray([_looked_up(b, column, node) for column in columns], np.int64).reshape(cases[0].shape)
     result = cases[-1]
     for v in reversed(range(size - 1)):
         result = choose(b, b.emit("le", node, b.constant(v, "i"), kind="b"), cases[v], result)
     return result
 
 
+def _looked_up(b: Builder, entries: list[int], index: int) -> int:
+    """One of some constants."""
+    return entries[0] if len(set(entries)) == 1 else b.lookup(tuple(b.value(i) for i in entries), index)
+
+
 def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
+    """Entries of x; where an index may lie outside and the filler is asked for, that one."""
+    filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
+    if filled and not _is_inside(b, eqn, x, index):
+        raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")
+
     def at(values):
         params = dict(eqn.params, fill_value=None, mode=jax.lax.GatherScatterMode.CLIP)
         with jax.ensure_compile_time_eval():
             return np.asarray(eqn.primitive.bind(jax.numpy.asarray(x, np.int32), jax.numpy.asarray(values), **params), np.int64)
 
-    return _chosen(b, index, max(x.shape, default=1), at)
+    rows = list(np.ndindex(index.shape[:-1]))
+    if len(rows) == 1 or all(b.value(i) is not None for i in index.ravel().tolist()):
+        return _chosen(b, x, index, at)
+    # One place after the other, so that each is chosen by its own index alone.
+    result = np.empty(eqn.outvars[0].aval.shape, np.int64)
+    offsets = eqn.params["dimension_numbers"].offset_dims
+    axes = [a for a in range(result.ndim) if a not in offsets]
+    for row in rows:
+        here = np.full(index.shape, b.constant(0, "i"))
+        here[row] = index[row]
+        one = np.moveaxis(_chosen(b, x, here, at), axes, range(len(axes)))[row]
+        np.moveaxis(result, axes, range(len(axes)))[row] = one
+    return result
+
+
+def _is_inside(b: Builder, eqn, x: Ids, index: Ids) -> bool:
+    """Whether all places of a gather are known and inside."""
+    axes, sizes = eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
+    rows = [[b.value(i) for i in row] for row in index.reshape(-1, len(axes)).tolist()]
+    return all(v is not None and 0 <= v <= x.shape[a] - sizes[a] for row in rows for a, v in zip(axes, row, strict=True))
 
 
 def _dynamic_slice(b: Builder, eqn, x: Ids, *starts: Ids) -> Ids:
@@ -112,7 +149,7 @@ def _dynamic_slice(b: Builder, eqn, x: Ids, *starts: Ids) -> Ids:
         corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, eqn.params["slice_sizes"], strict=True)]
         return x[tuple(slice(c, c + s) for c, s in zip(corner, eqn.params["slice_sizes"], strict=True))]
 
-    return _chosen(b, np.asarray(starts), max(x.shape, default=1), at)
+    return _chosen(b, x, np.asarray(starts), at)
 
 
 def _dynamic_update_slice(b: Builder, eqn, x: Ids, new: Ids, *starts: Ids) -> Ids:
@@ -122,7 +159,7 @@ def _dynamic_update_slice(b: Builder, eqn, x: Ids, new: Ids, *starts: Ids) -> Id
         result[tuple(slice(c, c + s) for c, s in zip(corner, new.shape, strict=True))] = new
         return result
 
-    return _chosen(b, np.asarray(starts), max(x.shape, default=1), at)
+    return _chosen(b, x, np.asarray(starts), at)
 
 
 def _scatter(op: str | None) -> Callable:

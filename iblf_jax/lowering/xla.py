@@ -23,6 +23,9 @@ from iblf_jax.one_function import as_one_function
 
 BLOCK = 64
 """Runs that go through a stretch of steps together on CPU."""
+LONG = 6000
+"""Operations of a step from which a block on CPU is always BLOCK wide: loops over fewer runs would be unrolled, and LLVM takes up to 20 GB
+over a long step without loops."""
 LONGEST = 20_000
 """Operations of a step above which XLA would take many minutes over it."""
 STRETCH = 4096
@@ -40,7 +43,8 @@ def run(
     if len(program.nodes) > LONGEST:
         raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
     runs = carry.floats.shape[1]
-    width = min(BLOCK, runs) if on_cpu() else runs
+    narrow = runs < BLOCK and len(program.nodes) < LONG
+    width = runs if narrow or not on_cpu() else BLOCK
     blocks = -(-runs // width)
 
     def apart(rows):

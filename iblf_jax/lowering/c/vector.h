@@ -36,6 +36,7 @@ typedef union { real f; integer i; } word;
 #define INLINE static inline __attribute__((always_inline))
 #define FUNCTION static
 #define SEPARATE static __attribute__((noinline))
+#define TABLE static const real
 #define MASK(comparison) (comparison)
 #define AT(x, l) (x)[l]
 INLINE F splat(real x) { return x - (F){}; }
@@ -52,6 +53,8 @@ INLINE I bits(F x) { return (I)x; }
 INLINE F from_bits(I x) { return (F)x; }
 INLINE F to_float(I x) { return __builtin_convertvector(x, F); }
 INLINE I to_int(F x) { return __builtin_convertvector(x, I); }
+INLINE integer within(integer i, integer size) { return i < 0 ? 0 : i < size ? i : size - 1; }
+INLINE F f_lookup(const real *table, integer size, I index) { F x; for (int l = 0; l < W; l++) x[l] = table[within(index[l], size)]; return x; }
 
 /* A function of the C library, lane by lane; the compiler makes a vector instruction of it where there is one. */
 #define LANEWISE(name, call) INLINE F name(F x) { \
