@@ -49,6 +49,7 @@ def real(name: str):
     return arm, without_constraints(mujoco.MjModel.from_xml_path(str(ARMS / REAL[name])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_arms_have_the_dynamics_that_mujoco_gives(name):
     arm, model = real(name)
@@ -97,6 +98,7 @@ def test_armature_is_on_the_diagonal():
     assert relative(ours[1][0], bias) < 1e-9
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(n=st.sampled_from([1, 4, 7]), seed=st.integers(0, 2**32 - 1))
 def test_random_chains_have_the_dynamics_that_mujoco_gives(n, seed):
@@ -118,6 +120,7 @@ def test_random_chains_have_the_dynamics_that_mujoco_gives(n, seed):
     np.testing.assert_allclose(twist, np.concatenate([linear, angular]), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_c_is_the_one_of_the_christoffel_symbols(seed):
     arm = random_arm(4, seed)
@@ -146,6 +149,7 @@ def two_link_in_space(**fields) -> Arm:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("payload", [0.0, 0.8])
 def test_two_link_in_space_is_the_planar_one(payload):
     flat, arm = dataclasses.replace(TWO_LINK, payload=payload), two_link_in_space(payload=payload)
@@ -156,6 +160,7 @@ def test_two_link_in_space_is_the_planar_one(payload):
     np.testing.assert_allclose(arm.skeleton(q)[:, [0, 2]], flat.skeleton(q), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_derivatives_by_inertial_parameters_are_finite_differences():
     arm = random_arm(3, 5)
     q, v, a = jnp.asarray(np.random.default_rng(5).normal(size=(3, 3)))
@@ -186,6 +191,7 @@ def accelerations(scenario, t: float) -> np.ndarray:
     return np.asarray(evaluate(scenario, jnp.asarray(t), state)[0].dq)
 
 
+@pytest.mark.slow
 def test_friction_of_the_joints_acts_on_the_plant():
     plain = accelerations(scenario_with(two_link_in_space()), 0.0)
     damped = accelerations(scenario_with(two_link_in_space(damping=[0.5, 0.2], friction=0.1)), 0.0)
@@ -194,6 +200,7 @@ def test_friction_of_the_joints_acts_on_the_plant():
     np.testing.assert_allclose(M @ (damped - plain), -(np.array([0.5, 0.2]) * dq + 0.1 * np.tanh(dq / 0.05)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_load_is_picked_up():
     load = {"mass": 1.2, "centre": [0.0, 0.0, 0.1], "inertia": [0.01, 0.02, 0.015, 0.0, 0.0, 0.0]}
     without, held = two_link_in_space(), two_link_in_space(carried=Payload(**load))
@@ -208,6 +215,7 @@ def test_a_load_is_picked_up():
         np.testing.assert_allclose(accelerations(scenario_with(picked), t), accelerations(scenario_with(same), t), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_model_does_not_know_when():
     picked = two_link_in_space(carried=Payload(mass=1.2, start=1.0))
     scenario = canonical(dataclasses.replace(scenario_with(picked), model=picked))
@@ -220,6 +228,7 @@ def test_the_model_does_not_know_when():
 SHORT_RUN = {"duration": 0.1, "dt": 1e-3}
 
 
+@pytest.mark.slow
 def test_runs_as_the_planar_robot_does():
     planar = dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), plant=TWO_LINK, model=TWO_LINK)
     run, other = ij.simulate(scenario_with(two_link_in_space()), **SHORT_RUN), ij.simulate(planar, **SHORT_RUN)
@@ -227,6 +236,7 @@ def test_runs_as_the_planar_robot_does():
     np.testing.assert_allclose(run.tau, other.tau, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_batches_of_arms_agree_with_single_runs():
     scenario, timing = scenario_with(two_link_in_space()), SHORT_RUN | {"method": "euler"}
     study = ij.monte_carlo(

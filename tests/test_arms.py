@@ -44,6 +44,7 @@ def test_the_data_are_what_the_file_says(name):
     assert shipped.n == PRESETS[name][1]
 
 
+@pytest.mark.slow
 def test_an_arm_is_like_what_its_maker_says():
     """Reach and weight, from the makers' data sheets: 0.85 m and 18.4 kg with the base; 0.82 m to the wrist and 29.9 kg."""
     ur5, iiwa = arms.arm("ur5"), arms.arm("iiwa14")
@@ -64,6 +65,7 @@ def test_unknown_arm():
 # ------------------------------------------------------------------------------------------------------------------ the presets
 
 
+@pytest.mark.slow
 def test_the_run_does_its_job(scenario, run):
     assert run.ok, ij.status.describe(int(run.status))
     assert np.all(np.asarray(run.metrics.margin) > 0.1)
@@ -164,6 +166,7 @@ def test_gains_follow_the_inertia():
     assert float(K2.min()) == arms.LEAST_K2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["log", "computed_torque", "pd"])
 def test_other_laws_on_the_arm(law):
     """The yardsticks at gains that suit its wrist, too."""

@@ -45,6 +45,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_backends_agree_with_the_reference(name, dtype):
     scenario = canonical(ij.astype(ij.presets.PRESETS[name](), dtype))

@@ -180,6 +180,7 @@ def test_symmetric_forms_are_those_of_the_literature():
     np.testing.assert_allclose(barriers.State().virtual_velocity(fixed, e, K1, None), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("name", BARRIERS)
 def test_singular_points_are_finite(name, dtype):

@@ -12,6 +12,7 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("[a-z]*.py")))
 def test_quick_benchmark(name, tmp_path):
     output = tmp_path / "table.json"

@@ -61,6 +61,7 @@ def left_side(batch, evidence):
 # ---------------------------------------------------------------------------------------------------- states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reading", "observer", "dtype"), READINGS)
 def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, dtype):
     batch, t, state = random_loops(ij.astype(loop(reading, observer), dtype), nearest=0.998)
@@ -76,6 +77,7 @@ def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, 
     assert np.any(np.asarray(evidence.dropped_f) != 0) == (observer == "printed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("barrier", list(BARRIERS.values()), ids=list(BARRIERS))
 def test_corrected_keeps_the_inequality_at_every_state(barrier):
     scenario = loop(barrier=barrier)
@@ -89,6 +91,7 @@ def test_corrected_keeps_the_inequality_at_every_state(barrier):
         assert np.all(left[free] <= allowed[free])
 
 
+@pytest.mark.slow
 def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     # One joint, e1 = 0, e2 = f_tilde = f', and all rates of the claim the same: each step of the proof is an equality.
     rate = 1.7
@@ -131,6 +134,7 @@ def corrected_certificate(corrected_run) -> Certificate:
     return certify(corrected_run.scenario, corrected_run)
 
 
+@pytest.mark.slow
 def test_rate_along_the_run_is_its_difference_quotient(paper_run):
     facts = facts_of(jax.tree.map(np.asarray, paper_run))
     V, h = facts.evidence.V, 0.01
@@ -166,6 +170,7 @@ def test_lambda_max_over_the_box_is_that_of_the_stretched_arm(paper_certificate,
     assert "grid" in paper_certificate["rho, case 2, over the box"].note
 
 
+@pytest.mark.slow
 def test_lambda_max_over_the_box_of_many_joints():
     n = 4
     arm = ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.01] * n)
@@ -178,6 +183,7 @@ def test_lambda_max_over_the_box_of_many_joints():
     assert extremes.lambda_min <= values.min()
 
 
+@pytest.mark.slow
 def test_corrected_run_holds_and_drops_nothing(corrected_certificate):
     assert corrected_certificate.holds
     for part in ("law", "observer"):
@@ -189,6 +195,7 @@ def test_corrected_run_holds_and_drops_nothing(corrected_certificate):
 CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -212,6 +219,7 @@ def test_corrected_holds_on_other_runs(corrected_run, changes):
         assert certificate["envelope, case 1"].tolerance < 1e-4
 
 
+@pytest.mark.slow
 def test_gains_below_the_conditions_are_named(corrected_run):
     scenario = ij.with_parameters(corrected_run.scenario, {"observer.kf": [0.8, 20.0]})
     certificate = certify(scenario, ij.simulate(scenario, **PAPER))
@@ -364,6 +372,7 @@ def test_printed_breaks_its_claim_where_corrected_keeps_it():
     assert np.all(np.diff(corrected.traces.V[:200]) < 0)
 
 
+@pytest.mark.slow
 def test_search_finds_the_gap_of_the_printed_law_only():
     ranges = {
         "initial.q": (0.4, 0.75),

@@ -45,6 +45,7 @@ def strict_json(path):
 # ------------------------------------------------------------------------------------------------------------- the main job
 
 
+@pytest.mark.slow
 def test_reproduce(command, tmp_path):
     code, out, err = command("reproduce", "--out", "out")
     assert code == 0, err
@@ -110,6 +111,7 @@ def test_simulate_a_preset(command):
     assert "peak_torque" in out
 
 
+@pytest.mark.slow
 def test_a_failed_run_exits_with_one(command, tmp_path):
     code, out, err = command("simulate", "zhang_yan_2024", *SHORT, "--set", "controller.K2=500", "--out", "out")
     assert code == 1
@@ -225,6 +227,7 @@ def test_a_folder_without_permission(command, tmp_path):
 # ------------------------------------------------------------------------------------------------------------------ the process
 
 
+@pytest.mark.slow
 def test_as_a_process_with_its_own_cache(tmp_path):
     env = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     env |= {"XDG_CACHE_HOME": str(tmp_path), "MPLBACKEND": "Agg"}

@@ -59,6 +59,7 @@ def scenario_of(loop: independent.Loop) -> ij.Scenario:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["integral", "log"])
 @pytest.mark.parametrize("reading", ["printed", "corrected"])
 @pytest.mark.parametrize("seed", range(3))

@@ -24,6 +24,7 @@ def both(scenario, method="rk4", record_every=1, alone=True, steps=50, dt=1e-3):
     return plain, jax.jit(partial(compact_loop.run_compactly, alone=alone, **options))(scenario, folds, step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "record_every", "alone"),
     [("rk4", 7, False), ("heun", 1, True), ("euler", None, True)],
@@ -35,6 +36,7 @@ def test_it_is_the_same_run(paper, method, record_every, alone):
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_run_that_breaks_is_flagged_alike(paper):
     for dt in (4e-3, 2e-2):  # it oscillates; it runs away
         plain, compact = both(paper, dt=dt, steps=150)
@@ -42,6 +44,7 @@ def test_a_run_that_breaks_is_flagged_alike(paper):
         assert int(plain.status) & Status.STEP_TOO_LARGE
 
 
+@pytest.mark.slow
 def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
     """The step after the end, which is not made, says nothing."""
     fast = ij.with_parameters(paper, {"controller.K2": 1e4})
@@ -50,6 +53,7 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
     assert not int(compact.status) & Status.NOT_FINITE
 
 
+@pytest.mark.slow
 def test_long_loops_take_it(paper, monkeypatch):
     """By its length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)

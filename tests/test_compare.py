@@ -26,6 +26,7 @@ def effort(run):
     return math.sqrt(np.mean(np.sum((np.asarray(run.tau[:-1]) - gravity) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 def test_equal_effort_is_equal_effort(comparison):
     assert list(comparison.equal_effort) == ["integral", "log", "pd"]
     efforts = [float(run.metrics.effort_above_gravity) for run in comparison.equal_effort.values()]
@@ -37,11 +38,13 @@ def test_equal_effort_is_equal_effort(comparison):
             np.testing.assert_allclose(after, before * comparison.factors[name], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_fold_measures_the_torque_above_gravity():
     run = ij.simulate(ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, metrics=(ij.metrics.AboveGravity(),))
     assert float(run.metrics.effort_above_gravity) == pytest.approx(effort(run), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario():
     scenario = ij.with_parameters(ij.presets.zhang_yan_2024_saturated(), {"controller.k1": [1.5, 2.5], "controller.K2": 15.0})
     comparison = ij.compare(scenario, ["log", "adaptive_rbf"], duration=0.02, dt=1e-3, equal_effort=False)
@@ -58,6 +61,7 @@ def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario(
     assert "effort" not in comparison.table
 
 
+@pytest.mark.slow
 def test_the_text_says_what_was_held_equal(comparison):
     text = repr(comparison)
     assert "twice the logarithmic" in text
@@ -127,6 +131,7 @@ class Bang:
         return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
 
 
+@pytest.mark.slow
 def test_laws_of_a_users_own():
     laws = [controllers.Backstepping(k1=2.0, K2=20.0, barrier=barriers.Tan()), Bang(), Bang(size=0.2)]
     comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1, dt=1e-3)
@@ -181,6 +186,7 @@ def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison)
         ij.plotting.comparison(comparison.rollouts["log"])
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     words = ["--laws", "integral", "log", "--duration", "2", "--record-every", "10", "--out", str(tmp_path / "out")]

@@ -12,6 +12,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("check", "member"), CASES)
 def test_member_fits_its_contract(check, member):
     check(member)

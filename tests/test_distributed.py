@@ -38,7 +38,8 @@ def job(compiled, tmp_path, words, more=((), ()), devices="2"):
     ]
 
 
-@pytest.mark.parametrize("devices", ["1", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", ["1", "2"])
 def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path, devices):
     path = tmp_path / "sweep.zarr"
     words = ("--store", str(path))
@@ -72,6 +73,7 @@ def test_a_study_over_two_processes(compiled, tmp_path):
         assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), expected)
 
 
+@pytest.mark.slow
 def test_slurm_says_where_the_processes_meet(tmp_path):
     """Two processes with the variables that `srun` gives them, and `--distributed` alone."""
     file, path = tmp_path / "sweep.toml", tmp_path / "sweep.zarr"

@@ -54,6 +54,7 @@ def test_the_run_can_be_done_again_from_its_attributes(short_run):
     assert attributes["status"] == "ok"
 
 
+@pytest.mark.slow
 def test_a_batch(batch):
     data = batch.to_xarray()
     assert data.q.dims == ("run", "time", "joint")
@@ -66,6 +67,7 @@ def test_a_batch(batch):
     xarray.testing.assert_equal(data.q.isel(run=1, drop=True), batch[1].to_xarray().q)
 
 
+@pytest.mark.slow
 def test_batches_of_batches_and_of_different_steps(paper):
     def one(gain, dt):
         run = ij.simulate(ij.with_parameters(paper, {"controller.K2": gain}), duration=0.01, method="euler")
@@ -78,6 +80,7 @@ def test_batches_of_batches_and_of_different_steps(paper):
     np.testing.assert_array_equal(data.t, t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".nc", ".npz", ".NC"])
 def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
     runs = {"integral BLF": short_run, "b-2": batch}

@@ -33,6 +33,7 @@ def saturated_runs():
     return runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ij.presets.LAWS)
 def test_every_system_keeps_the_bounds_and_settles(law):
     run = ij.simulate(ij.presets.zhang_yan_2024(law=law), **PAPER)
@@ -47,6 +48,7 @@ def test_unknown_law_names_the_known_ones():
         ij.presets.zhang_yan_2024(law="nonsense")
 
 
+@pytest.mark.slow
 def test_the_funnel_is_kept_by_its_own_law():
     run = ij.simulate(ij.presets.zhang_yan_2024_funnel(), duration=5.0, dt=5e-4, record_every=10)
     assert run.ok
@@ -81,6 +83,7 @@ def test_pd_holds_a_reference_at_rest():
     np.testing.assert_allclose(run.tau[-1], run.scenario.model.gravity(run.q[-1]), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_backstepping_without_barrier_is_the_limit_of_state_and_mapping():
     wide = walls(-1e5, 1e5 + 1.0)
     laws = ("backstepping", "state", "mapping")
@@ -100,6 +103,7 @@ def test_every_system_goes_through_a_scenario_file(law, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, scenario)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ij.presets.LAWS)
 def test_a_start_at_the_wall_stays_finite_in_float32(law):
     scenario = ij.with_parameters(ij.presets.zhang_yan_2024(law=law), {"initial.q": [1.0399, 0.8999], "initial.dq": 1.0})
@@ -120,6 +124,7 @@ def test_a_start_at_the_wall_stays_finite_in_float32(law):
 # ------------------------------------------------------------------------------------------------------------- adaptive RBF
 
 
+@pytest.mark.slow
 def test_adaptive_weights_stay_below_their_bound():
     run = ij.simulate(ij.presets.zhang_yan_2024(law="adaptive_rbf"), **PAPER)
     law, weights = run.scenario.controller, run.controller_state
@@ -131,6 +136,7 @@ def test_adaptive_weights_stay_below_their_bound():
     assert bool(jnp.all(jnp.max(norms[1000:], axis=0) < 1.5 * jnp.max(norms[:1000], axis=0)))
 
 
+@pytest.mark.slow
 def test_adaptive_weights_are_bounded_under_a_large_disturbance():
     strong = {"disturbance.acceleration_amplitude": 20.0, "disturbance.acceleration_frequency": 5.0, "controller.sigma": 0.5}
     run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="adaptive_rbf"), strong), **PAPER)
@@ -226,6 +232,7 @@ def test_a_limit_below_gravity_keeps_nothing(saturated_runs):
     assert bool(jnp.all(jnp.isfinite(run.q)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_smooth_limit(dtype):
     scenario = ij.astype(ij.presets.zhang_yan_2024_saturated(edge="smooth"), dtype)
@@ -322,6 +329,7 @@ def test_saturation_says_what_is_wrong():
 # ------------------------------------------------------------------------------------------------- extended-state observer
 
 
+@pytest.mark.slow
 def test_extended_state_observer_obeys_its_error_equation():
     scenario = dataclasses.replace(
         ij.presets.zhang_yan_2024(reading="corrected"), observer=observers.ExtendedState(bandwidth=30.0), initial=ij.Initial(Q, DQ)
@@ -343,6 +351,7 @@ def test_extended_state_observer_obeys_its_error_equation():
     np.testing.assert_allclose(left, along(along(f))(t, state) + 60.0 * along(f)(t, state), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_forms():
     scenario = ij.presets.zhang_yan_2024(reading="corrected")
     push = ij.disturbances.Sinusoids(amplitude=0.0, frequency=1.0, offset=[1.0, -0.5])

@@ -107,6 +107,7 @@ def test_a_joint_of_the_chain_can_be_locked(file):
     np.testing.assert_allclose(arm.mass, [6.0])
 
 
+@pytest.mark.slow
 def test_the_base_is_the_world_and_gravity_turns_with_it(file):
     whole = ij.robots.load(file(robot(*GRIPPER)), tip="tool")
     part = ij.robots.load(file(robot(*GRIPPER)), base="upper", tip="tool")
@@ -120,6 +121,7 @@ def test_gravity_can_be_given(file):
     np.testing.assert_allclose(ij.robots.load(file(robot(*GRIPPER)), tip="tool", gravity=[1.62, 0, 0]).g, [1.62, 0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_mjcf_gives_the_arm_that_it_was_written_from(seed, file):
     arm = random_arm(4, seed, armature=[0.1, 0.0, 0.3, 0.2])
@@ -371,6 +373,7 @@ def _element_changed(draw, text: str, place: int) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Inertia matrix is too close to singular")
 @settings(max_examples=400)
 @given(data=mutated())

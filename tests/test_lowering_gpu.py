@@ -61,6 +61,7 @@ def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
     return np.asarray(values, float)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
 def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
@@ -100,7 +101,8 @@ def spoiled(runs):
 
 
 @needs_compiler
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_batch_agrees_with_the_reference(dtype, on_cpu):
     """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not full."""
     good = draws(37)
@@ -120,6 +122,7 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
         np.testing.assert_array_equal(x[others], y[others])
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_records_agree_with_the_reference(on_cpu):
     found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
@@ -133,6 +136,7 @@ def test_one_run_is_the_run(on_cpu, paper):
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_forward_sensitivities(paper):
     scenario, dt = canonical(paper), jnp.asarray(DT)

@@ -32,6 +32,7 @@ def results(study):
 # ------------------------------------------------------------------------------------------------------------ bit-identity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
 def test_chunk_changes_nothing(study, chunk):
     assert cases.same(results(study), results(cases.study(chunk=chunk)))
@@ -111,6 +112,7 @@ def test_choice_has_its_weights():
     assert set(draws) == {1.0, 9.0}
 
 
+@pytest.mark.slow
 def test_a_law_and_a_distribution_from_a_notebook():
     """Classes of the user's own, defined where the study is made."""
 
@@ -146,6 +148,7 @@ def test_a_law_and_a_distribution_from_a_notebook():
     np.testing.assert_array_equal(replayed.metrics["effort"], study.metrics["effort"][7])
 
 
+@pytest.mark.slow
 def test_robot_paths_move_plant_and_model_together_and_shared_draws_are_one():
     ways = {"robot.mass[1]": ij.factor(ij.uniform(0.5, 2.0)), "initial.q": ij.offset(ij.normal(0, 0.01), shared=True)}
     study = cases.study(2, ways)

@@ -156,6 +156,7 @@ NUMBERS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(
     values=st.dictionaries(st.sampled_from([p.path for p in ij.parameters(ij.presets.zhang_yan_2024())]), NUMBERS, min_size=1, max_size=4)

@@ -87,6 +87,7 @@ def test_saved_it_needs_no_other_file(folder):
     assert "urdf" not in (folder / "saved.toml").read_text()
 
 
+@pytest.mark.slow
 def test_simulate_from_the_command_line(folder, capsys):
     path = written(folder, ROBOT + REFERENCE + RUN)
     assert main(["simulate", str(path), "--set", "plant.link[wrist_1_link].mass=1.3", "--out", str(folder / "out")]) == 0

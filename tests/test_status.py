@@ -113,6 +113,7 @@ def test_a_run_away_state_is_frozen_at_its_last_good_value(paper):
     assert np.max(np.abs(run.dq)) < 1e4
 
 
+@pytest.mark.slow
 def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
     """It touches the bound of joint 1 between recorded samples only, long after the start."""
     close = dataclasses.replace(paper.bounds, upper=dataclasses.replace(paper.bounds.upper, offset=[0.9, 0.5 + 0.14 * np.sqrt(2) - 1e-7]))
@@ -121,6 +122,7 @@ def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
         quiet(scenario, **PAPER)
 
 
+@pytest.mark.slow
 def test_nothing_raises_inside_jit_and_flags_come_back(thrown):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -49,6 +49,7 @@ def test_files_are_the_arguments_of_the_functions():
         )
 
 
+@pytest.mark.slow
 def test_montecarlo(command, tmp_path):
     code, out, err = command("montecarlo", "study.toml", "--out", "runs.nc", "--quiet")
     assert code == 1, err
@@ -61,6 +62,7 @@ def test_montecarlo(command, tmp_path):
     assert f"failed: {len(study.failed)}" in out
 
 
+@pytest.mark.slow
 def test_sweep_and_again(command):
     code, out, err = command("sweep", "sweep.toml", "--store", "s.zarr", "--quiet")
     assert code == 1, err
@@ -74,6 +76,7 @@ def test_sweep_and_again(command):
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_every_run_ok_is_zero_interrupted_is_130_and_full_is_3(command, monkeypatch):
     assert command("sweep", "calm.toml", "--quiet")[0] == 0
     plain = store.Store.write
@@ -96,6 +99,7 @@ def test_every_run_ok_is_zero_interrupted_is_130_and_full_is_3(command, monkeypa
     assert (code, err) == (3, "iblf-jax: error: no space left\n")
 
 
+@pytest.mark.slow
 def test_ctrl_c_from_outside(command, tmp_path):
     """As a user does it: a process, SIGINT after its first unit, the same command again."""
     text = SWEEP.replace("300", "2000")
@@ -114,6 +118,7 @@ def test_ctrl_c_from_outside(command, tmp_path):
     assert ij.load_sweep("s.zarr").identical(cases.from_file(text))
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_a_study_compiles(command, tmp_path):
     """XLA goes on in a thread of its own, and would crash if JAX were taken down under it."""
     code = """

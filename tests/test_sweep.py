@@ -50,6 +50,7 @@ def once(**more):
 # --------------------------------------------------------------------------------------------------------------- the result
 
 
+@pytest.mark.slow
 def test_dataset_is_labelled(table):
     assert dict(table.margin.sizes) == {"controller.K2": 3, "observer.kf": 2, "run": 500, "joint": 2}
     assert table["controller.K2"].attrs["units"] == "N m s/rad"
@@ -78,6 +79,7 @@ def test_chunk_changes_nothing(table, chunk):
     assert cases.table(chunk=chunk).identical(table)
 
 
+@pytest.mark.slow
 def test_designs_and_vectors():
     ways = {"controller.K2": ij.uniform(10.0, 40.0), "observer.kf": ij.factor(ij.log_uniform(0.5, 2.0), shared=True)}
     for design in ("random", "latin_hypercube"):
@@ -152,6 +154,7 @@ def test_another_configuration_is_refused(finished, change, message):
     assert cases.same(before, cases.arrays(ij.load_sweep(finished)))
 
 
+@pytest.mark.slow
 def test_another_scenario_law_or_backend_is_refused(finished):
     ways, options = cases.perturbations(), cases.options() | {"runs": cases.RUNS, "store": finished}
     heavier = ij.with_parameters(SCENARIO, {"plant.payload": 1.0})
@@ -258,6 +261,7 @@ def test_disk_full_keeps_what_was_written(tmp_path, table, monkeypatch):
     assert cases.table(store=path).identical(table)
 
 
+@pytest.mark.slow
 def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
     """RLIMIT_FSIZE: the kernel itself refuses to write more."""
     code = (
@@ -294,6 +298,7 @@ def killed_until_done(path, compiled, table, kills, seed):
     assert cases.same(dict(np.load(out)), cases.arrays(table))
 
 
+@pytest.mark.slow
 def test_three_kills(tmp_path, compiled, table):
     killed_until_done(tmp_path / "sweep.zarr", compiled, table, 3, seed=1)
 
@@ -303,6 +308,7 @@ def test_twenty_kills(tmp_path, compiled, table):
     killed_until_done(tmp_path / "sweep.zarr", compiled, table, 20, seed=2)
 
 
+@pytest.mark.slow
 def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table):
     path = tmp_path / "sweep.zarr"
     process = cases.start(compiled, str(tmp_path / "x.npz"), "--store", str(path), "--die-after", "5")

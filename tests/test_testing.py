@@ -34,6 +34,7 @@ class PlainLaw:
         return Command(tau, tube.dq_d, jnp.zeros_like(q), no, no), ()
 
 
+@pytest.mark.slow
 def test_a_users_law_registered_by_hand_passes_and_runs():
     ij.testing.check_law(PlainLaw(jnp.asarray(30.0)))
 
@@ -91,6 +92,7 @@ def test_a_check_in_post_init_is_found():
     rejects(ij.testing.check_side, Strict(0.9), "cannot be rebuilt by JAX", "check(self)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("methods", "words"),
     [

@@ -85,6 +85,7 @@ def vector(**changes):
     return values
 
 
+@pytest.mark.slow
 def test_gradient_in_both_modes_is_the_finite_difference(gradients):
     n = len(PATHS)
     steps = 1e-5 * np.maximum(np.abs(NOMINAL), 0.1)
@@ -97,6 +98,7 @@ def test_gradient_in_both_modes_is_the_finite_difference(gradients):
     assert np.all(np.abs(forward[:n]) > 1e-9)  # every parameter matters
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_finite_wherever_a_run_starts(gradients):
     """Near the wall, on it, past it, and thrown at it: numbers and both gradients stay finite."""
     rows = [vector(initial__q=q) for q in STARTS]
@@ -110,6 +112,7 @@ def test_values_and_gradients_are_finite_wherever_a_run_starts(gradients):
     assert all(v for v, o in zip(violated, outside, strict=True) if o)
 
 
+@pytest.mark.slow
 def test_run_away_states_have_finite_gradients(gradients):
     rows = [vector(controller__K2=k) for k in (200.0, 1e3, 1e4, 1e6)] + [vector(observer__kf=k) for k in (1e4, 1e5)]
     rows += [vector(plant__mass=m) for m in (1e-6, 1e6)]
@@ -118,6 +121,7 @@ def test_run_away_states_have_finite_gradients(gradients):
     assert np.all(np.isfinite(np.concatenate([value[:, None], reverse, forward[:, None]], axis=1)))
 
 
+@pytest.mark.slow
 def test_a_failing_run_leaves_the_others_bit_identical(batch):
     calm = batch(jnp.asarray([20.0, 20.0, 12.0]), jnp.asarray([0.8, 0.8, 0.7]))
     for K2, q in ((1e6, 0.8), (20.0, 5.0), (20.0, np.nan), (np.inf, 0.8)):
@@ -129,6 +133,7 @@ def test_a_failing_run_leaves_the_others_bit_identical(batch):
             assert all(jax.tree.leaves(same))
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
     runs = batch(jnp.asarray([20.0, 12.0, 30.0]), jnp.full(3, 0.8))
     assert runs.is_batch

@@ -53,6 +53,7 @@ def central(f, z, h=1e-5):
 # ---------------------------------------------------------------------------------------------------------------- derivatives
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_equal_finite_differences(nominal):
     z = nominal.box.z
     lanes = nominal.lanes(z[None])
@@ -70,6 +71,7 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
     np.testing.assert_allclose(forward.value.loss, reverse.value.loss, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v, with e1_u by finite differences of recorded runs."""
     lanes = nominal.lanes(nominal.box.z[None])
@@ -105,6 +107,7 @@ def test_reverse_mode_remembers_few_states(paper):
 # ---------------------------------------------------------------------------------------------------------------- quantities
 
 
+@pytest.mark.slow
 def test_quantities_are_what_numpy_makes_of_the_records(paper):
     parts = (
         Integral("error", joints=[1.0, 2.0], after=0.1),
@@ -171,6 +174,7 @@ def test_bijections_keep_inside_and_invert():
         assert np.all(inside <= box.high)
 
 
+@pytest.mark.slow
 def test_default_limits_keep_the_conditions_and_the_step(paper):
     blocks, box = layout(canonical(paper), [*GAINS, ij.tunable("controller.o", tied=True)], 1e-3, "rk4")
     low, high = np.exp(box.low), np.exp(box.high)
@@ -204,6 +208,7 @@ def test_box_step_solves_the_quadratic_programme():
 # ---------------------------------------------------------------------------------------------------------------- the loop
 
 
+@pytest.mark.slow
 def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
     parameters = [ij.tunable("controller.k1", 0.1, 100), ij.tunable("controller.K2", 0.6, 40), ij.tunable("observer.kf", 1.01, 100)]
     best = ij.tune(paper, parameters, objective(), iterations=25, **SHORT)
@@ -220,6 +225,7 @@ def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
     assert best.report.changes[1].after == pytest.approx(float(again.ise.sum() / before.ise.sum()), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_an_infeasible_start_finds_its_way_in(paper):
     weak = ij.with_parameters(paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]})
     assert int(plain_status(weak)) & ij.Status.BOUND_VIOLATED
@@ -230,6 +236,7 @@ def test_an_infeasible_start_finds_its_way_in(paper):
     assert best.report.margin[0] < 0 < 0.06 < best.report.margin[1]
 
 
+@pytest.mark.slow
 def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
     """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just so."""
     wanted = objectives.tracking() + objectives.peak_torque_below(12.0)
@@ -289,6 +296,7 @@ class Bowl:
         return jax.tree.map(np.asarray, self.derive(None, self.row(0)[1]._replace(z=jnp.asarray(z))))
 
 
+@pytest.mark.slow
 def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
     box = Box(np.array([-1.0, 2.0]), np.array([-3.0, -3.0]), np.array([3.0, 3.0]))
     method, bowl = _tune.make_method("lbfgs", box, 60, 1e-12, 0.1), Bowl()
@@ -348,6 +356,7 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
     np.testing.assert_array_equal(again.history["loss"], sharp.history["loss"])
 
 
+@pytest.mark.slow
 def test_only_needed_starts_are_evaluated_in_groups_of_one_shape(nominal):
     lanes = nominal.lanes(np.arange(20.0)[:, None] * np.ones(6))
     evaluator, shapes = Evaluator(nominal.plan, nominal.shared, lanes, "forward"), set()
@@ -373,6 +382,7 @@ def test_lbfgs_tunes_the_paper_as_well_as_newton(paper):
     assert best.objective < 1.01 * newton.objective
 
 
+@pytest.mark.slow
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
     assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["sound"][-1].all()
@@ -390,6 +400,7 @@ def robust(paper):
     )
 
 
+@pytest.mark.slow
 def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
     report = robust.report
     assert report.runs == 256
@@ -403,6 +414,7 @@ def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
         robust.check(seed=robust.setup.seed)
 
 
+@pytest.mark.slow
 def test_a_change_that_is_not_significant_is_called_so(robust, paper):
     from iblf_jax.tuning.report import make_report
 
@@ -413,6 +425,7 @@ def test_a_change_that_is_not_significant_is_called_so(robust, paper):
     assert not report.improved
 
 
+@pytest.mark.slow
 def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
     best = ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, starts=2, resample=True, iterations=3, **SHORT)
     assert best.optimiser == "adam"
@@ -421,6 +434,7 @@ def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
         ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, resample=True, optimiser="newton", **SHORT)
 
 
+@pytest.mark.slow
 def test_common_random_numbers(paper):
     """The same draws for every start and every step; other seeds give others."""
     built = [_tune.build(paper, GAINS, objectives.tracking(scale=1.0), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
@@ -443,6 +457,7 @@ np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best
 """
 
 
+@pytest.mark.slow
 def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
     env = os.environ | {"PYTHONPATH": str(Path(ij.__file__).parents[1])}
 

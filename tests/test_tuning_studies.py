@@ -24,6 +24,7 @@ def paper():
     return ij.presets.zhang_yan_2024()
 
 
+@pytest.mark.slow
 def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
     attack = ij.falsify(paper, SETS, starts=4, iterations=8, **SHORT)
     budget = 6 * attack.runs  # a value with its derivatives costs less than six values
@@ -39,6 +40,7 @@ def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
         ij.falsify(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.01))}, **SHORT)
 
 
+@pytest.mark.slow
 def test_pareto_is_a_front(paper):
     pair = (ij.objectives.tracking(), ij.objectives.effort())
     front = ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, iterations=10, **SHORT)
@@ -85,6 +87,7 @@ limit = 0.02
 """
 
 
+@pytest.mark.slow
 def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_path, capsys):
     from iblf_jax.cli import main
 
@@ -106,6 +109,7 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     assert "requirement[0].kind" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_figures(paper):
     best = ij.tune(paper, ["controller.k1", "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT)
     figure = best.plot(points=3)
