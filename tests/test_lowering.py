@@ -140,6 +140,8 @@ CASES = {
     "own index": (lambda x, k: x[:, k[1]] + jax.lax.dynamic_slice(x, (k[0], k[1]), (1, 1))[0, 0], X, K),
     "table": (lambda k: jnp.asarray(TABLE)[:, 90 * k[2]] * jax.lax.dynamic_slice(jnp.asarray(TABLE), (1, 70 * k[1]), (1, 2))[0], K),
     "table, outside": (lambda k: jnp.asarray(TABLE)[0, 900 * k[2]] + jnp.asarray(TABLE)[0, -900 * k[2]], K),
+    "update at an index of the run": (lambda x, k: jax.lax.dynamic_update_slice(jnp.zeros(5), x[0, 1:2], (k[1],)), X, K),
+    "zeros of either sign": (lambda k: jnp.exp(-1 / jnp.asarray([0.0, 1.0])[k[0]]) + jnp.exp(-1 / jnp.asarray([-0.0, 1.0])[k[0]]), K),
     "tables": (lambda k: jax.vmap(lambda i: jnp.asarray(TABLE)[:, 90 * i])(k) + jnp.asarray(TABLE)[1, 60 * k][:, None], K),
     "filled gather": (lambda x: jnp.take(x, jnp.asarray([0, 2]), axis=1), X),
     "scan": (lambda x: jax.lax.scan(lambda c, r: (c + r, c * r), jnp.zeros(3), x, reverse=True)[1], X),

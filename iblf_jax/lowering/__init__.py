@@ -84,7 +84,7 @@ def with_fallback(backend: str, run_on: Callable, plain: Callable):
         if backend != "vmap":
             return run_on(xla.run)
     except UnsupportedError as reason:
-        _tell(f"This scenario runs on plain vmap, several times slower: {reason}.")
+        _tell(f"This scenario runs on the vmap backend, several times slower: {reason}.")
     return plain()
 
 

@@ -41,16 +41,11 @@ def literal(node: Node, dtype: np.dtype) -> str:
         return f"splat_i({-1 if node.value else 0})"
     if node.kind == "i":
         return f"splat_i({node.value})"
-    return f"splat({number(node.value, dtype)})"
-
-
-def number(value: float, dtype: np.dtype) -> str:
-    """A constant of one run."""
-    if math.isnan(value):
-        return "NAN"
-    if math.isinf(value):
-        return f"{'-' if value < 0 else ''}INFINITY"
-    return f"{value.hex()}{'f' if dtype == np.float32 else ''}"
+    if math.isnan(node.value):
+        return "splat(NAN)"
+    if math.isinf(node.value):
+        return f"splat({'-' if node.value < 0 else ''}INFINITY)"
+    return f"splat({node.value.hex()}{'f' if dtype == np.float32 else ''})"
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
@@ -87,13 +82,17 @@ class _Emitter:
         self.program = program
         self.classes = program.classes()
         self.lines: list[str] = []
-        tables = dict.fromkeys(node.value for node in program.nodes if node.op == "lookup")
-        self.tables = {table: f"table_{k}" for k, table in enumerate(tables)}
+        tables = dict.fromkeys(self._numbers(node) for node in program.nodes if node.op == "lookup")
+        self.tables = {text: f"table_{k}" for k, text in enumerate(tables)}
 
     def definitions(self) -> str:
         """The tables of constants that statements look into."""
-        values = {name: ", ".join(number(x, self.program.dtype) for x in table) for table, name in self.tables.items()}
-        return "\n".join(f"TABLE {name}[] = {{{text}}};" for name, text in values.items())
+        return "\n".join(f"TABLE {name}[] = {{{text}}};" for text, name in self.tables.items())
+
+    def _numbers(self, lookup: Node) -> str:
+        """Their bits, which are constants for every compiler; infinity is a function's result for some."""
+        bits = np.asarray(lookup.value, self.program.dtype).view(f"u{self.program.dtype.itemsize}")
+        return ", ".join(f"(integer){x:#x}" for x in bits.tolist())
 
     def needed(self, names: dict[int, str], wanted: Iterable[int]) -> list[int]:
         """The nodes without a name that `wanted` needs, in order."""
@@ -116,7 +115,7 @@ class _Emitter:
                 continue
             args = [names[a] for a in node.args]
             if node.op == "lookup":
-                text = f"f_lookup({self.tables[node.value]}, {len(node.value)}, {args[0]})"
+                text = f"f_lookup({self.tables[self._numbers(node)]}, {len(node.value)}, {args[0]})"
             else:
                 text = expression(node, args, [nodes[a].kind for a in node.args])
             self.lines.append(f"  {'F' if node.kind == 'f' else 'I'} v{i} = {text};")

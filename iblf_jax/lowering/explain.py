@@ -20,7 +20,7 @@ from iblf_jax.scenario import Scenario, canonical
 
 SLOTS = {
     "div": 8, "sqrt": 8, "rsqrt": 16, "sin": 18, "cos": 18, "tan": 40, "exp": 20, "expm1": 22, "log": 24, "log1p": 32, "tanh": 32,
-    "logistic": 30, "atan": 26, "atan2": 40, "convert": 1, "max": 3, "min": 3, "sign": 4, "is_finite": 2,
+    "logistic": 30, "atan": 26, "atan2": 40, "convert": 1, "max": 3, "min": 3, "sign": 4, "is_finite": 2, "lookup": 24,
 }  # fmt: skip
 """Vector instructions of an operation, roughly, where it is not one; a function of the C library takes LIBRARY a run."""
 LIBRARY = 40

@@ -77,7 +77,7 @@ class Builder:
 
     def lookup(self, table: tuple[float, ...], index: int) -> int:
         """The node of table[index], for an index that only the run knows."""
-        return self._add(Node("lookup", (index,), "f", table), table)
+        return self._add(Node("lookup", (index,), "f", table), tuple(x.hex() for x in table))
 
     def value(self, node: int):
         """The value of a constant node, else None."""

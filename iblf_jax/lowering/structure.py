@@ -11,13 +11,13 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from iblf_jax.lowering.from_jaxpr import Ids, choose, constants
+from iblf_jax.lowering.from_jaxpr import Ids, constants
 from iblf_jax.lowering.program import Builder, UnsupportedError
 
 MOST_CHOICES = 64
 """Entries among which indices of the run may choose."""
-LONGEST_TABLE = 4096
-"""Constants among which one may."""
+LONGEST_TABLE, LARGEST_TABLES = 4096, 50_000
+"""Floating-point constants among which one may, and how many numbers the tables of one indexing may have in all."""
 
 
 def _reshape(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
@@ -92,27 +92,36 @@ def _chosen(b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] 
     if not unknown:
         return at(np.asarray(flat, np.int32).reshape(index.shape))
     choices = size ** len({*unknown, *known})
-    is_table = choices == size and all(b.value(i) is not None and b.nodes[i].kind == "f" for i in x.ravel().tolist())
-    if choices > (LONGEST_TABLE if is_table else MOST_CHOICES):
+    if choices > (LONGEST_TABLE if choices == size and _is_table(b, x.ravel().tolist()) else MOST_CHOICES):
         raise UnsupportedError(f"indices that only the run knows choose among {choices} entries, which is too many")
     node = unknown[0]
     cases = [_chosen(b, x, index, at, known | {node: v}) for v in range(size)]
-    if is_table:
-        columns = np.stack([case.ravel() for case in cases], axis=1).tolist()
-        return np.asarray([_looked_up(b, column, node) for column in columns], np.int64).reshape(cases[0].shape)
-    result = cases[-1]
-    for v in reversed(range(size - 1)):
-        result = choose(b, b.emit("le", node, b.constant(v, "i"), kind="b"), cases[v], result)
+    columns = np.stack([case.ravel() for case in cases], axis=1)
+    if columns.size > LARGEST_TABLES:
+        raise UnsupportedError(f"an index that only the run knows chooses among {columns.size} numbers, which is too many")
+    return np.asarray([_one_of(b, column, node) for column in columns.tolist()], np.int64).reshape(cases[0].shape)
+
+
+def _is_table(b: Builder, entries: list[int]) -> bool:
+    return all(b.value(i) is not None and b.nodes[i].kind == "f" for i in entries)
+
+
+def _one_of(b: Builder, entries: list[int], index: int) -> int:
+    """The entry at an index of the run: looked up where all are constants."""
+    if len(set(entries)) == 1:
+        return entries[0]
+    if _is_table(b, entries):
+        return b.lookup(tuple(b.value(i) for i in entries), index)
+    if len(entries) > MOST_CHOICES:
+        raise UnsupportedError(f"an index that only the run knows chooses among {len(entries)} entries, which is too many")
+    result = entries[-1]
+    for v, entry in reversed(list(enumerate(entries[:-1]))):
+        result = b.emit("select", b.emit("le", index, b.constant(v, "i"), kind="b"), entry, result, kind=b.nodes[entry].kind)
     return result
 
 
-def _looked_up(b: Builder, entries: list[int], index: int) -> int:
-    """One of some constants."""
-    return entries[0] if len(set(entries)) == 1 else b.lookup(tuple(b.value(i) for i in entries), index)
-
-
 def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
-    """Entries of x; where an index may lie outside and the filler is asked for, that one."""
+    """Entries of x, the nearest one for an index outside; what a filler is asked for then is refused."""
     filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
     if filled and not _is_inside(b, eqn, x, index):
         raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")

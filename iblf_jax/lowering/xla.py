@@ -23,7 +23,7 @@ from iblf_jax.one_function import as_one_function
 
 BLOCK = 64
 """Runs that go through a stretch of steps together on CPU."""
-LONG = 6000
+LONG = 10_000
 """Operations of a step from which a block on CPU is always BLOCK wide: loops over fewer runs would be unrolled, and LLVM takes up to 20 GB
 over a long step without loops."""
 LONGEST = 20_000

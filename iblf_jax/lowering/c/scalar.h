@@ -32,7 +32,7 @@ typedef union { real f; integer i; } word;
 #define INLINE static __device__ __forceinline__
 #define FUNCTION INLINE
 #define SEPARATE INLINE
-#define TABLE static __device__ const real
+#define TABLE static __device__ const integer
 #define MASK(comparison) (-(I)(comparison))
 #define AT(x, l) (x)
 #define splat(x) ((F)(x))
@@ -40,7 +40,7 @@ typedef union { real f; integer i; } word;
 #define from(first) (first)
 #define to_float(x) ((F)(x))
 #define to_int(x) ((I)(x))
-INLINE F f_lookup(const real *table, integer size, I i) { return table[i < 0 ? 0 : i < size ? i : size - 1]; }
+INLINE F f_lookup(const integer *table, integer size, I i) { return from_bits(table[i < 0 ? 0 : i < size ? i : size - 1]); }
 struct all_runs {};
 struct one_run {};
 template <typename count> INLINE void store_some(real *p, F x, count) { *p = x; }

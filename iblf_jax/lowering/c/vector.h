@@ -36,7 +36,7 @@ typedef union { real f; integer i; } word;
 #define INLINE static inline __attribute__((always_inline))
 #define FUNCTION static
 #define SEPARATE static __attribute__((noinline))
-#define TABLE static const real
+#define TABLE static const integer
 #define MASK(comparison) (comparison)
 #define AT(x, l) (x)[l]
 INLINE F splat(real x) { return x - (F){}; }
@@ -53,8 +53,8 @@ INLINE I bits(F x) { return (I)x; }
 INLINE F from_bits(I x) { return (F)x; }
 INLINE F to_float(I x) { return __builtin_convertvector(x, F); }
 INLINE I to_int(F x) { return __builtin_convertvector(x, I); }
-INLINE integer within(integer i, integer size) { return i < 0 ? 0 : i < size ? i : size - 1; }
-INLINE F f_lookup(const real *table, integer size, I index) { F x; for (int l = 0; l < W; l++) x[l] = table[within(index[l], size)]; return x; }
+INLINE F f_lookup(const integer *table, integer size, I index) {
+  I x; for (int l = 0; l < W; l++) x[l] = table[index[l] < 0 ? 0 : index[l] < size ? index[l] : size - 1]; return from_bits(x); }
 
 /* A function of the C library, lane by lane; the compiler makes a vector instruction of it where there is one. */
 #define LANEWISE(name, call) INLINE F name(F x) { \
