@@ -204,13 +204,13 @@ def rows_of(scenario, dtype: str, loop: str) -> list[Row]:
     if loop == "arm":
         return [Row("vmap", on("vmap"), 2e4, batches=(1, 64)), Row("native", on("native"), 2e6, batches=(1, 64, 4096))]
     rows = [
-        Row("vmap", on("vmap"), 2e6, batches=(1, 4096)),
+        Row("vmap", on("vmap"), 2e6, batches=(1, 64, 4096)),
         Row("xla", on("xla"), 3e7),
         Row("native", on("native"), 1e8),
         Row("native, one thread", on("native"), 1e8, threads=1, batches=LARGE[1:]),
     ]
     if loop != "paper":
-        return [row._replace(batches=(4096,)) if row.name == "xla" else row for row in rows]  # it compiles for most of a minute
+        return rows
     rows.append(Row("xla, no metrics", on("xla", ()), 3e7, batches=LARGE))
     first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 1e6, most=16_384)]
     if importlib.util.find_spec("diffrax"):
