@@ -133,7 +133,10 @@ class Evaluator:
         return self.functions[node.op](*args)
 
     def _looked_up(self, lookups: list[int], index: Any) -> jax.Array:
-        """The values of lookups by one index, in one gather: XLA makes a loop of each."""
+        """The values of lookups by one index, in one gather: XLA makes a loop of each.
+
+        The barriers keep it from computing index and rows again for every use.
+        """
         tables = jnp.asarray([self.program.nodes[i].value for i in lookups], self.program.dtype)
         columns = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(1,), start_index_map=(1,))
         index = lax.optimization_barrier(jnp.broadcast_to(index, self.shape))

@@ -121,7 +121,7 @@ def _one_of(b: Builder, entries: list[int], index: int) -> int:
 
 
 def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
-    """Entries of x, the nearest one for an index outside; what a filler is asked for then is refused."""
+    """Entries of x, the nearest one for an index outside; a gather that fills what lies outside is refused."""
     filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
     if filled and not _is_inside(b, eqn, x, index):
         raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")
