@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from typing import NoReturn
 
 import jax
 
-INTERRUPTED = 130
+from iblf_jax.studies.interrupt import INTERRUPTED, end_process
 
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
@@ -73,8 +74,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def entry() -> NoReturn:
     """A process of its own for one command: ends with `main`'s exit code.
 
-    An interrupted one ends without taking JAX down: XLA may be compiling in a thread, and crashes when its client goes.
+    An interrupted one ends without taking JAX down, see `end_process`.
     """
+    signal.signal(signal.SIGINT, end_process)
     code = main()
     if code == INTERRUPTED:
         sys.stdout.flush()

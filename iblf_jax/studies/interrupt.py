@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
-SIGNALS = {signal.SIGINT: ("Ctrl-C", signal.default_int_handler), signal.SIGTERM: ("SIGTERM", signal.SIG_DFL)}
+INTERRUPTED = 130
+"""Exit code of a process that was interrupted."""
+
+
+def end_process(number: int, frame: FrameType | None) -> NoReturn:
+    """A signal's handler for a process of its own: it ends here and now.
+
+    Nothing is unwound: XLA may be compiling in a thread, and crashes when what it works on goes.
+    """
+    sys.stdout.flush()
+    sys.stderr.write("iblf-jax: error: interrupted\n")
+    sys.stderr.flush()
+    os._exit(INTERRUPTED)
+
+
+SIGNALS = {signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)), signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,))}
 """Signals that ask, what they are called, and who handles them where nobody else does.  A cluster sends SIGTERM before it kills."""
 
 
@@ -28,7 +44,7 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            ours = [number for number, (_, usual) in SIGNALS.items() if signal.getsignal(number) is usual]
+            ours = [number for number, (_, usual) in SIGNALS.items() if signal.getsignal(number) in usual]
             self._before = {number: signal.signal(number, self._handle) for number in ours}
         return self
 
@@ -38,6 +54,7 @@ class StopRequest:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
-            raise KeyboardInterrupt
+            before = self._before[signal.Signals(number)]
+            (before if callable(before) else signal.default_int_handler)(number, frame)
         self.asked = True
         sys.stderr.write(f"\n{SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand; again to stop at once.\n")
