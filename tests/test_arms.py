@@ -202,7 +202,7 @@ def test_monte_carlo_and_sweep():
     assert table.rmse.shape == (2, 2, 7)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_tune_21_gains():
     scenario = ij.presets.iiwa14()
     gains = ["controller.k1", "controller.K2", "observer.kf"]

@@ -91,7 +91,7 @@ def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["xla", pytest.param("native", marks=needs_compiler)])
+@pytest.mark.parametrize("backend", [pytest.param("xla", marks=pytest.mark.release), pytest.param("native", marks=needs_compiler)])
 def test_a_spline_is_looked_up(backend):
     times = np.linspace(0.0, 0.04, 9)
     spline = ij.references.WaypointSpline(tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1)))
