@@ -76,21 +76,23 @@ def _conversion(source: str, target: str, arg: str) -> str:
 
 
 class _Emitter:
-    """Statements for nodes; `names` are the C expressions of nodes that were read or computed already."""
+    """Statements for nodes; `names` are the C expressions of nodes that were read or computed already.
+
+    `tables` says into which table each lookup looks, `definitions` is the C of the tables.
+    """
 
     def __init__(self, program: Program) -> None:
         self.program = program
         self.classes = program.classes()
         self.lines: list[str] = []
-        tables = dict.fromkeys(self._numbers(node) for node in program.nodes if node.op == "lookup")
-        self.tables = {text: f"table_{k}" for k, text in enumerate(tables)}
-
-    def definitions(self) -> str:
-        """The tables of constants that statements look into."""
-        return "\n".join(f"TABLE {name}[] = {{{text}}};" for text, name in self.tables.items())
+        names: dict[str, str] = {}
+        self.tables = {
+            i: names.setdefault(self._numbers(node), f"table_{len(names)}") for i, node in enumerate(program.nodes) if node.op == "lookup"
+        }
+        self.definitions = "\n".join(f"TABLE {name}[] = {{{numbers}}};" for numbers, name in names.items())
 
     def _numbers(self, lookup: Node) -> str:
-        """Their bits, which are constants for every compiler; infinity is a function's result for some."""
+        """The bits of its table, which are constants for every compiler; infinity is a function's result for some."""
         bits = np.asarray(lookup.value, self.program.dtype).view(f"u{self.program.dtype.itemsize}")
         return ", ".join(f"(integer){x:#x}" for x in bits.tolist())
 
@@ -115,7 +117,7 @@ class _Emitter:
                 continue
             args = [names[a] for a in node.args]
             if node.op == "lookup":
-                text = f"f_lookup({self.tables[self._numbers(node)]}, {len(node.value)}, {args[0]})"
+                text = f"f_lookup({self.tables[i]}, {len(node.value)}, {args[0]})"
             else:
                 text = expression(node, args, [nodes[a].kind for a in node.args])
             self.lines.append(f"  {'F' if node.kind == 'f' else 'I'} v{i} = {text};")
@@ -169,7 +171,7 @@ def source(program: Program, shared_leaves: int, lane_leaves: int, target: tuple
     """The whole C source of a program's kernel for a target, NATIVE or CUDA."""
     e, layout = _Emitter(program), Layout.of(program)
     before, after = target
-    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before), e.definitions()]
+    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before), e.definitions]
     is_long = target is NATIVE and len(program.nodes) > LONG
     parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
     parts += [(_advance_in_segments if is_long else _advance)(e, *layout)]
