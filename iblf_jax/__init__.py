@@ -38,7 +38,6 @@ from iblf_jax.scenario import Initial as Initial
 from iblf_jax.scenario import Scenario as Scenario
 from iblf_jax.scenario_file import load_scenario as load_scenario
 from iblf_jax.scenario_file import save_scenario as save_scenario
-from iblf_jax.stability import recommended_dt as recommended_dt
 from iblf_jax.status import Status as Status
 
 __version__ = _version("iblf_jax")
@@ -52,6 +51,7 @@ if TYPE_CHECKING:
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
     from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
+    from iblf_jax.studies.recommended import recommended_dt as recommended_dt
     from iblf_jax.studies.sensitivity import sensitivity as sensitivity
     from iblf_jax.studies.store import StoreError as StoreError
     from iblf_jax.studies.study import Study as Study
@@ -81,6 +81,7 @@ _ON_FIRST_USE = {
     "objectives": ("iblf_jax.tuning.objectives", None),
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
+    "recommended_dt": ("iblf_jax.studies.recommended", "recommended_dt"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),
     "StoreError": ("iblf_jax.studies.store", "StoreError"),
     "Study": ("iblf_jax.studies.study", "Study"),

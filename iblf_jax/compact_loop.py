@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax import accuracy
 from iblf_jax.closed_loop import evaluate, initial_state
 from iblf_jax.integrators import stages
 from iblf_jax.one_function import as_one_function, is_long
 from iblf_jax.scenario import Scenario
 from iblf_jax.stability import fastest_mode_by_differences
-from iblf_jax.time_loop import Carry, Nearest, Outcome, critical_instants, folded, keep_if, moved, record_of, scan_steps, verdict
+from iblf_jax.time_loop import Carry, Nearest, Outcome, critical_instants, keep_if, moved, observed, record_of, scan_steps, verdict
 
 _evaluate_once = jax.jit(evaluate)
 """`closed_loop.evaluate` as a call that stays one: copied to where it is called, a long loop takes longer to trace."""
@@ -48,10 +49,12 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
         return tuple(ravel_pytree(part)[0] for part in _evaluate_once(scenario, t, whole(x), covered))
 
     @piece
-    def after(carry, record, index, sample, stepped):
-        sample = whole_sample(sample)
+    def after(carry, record, index, sample, slopes, stepped):
+        sample, slopes = whole_sample(sample), [whole(k) for k in slopes]
         begun = carry._replace(accumulators=keep_if(index > 0, carry.accumulators, tuple(fold.init(sample) for fold in folds)))
-        there = moved(folded(folds, sample, begun), whole(stepped), index < steps)
+        seen = observed(folds, method, dt, index, slopes[0], sample, begun)
+        seen = seen._replace(accuracy=accuracy.passed(seen.accuracy, method, slopes))
+        there = moved(seen, whole(stepped), index < steps)
         record = keep_if(index % every == 0, record_of(sample, carry.state), record) if record_every else None
         return keep_if(index <= steps, there, carry), record
 
@@ -63,10 +66,10 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
         def stage(slope_and_sum, weights):
             (k, total), (c, a, b) = slope_and_sum, weights
             k, sample = loop(scenario, t + c * dt, x + dt * (a * k), covered)
-            return (k, total + b * k), sample
+            return (k, total + b * k), (k, sample)
 
-        (_, total), samples = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
-        return after(carry, record, index, samples[0], x + dt * total), None
+        (_, total), (slopes, samples) = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
+        return after(carry, record, index, samples[0], slopes, x + dt * total), None
 
     def block(carried, first):
         carried, _ = jax.lax.scan(one, carried, first + jnp.arange(every))
@@ -74,9 +77,16 @@ def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: in
 
     blank = jax.eval_shape(lambda sample: tuple(fold.init(sample) for fold in folds), shapes[1])
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
-    carry = Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(dt), zero, jax.lax.stop_gradient(state)))
+    same, there = jax.lax.stop_gradient((scenario, state))
+
+    def rate_at(x):
+        return accuracy.numbers(whole(loop(same, zero, ravel_pytree(accuracy.with_numbers(there, x))[0], zero)[0]))
+
+    estimate = accuracy.begin(method, partial(jax.lax.map, rate_at), there)
+    carry = Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(dt), zero, there), estimate)
     record = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(record_of, shapes[1], state)) if record_every else None
     (carry, _), records = jax.lax.scan(block, (carry, record), every * jnp.arange(steps // every + 1))
+    carry = carry._replace(accuracy=accuracy.between_stages(scenario, carry.accuracy, method, dt, steps))
     times, states = critical_instants(scenario, dt, steps, carry)
 
     def mode(instant):

@@ -97,17 +97,17 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
       folds, dt, steps, method: as `compact_loop.run`.
     """
     count = len(next(iter(directions.values())))
-    first = jax.eval_shape(lambda v: start(with_parameters(scenario, v), folds, dt), varied)
+    first = jax.eval_shape(lambda v: start(with_parameters(scenario, v), folds, method, dt), varied)
     how = _split((first.state, first.accumulators))[2]
 
     def begin(varied):
-        carry = start(with_parameters(scenario, varied), folds, dt)
+        carry = start(with_parameters(scenario, varied), folds, method, dt)
         reals, others, _ = _split((carry.state, carry.accumulators))
-        return reals, (others, carry.status, carry.nearest)
+        return reals, (others, carry.status, carry.nearest, carry.accuracy)
 
     def assemble(reals, rest):
         state, accumulators = _joined(reals, rest[0], how)
-        return Carry(state, accumulators, rest[1], rest[2])
+        return Carry(state, accumulators, *rest[1:])
 
     def one(rest, index, varied, reals):
         here = with_parameters(scenario, varied)
@@ -116,7 +116,7 @@ def forward(scenario: Scenario, varied, directions, folds, dt, *, steps: int, me
         new, others, _ = _split((after.state, after.accumulators))
         outer = outer_of(folds, before.accumulators, sample)
         factors = jax.lax.stop_gradient(tuple((jnp.broadcast_to(o.weight, o.vector.shape), o.decay) for o in outer))
-        return (new, tuple(o.vector for o in outer)), ((others, after.status, after.nearest), factors)
+        return (new, tuple(o.vector for o in outer)), ((others, after.status, after.nearest, after.accuracy), factors)
 
     def body(loop, index):
         reals, tangents, rest, products = loop
@@ -192,7 +192,7 @@ def run_checkpointed(scenario: Scenario, folds, dt, *, steps: int, method: str) 
     def many(carry, first):
         return jax.lax.scan(few, carry, first + inner * jnp.arange(inner))
 
-    carry, _ = jax.lax.scan(many, start(scenario, folds, dt), inner * inner * jnp.arange(blocks))
+    carry, _ = jax.lax.scan(many, start(scenario, folds, method, dt), inner * inner * jnp.arange(blocks))
     begin = blocks * inner * inner
     carry, _ = jax.lax.scan(few, carry, begin + inner * jnp.arange(rest // inner))
     carry, _ = jax.lax.scan(one, carry, begin + rest // inner * inner + jnp.arange(rest % inner))

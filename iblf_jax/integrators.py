@@ -25,17 +25,23 @@ class Tableau(NamedTuple):
     order: int
     stability: float
     """|dt * mode| up to which the method is stable, on the negative real axis."""
+    differences: tuple[float, ...]
+    """Weights of the last rates, oldest first, in the estimate of a step's error (`accuracy`)."""
+    halfway: int = 0
+    """The stage in the middle of a step, whose rate is one of these; 0 if there is none."""
 
 
 TABLEAUS = {
-    "euler": Tableau(c=(0.0,), a=((),), b=(1.0,), order=1, stability=2.0),
-    "heun": Tableau(c=(0.0, 1.0), a=((), (1.0,)), b=(0.5, 0.5), order=2, stability=2.0),
+    "euler": Tableau(c=(0.0,), a=((),), b=(1.0,), order=1, stability=2.0, differences=(-0.5, 0.5)),
+    "heun": Tableau(c=(0.0, 1.0), a=((), (1.0,)), b=(0.5, 0.5), order=2, stability=2.0, differences=(1.0, -2.0, 1.0)),
     "rk4": Tableau(
         c=(0.0, 0.5, 0.5, 1.0),
         a=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
         b=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
         order=4,
         stability=2.785,
+        differences=(1 / 18, -4 / 18, 6 / 18, -4 / 18, 1 / 18),
+        halfway=2,
     ),
 }
 
@@ -73,8 +79,18 @@ def step(method: str, slope, t: jax.Array, state, dt: jax.Array, first_slope):
       state: pytree of arrays.
       first_slope: slope(t, state).
     """
+    return combined(method, state, dt, stage_slopes(method, slope, t, state, dt, first_slope))
+
+
+def stage_slopes(method: str, slope, t: jax.Array, state, dt: jax.Array, first_slope) -> list:
+    """The slopes of a step's stages; arguments as `step`."""
     table = tableau(method)
     slopes = [first_slope]
     for c, row in zip(table.c[1:], table.a[1:], strict=True):
         slopes.append(slope(t + c * dt, _combine(state, dt, row, slopes)))
-    return _combine(state, dt, table.b, slopes)
+    return slopes
+
+
+def combined(method: str, state, dt: jax.Array, slopes: list):
+    """The state one step later, from the slopes of its stages."""
+    return _combine(state, dt, tableau(method).b, slopes)

@@ -98,3 +98,21 @@ def _solve_spd_jvp(primals, tangents):
     (matrix, rhs), (matrix_dot, rhs_dot) = primals, tangents
     x = solve_spd(matrix, rhs)
     return x, solve_spd(matrix, rhs_dot - matvec(matrix_dot, x))
+
+
+def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """X with matrix X = rhs, for any (m, m) matrix and an (m, k) right-hand side, by Gauss and Jordan with pivoting.
+
+    For what is done once a run: in a loop over the columns, quick to compile and without a call into a library, which would keep the run
+    around it from becoming one machine function.
+    """
+    rows = jnp.arange(len(matrix))
+
+    def eliminate(table, k):
+        pivot = jnp.argmax(jnp.where(rows >= k, jnp.abs(table[:, k]), -1.0))
+        top = table[pivot] / table[pivot, k]
+        table = jnp.where((rows == pivot)[:, None], table[k], table)
+        return jnp.where((rows == k)[:, None], top, table - table[:, k][:, None] * top), None
+
+    table, _ = jax.lax.scan(eliminate, jnp.concatenate([matrix, rhs], axis=1), rows)
+    return table[:, len(matrix) :]

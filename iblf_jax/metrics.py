@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax import checks
+from iblf_jax.accuracy import UNITS
 from iblf_jax.closed_loop import Sample
 from iblf_jax.pytree import Leaf, component, leaf
 
@@ -281,16 +282,19 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike) -> tup
         metrics = standard()
     if not isinstance(metrics, tuple | list):
         raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
-    owner: dict[str, int] = {}
+    owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
     for i, fold in enumerate(metrics):
         checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
         for name in fold.units:
             if name in owner:
-                raise checks.fail(
-                    f"metrics[{i}]", fold, "names that no other fold returns", f"metrics[{owner[name]}] returns {name!r} too."
-                )
-            owner[name] = i
+                raise checks.fail(f"metrics[{i}]", fold, "names that no other fold returns", f"{owner[name]} returns {name!r} too.")
+            owner[name] = f"metrics[{i}]"
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tuple(metrics))
+
+
+def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
+    """Name and unit of everything that a run with some folds returns: theirs, and its accuracy."""
+    return tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items()) + UNITS
 
 
 def standard() -> tuple[Fold, ...]:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.accuracy import RELATIVE
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status, describe
 
@@ -107,6 +108,8 @@ class Rollout:
     observer_state: Any
     """State of the observer, time axis first; `()` if it has none."""
     metrics: Metrics
+    """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, () [1]: the estimated error of the
+    positions that the time step is to blame for, as it is and relative to the width of the tube (`accuracy`)."""
     status: jax.Array
     """Bit flags of `Status`, () int32; 0 is ok."""
     fastest_mode: jax.Array
@@ -149,7 +152,8 @@ class Rollout:
         if self.is_batch:
             bad = int(np.sum(np.asarray(self.status) != 0))
             return f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"
-        return f"Rollout({shape}; status: {describe(int(self.status))})"
+        accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube" if RELATIVE in self.metrics else ""
+        return f"Rollout({shape}; status: {describe(int(self.status))}{accuracy})"
 
     def to_xarray(self):
         """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its attributes."""

@@ -11,14 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.bounds import tube_at
 from iblf_jax.compact_loop import run
 from iblf_jax.integrators import tableau
-from iblf_jax.metrics import Fold, as_folds
+from iblf_jax.metrics import Fold, as_folds, metric_units
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.stability import comfortable_dt
 from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.step_size import comfortable_dt, find_dt
 
 MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""
@@ -114,12 +115,11 @@ def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record
     else:
         outcome = _run_compiled(scenario, folds, dt, alone=False, **options)
     arrays, controller_state, observer_state = outcome.records
-    units = tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
     return Rollout(
         scenario=scenario,
         controller_state=controller_state,
         observer_state=observer_state,
-        metrics=Metrics(outcome.metrics, units),
+        metrics=Metrics(outcome.metrics, metric_units(folds)),
         status=outcome.status,
         fastest_mode=outcome.fastest_mode,
         dt=dt,
@@ -133,15 +133,18 @@ def _report(result: Rollout, steps: int, throw: bool) -> None:
     status = Status(int(result.status))
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
-    if not status & FAILED:
+    failed = status & FAILED
+    told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED)
+    if not told:
         return
-    text = f"The run failed: {describe(status & FAILED)}. " + " ".join(_explanations(result, status))
-    if throw:
+    heading = f"{'The run failed' if failed else 'Look again'}: {describe(told)}."
+    text = " ".join([heading, *_explanations(result, status, steps)])
+    if throw and failed:
         raise SimulationError(text)
     warnings.warn(text, SimulationWarning, stacklevel=3)
 
 
-def _explanations(result: Rollout, status: Status) -> list[str]:
+def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     texts = []
     metrics = result.metrics
     if status & Status.BOUND_VIOLATED and "first_violation_time" in metrics:
@@ -159,6 +162,18 @@ def _explanations(result: Rollout, status: Status) -> list[str]:
         )
     elif status & Status.NOT_FINITE:
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
+    elif status & Status.INACCURATE:
+        error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
+        dt = find_dt(result.scenario, duration=steps * float(result.dt), method=result.method)
+        texts.append(
+            f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where {100 * TOLERANCE:g} % are tolerated: "
+            f"dt = {float(result.dt):g} s is too large for what drives this loop. Take dt={dt:g}."
+        )
+    if status & Status.GUARD_STAYED:
+        texts.append(
+            "While the guard is active the barrier is softer than the one that was asked for: what ran there is another law. Start or stay "
+            "further from the bounds, or give the barrier a smaller guard."
+        )
     return texts
 
 

@@ -1,4 +1,4 @@
-"""How fast the closed loop's fastest mode is, and which time step that allows.
+"""How fast the closed loop's fastest mode is.
 
 The gain K2 acts through M0^-1, so the fastest mode is about K2 / lambda_min(M0): near 1000 1/s for the paper's gains.  An
 explicit step is stable only while dt times that mode stays inside the method's stability region; beyond it the numbers grow
@@ -8,29 +8,22 @@ without any physics behind them.  So every run measures its fastest mode, at its
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax import checks
-from iblf_jax.closed_loop import LoopState, initial_state, rate
+from iblf_jax.closed_loop import LoopState, rate
 from iblf_jax.integrators import tableau
 from iblf_jax.one_function import as_one_function, is_long
-from iblf_jax.scenario import Initial, Scenario, canonical
+from iblf_jax.scenario import Scenario
 
 POWER_ITERATIONS = 48
 AVERAGED = 16
-COMFORT = 1.5
-"""|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
-
 SLOWEST = 1.0
-"""1/s.  A loop slower than this still follows a reference, so a step is never advised beyond that."""
+"""1/s.  A loop slower than this still follows a reference."""
 
 
 class Growth(NamedTuple):
@@ -105,50 +98,14 @@ def stable_dt(mode: float, method: str) -> float:
     return tableau(method).stability / mode
 
 
-def comfortable_dt(mode: float) -> float:
-    """A round step (1, 2 or 5 times a power of ten) that follows a mode [1/s] comfortably, [s]."""
-    limit = COMFORT / max(mode, SLOWEST)
-    decade = 10.0 ** math.floor(math.log10(limit))
-    factor = max(f for f in (1.0, 2.0, 5.0) if f * decade <= limit * (1 + 1e-12))
-    return float(f"{factor * decade:.1g}")
-
-
-def recommended_dt(scenario: Scenario, *, duration: float = 20.0, method: str = "rk4") -> float:
-    """A round time step [s] with which `simulate` is stable and accurate on this scenario.
-
-    dt = 1.5 / max |eigenvalue of the closed loop's Jacobian|, rounded down to 1, 2 or 5 times a power of ten; the maximum is
-    taken at the start and along the reference.
-
-    Args:
-      scenario: what is to run.
-      duration: over which stretch of the reference to look [s].
-      method: the integrator.
-
-    Raises:
-      ValueError: bad scenario, duration or method.
-    """
-    tableau(method)
-    scenario = canonical(scenario)
-    times = np.linspace(0.0, checks.positive_number("duration", duration, "s"), 33)
-    modes = np.abs(np.linalg.eigvals(np.asarray(_jacobians(scenario, jnp.asarray(times, scenario.initial.q.dtype)), float)))
-    if not np.all(np.isfinite(modes)):
-        raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
-    return comfortable_dt(float(np.max(modes)))
-
-
 @jax.jit
-def _jacobians(scenario: Scenario, times: jax.Array) -> jax.Array:
-    def along_reference(t):
-        tube = scenario.setting.tube(t)
-        return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
+def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
+    """The closed loop's Jacobian at (t, state), (m, m) [1/s]."""
+    x, whole = ravel_pytree(state)
 
     def rate_at(t, x):
         return ravel_pytree(rate(scenario, t, whole(x)))[0]
 
-    start, whole = ravel_pytree(initial_state(scenario))
-    states = jnp.concatenate([start[None], jax.vmap(lambda t: ravel_pytree(along_reference(t))[0])(times)])
-    times = jnp.concatenate([times[:1], times])
-    if is_long(rate_at, times[0], start):
-        piece = as_one_function(rate_at)
-        return jax.lax.map(lambda at: jacobian_by_differences(partial(piece, at[0]), at[1]).T, (times, states))
-    return jax.vmap(lambda t, x: jax.jacfwd(partial(rate_at, t))(x))(times, states)
+    if is_long(rate_at, t, x):
+        return jacobian_by_differences(partial(as_one_function(rate_at), t), x).T
+    return jax.jacfwd(partial(rate_at, t))(x)

@@ -29,6 +29,10 @@ class Status(enum.IntFlag):
     """A joint came so near its bound that the barrier's slope was held at its greatest finite value."""
     INADMISSIBLE_DRAW = 64
     """A study drew a value that its leaf does not admit (a negative mass, say): the run was not made, its metrics are NaN."""
+    INACCURATE = 128
+    """The estimated error of the positions is more than 0.5 % of the tube (`accuracy.TOLERANCE`): take a smaller dt."""
+    GUARD_STAYED = 256
+    """The guard was active beyond the first instant: there another law ran, softer than the one that was asked for."""
 
 
 FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
@@ -46,6 +50,8 @@ _WORDS = {
     Status.TORQUE_SATURATED: "the torque was saturated",
     Status.GUARD_ACTIVE: "the guard at the wall was active",
     Status.INADMISSIBLE_DRAW: "a drawn parameter was inadmissible, so the run was not made",
+    Status.INACCURATE: "the positions are inaccurate: the time step is too large",
+    Status.GUARD_STAYED: "the guard stayed active beyond the first instant",
 }
 
 

@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import accuracy
 from iblf_jax.bounds import NARROWEST
-from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
-from iblf_jax.integrators import step, tableau
+from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state, rate
+from iblf_jax.integrators import combined, stage_slopes, tableau
 from iblf_jax.results import Rollout
 from iblf_jax.scenario import Scenario
 from iblf_jax.stability import fastest_mode
@@ -42,6 +43,7 @@ class Carry(NamedTuple):
     accumulators: tuple
     status: jax.Array
     nearest: Nearest
+    accuracy: accuracy.Accuracy
 
 
 class Outcome(NamedTuple):
@@ -61,6 +63,7 @@ def sample_status(sample: Sample) -> jax.Array:
         flag(jnp.any(~(margin > 0)), Status.BOUND_VIOLATED)
         | flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
         | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
+        | flag(jnp.any(sample.guard_active) & (sample.t > 0), Status.GUARD_STAYED)
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
         | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
     )
@@ -77,22 +80,24 @@ def keep_if(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def folded(folds, sample: Sample, carry: Carry) -> Carry:
-    """The carry with a sample folded in."""
+def observed(folds, method: str, dt, index, slope: LoopState, sample: Sample, carry: Carry) -> Carry:
+    """The carry with the rate and the sample of an instant folded in."""
     accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, carry.accumulators, strict=True))
     near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
     here = Nearest(near, sample.t, jax.lax.stop_gradient(carry.state))
     nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
-    return Carry(carry.state, accumulators, carry.status | sample_status(sample), nearest)
+    estimate = accuracy.observed(carry.accuracy, method, dt, index, slope, sample.upper - sample.lower)
+    return Carry(carry.state, accumulators, carry.status | sample_status(sample), nearest, estimate)
 
 
 def advance(scenario: Scenario, folds, method: str, dt, carry: Carry, index, loop=evaluate) -> tuple[Carry, Sample]:
     """One step of the time loop: observe, integrate, freeze what runs away.  `loop` stands for `closed_loop.evaluate`."""
     t = index.astype(dt.dtype) * dt
     slope, sample = loop(scenario, t, carry.state, dt)
-    carry = folded(folds, sample, carry)
-    stepped = step(method, lambda t, state: loop(scenario, t, state)[0], t, carry.state, dt, slope)
-    return moved(carry, stepped), sample
+    carry = observed(folds, method, dt, index, slope, sample, carry)
+    slopes = stage_slopes(method, lambda t, state: loop(scenario, t, state)[0], t, carry.state, dt, slope)
+    carry = carry._replace(accuracy=accuracy.passed(carry.accuracy, method, slopes))
+    return moved(carry, combined(method, carry.state, dt, slopes)), sample
 
 
 def moved(carry: Carry, stepped: LoopState, moving: jax.Array | bool = True) -> Carry:
@@ -102,25 +107,29 @@ def moved(carry: Carry, stepped: LoopState, moving: jax.Array | bool = True) -> 
     return carry._replace(state=state, status=carry.status | flag(~sound & moving, Status.NOT_FINITE))
 
 
-def start(scenario: Scenario, folds, dt) -> Carry:
+def start(scenario: Scenario, folds, method: str, dt) -> Carry:
     """The carry before the first step."""
     state, zero = initial_state(scenario), jnp.zeros_like(dt)
     _, first = evaluate(scenario, zero, state, dt)
     nearest = Nearest(-jnp.ones_like(dt), zero, jax.lax.stop_gradient(state))
-    return Carry(state, tuple(fold.init(first) for fold in folds), jnp.int32(0), nearest)
+    same, there = jax.lax.stop_gradient((scenario, state))
+    rate_at = jax.vmap(lambda x: accuracy.numbers(rate(same, zero, accuracy.with_numbers(there, x))))
+    estimate = accuracy.begin(method, rate_at, there)
+    return Carry(state, tuple(fold.init(first) for fold in folds), jnp.int32(0), nearest, estimate)
 
 
 def finish(scenario: Scenario, folds, method: str, dt, steps: int, carry: Carry) -> tuple[Carry, Sample, Outcome]:
     """The last sample, the folds' results and the verdict on the step."""
-    carry, sample = observe_end(scenario, folds, dt, steps, carry)
+    carry, sample = observe_end(scenario, folds, method, dt, steps, carry)
     modes = jax.vmap(partial(fastest_mode, scenario))(*critical_instants(scenario, dt, steps, carry))
     return carry, sample, verdict(folds, method, dt, carry, modes)
 
 
-def observe_end(scenario: Scenario, folds, dt, steps: int, carry: Carry) -> tuple[Carry, Sample]:
+def observe_end(scenario: Scenario, folds, method: str, dt, steps: int, carry: Carry) -> tuple[Carry, Sample]:
     """The carry and the sample after the last step."""
-    _, sample = evaluate(scenario, dt * steps, carry.state, jnp.zeros_like(dt))
-    return folded(folds, sample, carry), sample
+    slope, sample = evaluate(scenario, dt * steps, carry.state, jnp.zeros_like(dt))
+    carry = observed(folds, method, dt, steps, slope, sample, carry)
+    return carry._replace(accuracy=accuracy.between_stages(scenario, carry.accuracy, method, dt, steps)), sample
 
 
 def critical_instants(scenario: Scenario, dt, steps: int, carry: Carry) -> tuple[jax.Array, LoopState]:
@@ -132,10 +141,11 @@ def critical_instants(scenario: Scenario, dt, steps: int, carry: Carry) -> tuple
 
 
 def verdict(folds, method: str, dt, carry: Carry, modes: jax.Array) -> Outcome:
-    """The folds' results, and the status with the verdict on the step, given the measured modes [1/s]."""
+    """The folds' results and the accuracy, and the status with the verdict on the step, given the measured modes [1/s]."""
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     status = carry.status | flag(dt * mode > tableau(method).stability, Status.STEP_TOO_LARGE)
-    metrics: dict[str, jax.Array] = {}
+    status |= flag(~(carry.accuracy.relative <= accuracy.TOLERANCE), Status.INACCURATE)
+    metrics = accuracy.results(carry.accuracy)
     for fold, acc in zip(folds, carry.accumulators, strict=True):
         metrics |= fold.finish(acc)
     return Outcome(None, metrics, status, mode)
@@ -165,7 +175,7 @@ def scan_steps(scenario: Scenario, folds, dt, *, steps: int, record_every: int |
         carry, record = recorded(carry, index)
         return jax.lax.scan(unrecorded, carry, index + jnp.arange(1, record_every))[0], record
 
-    carry = start(scenario, folds, dt)
+    carry = start(scenario, folds, method, dt)
     if record_every is None:
         carry, _ = jax.lax.scan(unrecorded, carry, jnp.arange(steps))
         return finish(scenario, folds, method, dt, steps, carry)[2]

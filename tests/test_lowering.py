@@ -102,7 +102,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name):
     dt, index = jnp.asarray(DT), jnp.int32(3)
     varied = {"initial.q": jnp.asarray([[0.8, 0.8]]), "plant.mass[1]": jnp.asarray([0.9])}
     run = batch.batch_of(native.run, scenario, varied, STANDARD, dt)
-    carry = jax.tree.map(lambda x: x[0], run.start())
+    carry = jax.tree.map(lambda x: x[0], run.start("heun"))
     changed, _, dt = run.whole([x[0] for x in run.leaves.lane])
     p, _, _ = run.program(batch.step_function, jax.tree.map(lambda x: x[None], carry), "heun", False)
     expected = numbers(jax.tree.leaves(jax.jit(lambda c: time_loop.advance(changed, STANDARD, "heun", dt, c, index)[0])(carry)))
@@ -195,14 +195,14 @@ def test_classes_of_a_program():
     scenario = canonical(PRESET)
     varied = {"plant.mass[1]": jnp.asarray([0.9])}
     run = batch.batch_of(native.run, scenario, varied, STANDARD, jnp.asarray(DT))
-    p, shapes, _ = run.program(batch.step_function, run.start(), "rk4", False)
+    p, shapes, _ = run.program(batch.step_function, run.start("rk4"), "rk4", False)
     classes = p.classes()
     sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
     assert sines.count(program.LANE | program.TIME) <= 4 < sines.count(program.TIME), "signals of time belong to no run"
     assert len(p.carry) == shapes.size
-    packed = pack(jax.tree.leaves(run.start()), shapes, jnp.float64, 1)
+    packed = pack(jax.tree.leaves(run.start("rk4")), shapes, jnp.float64, 1)
     assert len(packed.floats) + len(packed.ints) == shapes.size
-    assert Shapes.of(jax.tree.leaves(run.start()), 1) == shapes
+    assert Shapes.of(jax.tree.leaves(run.start("rk4")), 1) == shapes
 
 
 @ij.component

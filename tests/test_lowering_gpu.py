@@ -44,7 +44,7 @@ def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), folds)
     varied = {path: jnp.asarray(x, dtype) for path, x in varied.items()}
     of = batch.batch_of(gpu.run, scenario, varied, folds, jnp.asarray(DT, dtype))
-    carry = of.start()
+    carry = of.start(method)
     program, shapes, _ = of.program(batch.step_function, carry, method, False)
     shared = jnp.concatenate([jnp.ravel(x) for x in of.leaves.shared])
     lane = pack(of.leaves.lane, batch.Shapes.of(of.leaves.lane, 1), dtype, of.runs).floats

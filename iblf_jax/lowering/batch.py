@@ -87,9 +87,14 @@ class Batch(NamedTuple):
         packed, samples = self.executor(program, jnp.concatenate([*shared, jnp.zeros((0,), self.dtype)]), lane, packed, steps, every)
         return jax.tree.unflatten(treedef, unpack(packed, shapes, self.runs)), samples
 
-    def start(self):
+    def start(self, method: str):
         """The carry before the first step."""
-        return jax.vmap(lambda lane: time_loop.start(*self.whole(lane)), axis_size=self.runs)(self.leaves.lane)
+
+        def one(lane):
+            scenario, folds, dt = self.whole(lane)
+            return time_loop.start(scenario, folds, method, dt)
+
+        return jax.vmap(one, axis_size=self.runs)(self.leaves.lane)
 
 
 def batch_of(executor: Executor, scenario, varied, folds, dt) -> Batch:
@@ -106,7 +111,7 @@ def run(executor: Executor, scenario, varied, folds, dt, *, steps: int, method: 
       ToolchainError: the native backend has no compiler.
     """
     batch = batch_of(executor, scenario, varied, folds, dt)
-    carry, samples = batch.advance(step_function, batch.start(), steps, record_every, method, record_every is not None)
+    carry, samples = batch.advance(step_function, batch.start(method), steps, record_every, method, record_every is not None)
     outcome, last = finish(batch, method, steps, carry)
     return outcome if record_every is None else outcome._replace(records=_records(samples, last, steps % record_every == 0))
 
@@ -117,7 +122,7 @@ def run_alone(executor: Executor, scenario, folds, dt, *, steps: int, method: st
     Start and end are the plain ones, quicker to compile than lowered.
     """
     batch = batch_of(executor, scenario, {"initial.q": scenario.initial.q[None]}, folds, dt)
-    carry = jax.tree.map(lambda x: x[None], time_loop.start(scenario, folds, dt))
+    carry = jax.tree.map(lambda x: x[None], time_loop.start(scenario, folds, method, dt))
     if longest and len(batch.program(step_function, carry, method, True)[0].nodes) > longest:
         raise UnsupportedError(f"its step has more than {longest} operations")
     carry, samples = batch.advance(step_function, carry, steps, record_every, method, True)
@@ -136,7 +141,7 @@ def finish(batch: Batch, method: str, steps: int, carry: Any):
 
     def observe(lane, carry):
         scenario, folds, dt = batch.whole(lane)
-        carry, sample = time_loop.observe_end(scenario, folds, dt, steps, carry)
+        carry, sample = time_loop.observe_end(scenario, folds, method, dt, steps, carry)
         return carry, time_loop.record_of(sample, carry.state)
 
     carry, last = jax.vmap(observe)(batch.leaves.lane, carry)

@@ -75,7 +75,7 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard() if metrics is None else tuple(metrics))
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
     one = batch.batch_of(native.run, scenario, leaves, folds, jnp.asarray(1e-3, dtype))
-    program, _, _ = one.program(batch.step_function, one.start(), method, False)
+    program, _, _ = one.program(batch.step_function, one.start(method), method, False)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}

@@ -8,7 +8,7 @@ once, because equal nodes of a scalar program are one node.  The Gauss-Newton pr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -184,7 +184,7 @@ def is_short(executor: Executor, scenario, varied, directions: Directions, folds
       UnsupportedError: the step does not lower.
     """
     batch = batch_of(executor, scenario, varied, folds, dt)
-    program, _, _ = batch.program(step_function, jax.eval_shape(batch.start), method, False)
+    program, _, _ = batch.program(step_function, jax.eval_shape(partial(batch.start, method)), method, False)
     return len(program.nodes) * (1 + directions.tangents) <= (LARGEST_IN_PIECES if executor is native.run else LARGEST)
 
 
@@ -196,7 +196,9 @@ def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, fo
 
     def begin(lane):
         scenario, folds, dt = batch.whole(lane)
-        _, tangents, carry = pushed(lambda s, *_: _floats_and_rest(time_loop.start(s, folds, dt)), directions, scenario, None, dt.dtype)
+        _, tangents, carry = pushed(
+            lambda s, *_: _floats_and_rest(time_loop.start(s, folds, method, dt)), directions, scenario, None, dt.dtype
+        )
         return Differentiated(carry, tangents, [jnp.zeros((len(rows),), dt.dtype)] * count)
 
     before = jax.vmap(begin, axis_size=batch.runs)(batch.leaves.lane)
@@ -206,7 +208,7 @@ def lowered_jvp(executor: Executor, scenario, varied, directions: Directions, fo
         scenario, folds, dt = batch.whole(lane)
 
         def metrics(scenario, carry, _):
-            carry, _ = time_loop.observe_end(scenario, folds, dt, steps, carry)
+            carry, _ = time_loop.observe_end(scenario, folds, method, dt, steps, carry)
             outcome = time_loop.verdict(folds, method, dt, carry, jnp.zeros((1,), dt.dtype))
             return _floats_of(outcome.metrics), carry
 

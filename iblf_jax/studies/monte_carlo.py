@@ -14,12 +14,14 @@ import jax
 import numpy as np
 
 from iblf_jax import checks, distributed
+from iblf_jax.accuracy import RELATIVE
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario
 from iblf_jax.studies.blocks import MEMORY, Results, block_size, run_blocks
 from iblf_jax.studies.designs import check_sampler
 from iblf_jax.studies.progress import bar
+from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.setup import prepare
 from iblf_jax.studies.study import Study
 
@@ -56,7 +58,7 @@ def monte_carlo(
         `robot.` paths change plant and model alike.
       runs: number of runs N.
       duration: length of a run [s], a whole number of steps.
-      dt: time step [s].
+      dt: time step [s]; `recommended_dt(scenario, perturbations=...)` says which will do.
       seed: whole number that fixes all draws.
       method: "rk4", "heun" or "euler".
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
@@ -92,6 +94,7 @@ def monte_carlo(
             results = _stored(results, part, block, runs)
             shown.update(min(block_size(), runs - block * block_size()))
     results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))
+    tell_of_step(results.status, results.fastest_mode, results.metrics[RELATIVE], float(dt), method)
     return Study.of(setup, results)
 
 

@@ -23,7 +23,7 @@ from scipy import stats
 
 from iblf_jax import checks
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import Fold
+from iblf_jax.metrics import Fold, metric_units
 from iblf_jax.results import Metrics
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED
@@ -33,7 +33,6 @@ from iblf_jax.studies.designs import check_seed, split
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.setup import Setup, prepare
-from iblf_jax.studies.study import metric_units
 
 if TYPE_CHECKING:
     import xarray

@@ -19,7 +19,7 @@ import numpy as np
 
 from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import Fold
+from iblf_jax.metrics import metric_units
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.rollout import trajectory
 from iblf_jax.scenario import Scenario
@@ -44,11 +44,6 @@ class Run:
     metrics: Metrics
     status: int
     samples: dict[str, Any]
-
-
-def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
-    """Name and unit of everything that some folds return."""
-    return tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items())
 
 
 @jax.tree_util.register_dataclass

@@ -17,8 +17,9 @@ import jax
 import numpy as np
 
 from iblf_jax import checks, distributed
+from iblf_jax.accuracy import RELATIVE
 from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import Fold
+from iblf_jax.metrics import Fold, metric_units
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.studies import config as configuration
 from iblf_jax.studies.blocks import MEMORY, Results, _execute, block_size, run_blocks
@@ -27,6 +28,7 @@ from iblf_jax.studies.designs import check_sampler, check_seed
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
 from iblf_jax.studies.progress import bar
+from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.setup import Setup, prepare
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
 
@@ -127,9 +129,10 @@ def sweep(
     setup = prepare(scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options)
     config = configuration.describe(setup, where, design, float(dt))
     how = _How(chunk, memory, devices, progress)
-    if store is None:
-        return _in_memory(setup, config, how)
-    return _into_store(setup, config, how, store, unit)
+    result = _in_memory(setup, config, how) if store is None else _into_store(setup, config, how, store, unit)
+    status, modes, errors = (np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE))
+    tell_of_step(status, modes, errors, float(dt), method)
+    return result
 
 
 def load_sweep(store: str | os.PathLike) -> xarray.Dataset:
@@ -161,7 +164,7 @@ def _flat(results: Results) -> dict[str, Any]:
 def _variables(setup: Setup, config: dict[str, Any]) -> dict[str, Variable]:
     """The arrays of a sweep."""
     shapes = _flat(jax.eval_shape(lambda *x: _execute(*x, program=setup.program), setup.shared, setup.lanes(np.arange(block_size()))))
-    units = {name: unit for fold in setup.shared.folds for name, unit in fold.units.items()}
+    units = dict(metric_units(setup.shared.folds))
     units |= {"status": "1", "fastest_mode": "1/s"} | {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
     shapes = {name: shapes[name] for name in {n: None for n in units if n in shapes} | shapes}
     return {

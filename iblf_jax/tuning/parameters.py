@@ -13,7 +13,7 @@ fastest mode of the closed loop grows with every gain, and past stability / dt t
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +24,7 @@ from iblf_jax import checks, paths
 from iblf_jax.integrators import tableau
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario
-from iblf_jax.stability import _jacobians
+from iblf_jax.step_size import fastest_along
 from iblf_jax.studies.draws import check_paths
 
 CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
@@ -155,8 +155,8 @@ def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: floa
         return np.full(value.shape, np.inf)
 
     def fits(factor: float) -> bool:
-        modes = _modes(scenario, {item.path: jnp.asarray(value * factor)})
-        return bool(np.all(np.isfinite(modes))) and dt * float(np.max(modes)) <= SHARE * tableau(method).stability
+        mode = fastest_along(with_parameters(scenario, {item.path: jnp.asarray(value * factor)}), np.linspace(0.0, 6.0, 7))
+        return dt * mode <= SHARE * tableau(method).stability
 
     if not fits(1.0):
         return 1.01 * value
@@ -167,12 +167,6 @@ def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: floa
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fits(float(np.exp(middle))) else (low, middle)
     return np.exp(low) * value
-
-
-def _modes(scenario: Scenario, values: Mapping[str, Any]) -> np.ndarray:
-    dtype = scenario.initial.q.dtype
-    times = jnp.linspace(0.0, 6.0, 7, dtype=dtype)
-    return np.abs(np.linalg.eigvals(np.asarray(_jacobians(with_parameters(scenario, values), times), float)))
 
 
 def _coordinate(x: np.ndarray, log: bool) -> np.ndarray:

@@ -1,0 +1,169 @@
+"""How accurate a run is: the error of its positions that the time step is to blame for, estimated along every run.
+
+A step's own error shows in the differences of the rates x' at the last instants; for rk4, whose third stage is half a step on,
+
+    l_k = dt (x'_{k-2} - 4 x'_{k-3/2} + 6 x'_{k-1} - 4 x'_{k-1/2} + x'_k) / 18,
+
+and likewise for the other methods (`integrators.Tableau.differences`).  The factor is ten times that of a smooth loop, so that a
+torque that jumps within a step is seen too.  Such errors add up and are forgotten,
+
+    L_k = (1 - dt r) L_{k-1} + l_k,   r = `stability.SLOWEST`,
+
+and an error y of the velocities and of the observer moves the positions by R y, R = [I 0] (r I - J)^-1, J the Jacobian of their rates
+at the start.  So the error of the positions is about
+
+    max_k max(|L_q|, |L_q + R L_y|).
+
+What the stages of a step cannot see, a reference or a disturbance that goes through whole periods between them, is looked for on its own
+(`between_stages`).  Against runs at a sixteenth of the step the estimate is 0.5 to 30 times the error where that matters, above 1e-4 of
+the tube, and larger below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.closed_loop import LoopState
+from iblf_jax.integrators import tableau
+from iblf_jax.linalg import matvec, solve, solve_spd
+from iblf_jax.robots import at_time
+from iblf_jax.scenario import Scenario
+from iblf_jax.stability import SLOWEST
+
+TOLERANCE = 0.005
+"""Estimated error of a position, relative to the width of its tube, above which a run is flagged INACCURATE."""
+INSTANTS = 16
+"""Steps, spread over a run, in which signals are looked at between the stages."""
+ONSET = 3.0
+"""How much further a torque moves the positions when it sets in than when an observer has learnt it."""
+GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 8 / 18), (0.5 + 0.15**0.5, 5 / 18))
+"""Places and weights of the quadrature that a step's own is held against."""
+ERROR, RELATIVE = "numerical_error", "relative_numerical_error"
+UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
+"""Name and unit of what every run says of its accuracy, beside its metrics."""
+
+
+class Accuracy(NamedTuple):
+    """The estimate as it goes from step to step.  m numbers: positions, velocities, state of the observer."""
+
+    rates: tuple[jax.Array, ...]
+    """The last rates, (m,) each, newest last."""
+    drift: jax.Array
+    """L, (m,)."""
+    response: jax.Array
+    """R, (n, m - n)."""
+    error: jax.Array
+    """Largest error so far, (n,) [rad]."""
+    relative: jax.Array
+    """The largest, relative to the width of its tube, () [1]."""
+
+
+def numbers(state: LoopState) -> jax.Array:
+    """Positions, velocities and the observer's state as one vector, (m,); what a law has learnt is left out."""
+    leaves = [x for x in jax.tree.leaves((state.q, state.dq, state.observer)) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.concatenate([jnp.ravel(x) for x in leaves])
+
+
+def with_numbers(state: LoopState, flat: jax.Array) -> LoopState:
+    """The state with these numbers."""
+    leaves, structure = jax.tree.flatten((state.q, state.dq, state.observer))
+    used, new = 0, []
+    for x in leaves:
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            x, used = flat[used : used + x.size].reshape(x.shape), used + x.size
+        new.append(x)
+    q, dq, observer = jax.tree.unflatten(structure, new)
+    return LoopState(q, dq, state.controller, observer)
+
+
+def begin(method: str, rate_at: Callable[[jax.Array], jax.Array], state: LoopState) -> Accuracy:
+    """The estimate before the first step.
+
+    Args:
+      method: the integrator.
+      rate_at: function of states (k, m) -> their rates (k, m), at the start.
+      state: the state at the start.
+    """
+    x, n = numbers(state), state.q.size
+    h = jnp.sqrt(jnp.finfo(x.dtype).eps) * jnp.maximum(1.0, jnp.abs(x[n:]))
+    moves = jnp.concatenate([jnp.zeros((x.size - n, n), x.dtype), jnp.diag(h)], axis=1)
+    rates = rate_at(jnp.concatenate([x[None], x + moves]))
+    jacobian = (rates[1:, n:] - rates[0, n:]) / h[:, None]  # a row for each number that moves: J transposed
+    response = solve(SLOWEST * jnp.eye(x.size - n, dtype=x.dtype) - jacobian, jnp.eye(x.size - n, n, dtype=x.dtype)).T
+    response = jnp.where(jnp.isfinite(response), response, 0.0)
+    history = (jnp.zeros_like(x),) * (len(tableau(method).differences) - 1)
+    return Accuracy(history, jnp.zeros_like(x), response, jnp.zeros_like(x[:n]), jnp.zeros_like(x[0]))
+
+
+def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array | int, slope: LoopState, width: jax.Array) -> Accuracy:
+    """The estimate after one more instant, at which the rate of the state and the width of the tube, (n,) [rad], are known."""
+    table, n = tableau(method), width.size
+    now, width = jax.lax.stop_gradient((numbers(slope), width))
+    rates = (*accuracy.rates, now)
+    complete = index >= (len(rates) - 1) // (2 if table.halfway else 1)
+    drift = (1.0 - SLOWEST * dt) * accuracy.drift
+    for weight, rate in zip(table.differences, rates, strict=True):
+        drift = drift + jnp.where(complete, weight * dt, 0.0) * rate
+    here = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[:n] + matvec(accuracy.response, drift[n:])))
+    relative = jnp.maximum(accuracy.relative, jnp.max(here / width))
+    return Accuracy(rates[1:], drift, accuracy.response, jnp.maximum(accuracy.error, here), relative)
+
+
+def passed(accuracy: Accuracy, method: str, slopes: list[LoopState]) -> Accuracy:
+    """The estimate after a step with these slopes of its stages."""
+    halfway = tableau(method).halfway
+    if not halfway:
+        return accuracy
+    return accuracy._replace(rates=(*accuracy.rates[1:], jax.lax.stop_gradient(numbers(slopes[halfway]))))
+
+
+def between_stages(scenario: Scenario, accuracy: Accuracy, method: str, dt: jax.Array, steps: int | jax.Array) -> Accuracy:
+    """The estimate, with what reference, bounds and disturbance do between the stages of a step.
+
+    In some steps the method's own quadrature of each signal is held against what the signal does: the rates of reference and bounds against
+    their change over the step, the disturbance's torque against Gauss's three points.  The worst is taken to last for 1/r.
+    """
+    table, n = tableau(method), scenario.n
+    scenario, dt = jax.lax.stop_gradient((scenario, dt))
+    own, exact = (np.asarray(weights, dt.dtype)[:, None] for weights in (table.b, [w for _, w in GAUSS]))
+    places = jnp.asarray([*table.c, *(place for place, _ in GAUSS), 1.0], dt.dtype)
+    stages = slice(len(table.c))
+
+    def at(index: jax.Array):
+        start = index.astype(dt.dtype) * dt
+        here = scenario.setting.tube(start)
+
+        def signals(t: jax.Array):
+            tube = scenario.setting.tube(t)
+            torque = scenario.disturbance.torque(t, here.q_d, here.dq_d, at_time(scenario.plant, t), scenario.model)
+            ends = jnp.concatenate([tube.q_d, tube.lower, tube.upper])
+            return ends, jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper]), torque
+
+        ends, rates, torques = jax.vmap(signals)(start + places * dt)
+        rate = jnp.sum(own * rates[stages], axis=0)
+        # The difference of two positions is rounded, the more so the later it is: that much is no error.
+        noise = 4.0 * jnp.finfo(dt.dtype).eps * (jnp.abs(ends[0]) + start * jnp.abs(rate)) / dt
+        missed = jnp.maximum(jnp.abs(rate - (ends[-1] - ends[0]) / dt) - noise, 0.0)
+        push = jnp.abs(jnp.sum(own * torques[stages], axis=0) - jnp.sum(exact * torques[len(table.c) : -1], axis=0))
+        return jnp.max(missed.reshape(3, n), axis=0), push, here.upper - here.lower
+
+    # Steps in the places of the golden section, so that they share no period with a signal.
+    spread = jnp.asarray(np.arange(INSTANTS) * 0.6180339887498949 % 1.0, dt.dtype)
+    indices = jnp.floor(spread * steps).astype(jnp.int32)
+    missed, push, width = jax.vmap(at)(indices)
+    M = at_time(scenario.plant, jnp.zeros_like(dt)).mass_matrix(scenario.initial.q)
+    pushed = jnp.abs(matvec(accuracy.response[:, :n], solve_spd(M, jnp.max(push, axis=0))))
+    error = (jnp.max(missed, axis=0) + ONSET * pushed) / SLOWEST
+    relative = jnp.max(error / jnp.min(width, axis=0))
+    return accuracy._replace(error=jnp.maximum(accuracy.error, error), relative=jnp.maximum(accuracy.relative, relative))
+
+
+def results(accuracy: Accuracy) -> dict[str, jax.Array]:
+    """What a run says of its accuracy: infinite where nothing can be said."""
+    found = {ERROR: accuracy.error, RELATIVE: accuracy.relative}
+    return {name: jnp.where(jnp.isnan(x), jnp.inf, x) for name, x in found.items()}

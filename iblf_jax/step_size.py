@@ -1,0 +1,194 @@
+"""Which time step will do: small enough for the modes of the loop and for the signals that drive it.
+
+The first guess is a step that follows the loop's fastest mode.  Then the run is made twice, side by side: in steps dt, and with each of
+them cut into three unequal ones, so that no signal goes through whole periods between the stages of both.  The step is made smaller
+until the two agree, and until the run's own estimate of its error (`accuracy`) is content too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax import accuracy, checks
+from iblf_jax.closed_loop import LoopState, evaluate, initial_state, rate
+from iblf_jax.integrators import stages, tableau
+from iblf_jax.one_function import as_one_function
+from iblf_jax.scenario import Initial, Scenario, canonical
+from iblf_jax.stability import SLOWEST, jacobian
+from iblf_jax.status import VELOCITY_LIMIT
+
+COMFORT = 1.5
+"""|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
+GOAL = accuracy.TOLERANCE / 5
+"""Difference of the two runs, relative to the tube, that a recommended step may leave."""
+LOOKS = 33
+"""Places along the reference at which modes are measured."""
+MOST_STEPS = 5_000_000
+"""Steps of the longest run that is tried."""
+CHUNK = 1000
+"""Steps between two looks at the pair."""
+CUTS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.236), (0.618, 0.382))
+"""Start and size, in steps, of what is integrated for each step: it, and its three parts."""
+
+
+class Pair(NamedTuple):
+    """Two runs side by side."""
+
+    step: jax.Array
+    coarse: jax.Array
+    fine: jax.Array
+    estimate: accuracy.Accuracy
+    difference: jax.Array
+    """Largest so far, relative to the tube."""
+    nearest: tuple[jax.Array, jax.Array, jax.Array]
+    """|xi|, time and state of the fine run where it was nearest to a bound."""
+    going: jax.Array
+    """Whether the fine run has not run away."""
+
+
+def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> Pair:
+    """A run in steps dt beside one in steps of about a third, until their end, or until they differ by more than a tube's width.
+
+    Args:
+      scenario: canonical.
+      dt: time step [s].
+      steps: how many; another number does not compile anew.
+      method: the integrator.
+    """
+    size, end = jnp.asarray(dt, scenario.initial.q.dtype), jnp.int32(steps)
+    pair = _start(scenario, size, end, method=method)
+    while int(pair.step) < steps and bool(pair.going) and float(pair.difference) <= 1.0:
+        pair = _advanced(scenario, size, end, pair, method=method)
+    return pair
+
+
+@partial(jax.jit, static_argnames="method")
+def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
+    start, zero = initial_state(scenario), jnp.zeros_like(dt)
+    x = ravel_pytree(start)[0]
+    rate_at = jax.vmap(lambda y: accuracy.numbers(rate(scenario, zero, accuracy.with_numbers(start, y))))
+    estimate = accuracy.between_stages(scenario, accuracy.begin(method, rate_at, start), method, dt, steps)
+    return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
+
+
+@partial(jax.jit, static_argnames="method")
+def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str) -> Pair:
+    """The pair up to CHUNK steps later: one machine function, as XLA's own loops take longer to go round than a small arm to compute."""
+    whole = ravel_pytree(initial_state(scenario))[1]
+    n, halfway = scenario.n, tableau(method).halfway
+
+    def chunk(scenario, dt, steps, pair):
+        weights, cuts = (jnp.asarray(table, dt.dtype) for table in (np.stack(stages(method), axis=1), CUTS))
+
+        def one(pair, _):
+            begin = pair.step.astype(dt.dtype) * dt
+
+            def part(both, cut):
+                coarse, fine = both
+                whole_step, t, h = cut[1] == 1.0, begin + cut[0] * dt, cut[1] * dt
+                x = jnp.where(whole_step, coarse, fine)
+
+                def stage(slope_and_sum, row):
+                    k, total = slope_and_sum
+                    slope, sample = evaluate(scenario, t + row[0] * h, whole(x + h * (row[1] * k)))
+                    k = ravel_pytree(slope)[0]
+                    return (k, total + row[2] * k), (k, sample.upper - sample.lower, sample.xi)
+
+                (_, total), seen = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
+                new = x + h * total
+                return (jnp.where(whole_step, new, coarse), jnp.where(whole_step, fine, new)), seen
+
+            (coarse, fine), (slopes, widths, xis) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
+            width = widths[0, 0]
+            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, whole(slopes[0, 0]), width)
+            estimate = accuracy.passed(estimate, method, [whole(slopes[0, i]) for i in range(halfway + 1)])
+            near = jnp.max(jnp.abs(xis[1, 0]))
+            nearest = jax.tree.map(partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest)
+            off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
+            going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
+            difference = jnp.where(going, jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf)), pair.difference)
+            after = Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
+            return jax.tree.map(partial(jnp.where, pair.going & (pair.step < steps)), after, pair), None
+
+        return jax.lax.scan(one, pair, None, CHUNK)[0]
+
+    return as_one_function(chunk)(scenario, dt, steps, pair)
+
+
+@jax.jit
+def _along_reference(scenario: Scenario, times: jax.Array) -> LoopState:
+    """States of a loop that follows its reference exactly, time axis first."""
+
+    def at(t):
+        tube = scenario.setting.tube(t)
+        return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
+
+    return jax.vmap(at)(times)
+
+
+def fastest_along(scenario: Scenario, times: np.ndarray) -> float:
+    """The fastest mode at the start and along the reference at some times [1/s]; infinite where the loop has no finite derivative."""
+    states = _along_reference(scenario, jnp.asarray(times, scenario.initial.q.dtype))
+    along = [(t, jax.tree.map(lambda x, i=i: x[i], states)) for i, t in enumerate(times)]
+    return max(_mode(scenario, t, state) for t, state in [(0.0, initial_state(scenario)), *along])
+
+
+def _mode(scenario: Scenario, t: float | jax.Array, state: LoopState) -> float:
+    """The fastest mode at one state [1/s]."""
+    found = np.asarray(jacobian(scenario, jnp.asarray(t, scenario.initial.q.dtype), state), float)
+    return float(np.max(np.abs(np.linalg.eigvals(found)))) if np.all(np.isfinite(found)) else np.inf
+
+
+def round_down(dt: float) -> float:
+    """1, 2 or 5 times a power of ten, not above dt [s]."""
+    decade = 10.0 ** math.floor(math.log10(dt))
+    factor = max((f for f in (1.0, 2.0, 5.0) if f * decade <= dt * (1 + 1e-12)), default=1.0)
+    return float(f"{factor * decade:.1g}")
+
+
+def comfortable_dt(mode: float) -> float:
+    """A round step (1, 2 or 5 times a power of ten) that follows a mode [1/s] comfortably, [s]."""
+    return round_down(COMFORT / max(mode, SLOWEST))
+
+
+def smaller(dt: float, excess: float, order: int) -> float:
+    """The round step to try after dt, whose error is `excess` times what it may be: one to ten times smaller."""
+    wanted = dt / max(min(excess, 1e9), 1.0) ** (1.0 / order)
+    return round_down(min(max(wanted, dt / 10.0), 0.7 * dt))
+
+
+def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
+    """`iblf_jax.recommended_dt` for one scenario: as it says there."""
+    order = tableau(method).order
+    scenario = canonical(scenario)
+    duration = checks.positive_number("duration", duration, "s")
+    mode = fastest_along(scenario, np.linspace(0.0, duration, LOOKS))
+    if not np.isfinite(mode):
+        raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
+    dt = for_modes = min(comfortable_dt(mode), round_down(duration))
+    whole = ravel_pytree(initial_state(scenario))[1]
+    while duration / dt <= MOST_STEPS:
+        pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
+        excess = max(float(pair.difference) / GOAL, float(pair.estimate.relative) / accuracy.TOLERANCE)
+        if not excess > 1.0:
+            limit = comfortable_dt(_mode(scenario, pair.nearest[1], whole(pair.nearest[2])))
+            if dt <= limit:
+                return dt
+            dt = for_modes = limit
+        else:
+            dt = smaller(dt, excess if np.isfinite(excess) else np.inf, order)
+    warnings.warn(
+        f"No step down to {duration / MOST_STEPS:.1g} s makes this run accurate: the loop may magnify every error, or a signal may be "
+        f"faster than that. {for_modes:g} s is what the loop's modes allow.",
+        stacklevel=3,
+    )
+    return for_modes
