@@ -474,6 +474,12 @@ WITH_REPAIR = {
         ),
         "joint 'ja': from one tied to another by tendon 'e' to one that moves by itself",
     ),
+    "motion capture": (
+        mjcf("", '<equality><weld name="w" body1="m" body2="a"/></equality>').replace(
+            "<worldbody>", '<worldbody><body name="m" mocap="true"/>'
+        ),
+        "equality 'w': from 'm' and 'a' tied together to no tie",
+    ),
     "mjcf inertia": (
         mjcf('<body name="b"><joint/><inertial pos="0 0 .1" euler="0 30 0" mass="1" diaginertia=".01 .01 .03"/></body>'),
         "body 'b': inertia: from principal moments 0.01, 0.01, 0.03 to principal moments 0.015, 0.015, 0.03",

@@ -65,7 +65,7 @@ class Links(NamedTuple):
         m, J = P[3, 3], _about_centre(P)
         J = np.zeros((3, 3)) if is_nothing(J, m) else J
         error = checks.fail(where, moments_of(J), "a positive definite inertia [kg m^2]", "A body that moves needs one.")
-        nearest = thickened(J, m * (COMPACT * self._length(i)) ** 2)
+        nearest = thickened(J, m * (COMPACT * self._longest()) ** 2)
         if not np.trace(nearest) > np.trace(J) * (1.0 + ROUNDING):  # all of the file is in one point, or heavier by far beyond
             raise error
         repairs.meet(Fault(where, moments_of(J), error, moments_of(nearest)))
@@ -73,12 +73,12 @@ class Links(NamedTuple):
         moments[i, :3, :3] += second_moments(nearest) - second_moments(J)
         return self._replace(moments=moments)
 
-    def _length(self, i: int) -> float:
-        """From the joint of link i to what is farthest on it; of the longest link, with the base, where all is in one point."""
-        far = [np.linalg.norm(self.moments[i, :3, 3]) / max(self.moments[i, 3, 3], 1e-300)]
-        far += [np.linalg.norm(p) for body, (p, _) in self.frames.items() if self.carrier[body] == i]
-        steps = np.linalg.norm(self.position, axis=1)
-        return float(max(*far, *steps[i + 1 : i + 2]) or steps.max())
+    def _longest(self) -> float:
+        """Xs link, for the longest link; from the base to the first joint where all is in one point."""
+        centres = self.moments[:, :3, 3] / np.maximum(self.moments[:, 3, 3], 1e-300)[:, None]
+        places = [p for body, (p, _) in self.frames.items() if self.carrier[body] >= 0]
+        longest = float(np.max(np.linalg.norm([*centres, *places, *self.position[1:]], axis=1)))
+        return longest if longest > FINEST else float(np.linalg.norm(self.position[0]))
 
     def _unresisting(self, joints: dict[str, Any]) -> int | None:
         """The link nearest to the tip that, at some configuration, does not resist its joint when those beyond are free; None if all do."""

@@ -43,10 +43,10 @@ def load(
 
         S = 1/2 tr(J) 1 - J = V diag(s) V^T,   S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
-    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the link's length, where a link that moves would resist its joint with
-    nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and refused else.  A
-    range that is none, and a torque below 0, become no limits; friction below 0 becomes 0; a spring is left out; a joint of the chain that
-    is tied to another (a mimic, a coupling) moves by itself.
+    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link, where a link that moves would resist its
+    joint with nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and
+    refused else.  A range that is none, and a torque below 0, become no limits; friction below 0 becomes 0; a spring is left out; a joint
+    of the chain that is tied to another (a mimic, a coupling) moves by itself.
 
     Args:
       path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.

@@ -23,7 +23,7 @@ KEPT = {
     "option": "gravity",
     "default": "class",
     "worldbody": "",
-    "body": f"name childclass {PLACE}",
+    "body": f"name childclass mocap {PLACE}",
     "frame": f"name childclass {PLACE}",
     "inertial": f"mass diaginertia fullinertia {PLACE}",
     "joint": "name class type pos axis range limited ref stiffness damping frictionloss armature actuatorfrcrange actuatorfrclimited",

@@ -9,8 +9,8 @@ body can have (the least change of S, and so of the pseudo-inertia, in the Frobe
 
     S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
-with f = 0; for a link that moves and would resist its joint with nothing, f = m (L / 100)^2, its mass and the distance L from its joint to
-the farthest frame on it: a compact body.
+with f = 0; for a link that moves and would resist its joint with nothing, f = m (L / 100)^2, m its mass and L the length of the longest
+link of the chain: a compact body.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROUNDING = 1e-6
 FINEST = 1e-6
 """[m]: no link is known to a finer length, so moments of mass FINEST^2 are none."""
 COMPACT = 0.01
-"""Radius of gyration of a mended link, by its length."""
+"""Radius of gyration, along each axis, of a link that had no inertia, by the length of the longest."""
 
 
 class Fault(NamedTuple):

@@ -261,10 +261,11 @@ class Tree:
             if m.eq_type[e] == COUPLED:
                 self._meet_coupling(where, {first, second} & set(joints), repairs)
             if m.eq_type[e] in (CONNECT, WELD):
-                self._check_tied(where, [int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x for x in (first, second)], links)
+                bodies = [int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x for x in (first, second)]
+                self._meet_tie(where, bodies, links, repairs)
         for where, (named, sites) in tendons.items():
             self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
-            self._check_tied(where, [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites], links)
+            self._meet_tie(where, [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites], links, repairs)
 
     def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
         for j in sorted(coupled):
@@ -273,10 +274,13 @@ class Tree:
             error = checks.fail(where, Shown(f"joint {name!r} tied to another"), "joints that move by themselves", mend)
             repairs.meet(Fault(f"joint {name!r}", f"one tied to another by {where}", error, "one that moves by itself"))
 
-    def _check_tied(self, where: str, bodies: list[int], links: Links) -> None:
+    def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
+        """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its links closes the chain."""
         if len({links.carrier.get(b, -1) for b in bodies}) > 1:
-            found = Shown(f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together")
-            raise checks.fail(where, found, "an open chain", "A closed chain has no serial one: cut it open, or lock its joints.")
+            tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
+            mend = "A closed chain has no serial one: cut it open, or lock its joints."
+            to = "no tie: a motion-capture body is no link" if any(self.model.body_mocapid[b] >= 0 for b in bodies) else ""
+            repairs.meet(Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", mend), to))
 
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
