@@ -162,6 +162,11 @@ def test_mjcf_with_classes_references_and_two_hinges_in_a_body(file):
     np.testing.assert_allclose(arm.coriolis(q, v, v) + arm.gravity(q), bias, rtol=1e-9, atol=1e-12)
 
 
+def test_mjcf_without_gravity(file):
+    off = '<option gravity="0 0 -1"><flag gravity="disable"/></option><worldbody>'
+    assert not np.any(ij.robots.load(file(mjcf("").replace("<worldbody>", off)), tip="a").g)
+
+
 def test_mjcf_that_includes_another_file(file):
     main = MJCF.format(finger="").replace("<worldbody>", '<include file="more.xml"/><worldbody>')
     file("<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>", "more.xml")
@@ -465,6 +470,10 @@ WITH_REPAIR = {
     "no range": (arm_with(ja='<limit lower="0" upper="0"/>'), r"joint 'ja': limit: from \(0.0, 0.0\) to no limits"),
     "no <limit>": (arm_with(ja=""), "joint 'ja': limit: from nothing to no limits"),
     "negative torque": (arm_with(ja=LIMIT.replace("7", "-1")), "joint 'ja': effort: from -1.0 to no limit"),
+    "mimic of nothing": (
+        arm_with(ja=LIMIT + '<mimic joint="x"/>'),
+        "joint 'ja': from a mimic of 'x' in the chain to one that moves by itself",
+    ),
     "mimic": (arm_with(ja=LIMIT + '<mimic joint="jb"/>'), "joint 'ja': from a mimic of 'jb' in the chain to one that moves by itself"),
     "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness: from 3.0 to 0"),
     "coupled": (BAD_MJCF["coupled"][0], "joint 'ja': from one tied to another by equality 'c' to one that moves by itself"),

@@ -118,13 +118,6 @@ class _Chain(NamedTuple):
         """The chain with the mimics that are not in it locked where their joints take them, and what is wrong with its joints met."""
         tree, held = self.tree, dict(self.held)
         moving = {tree.joint_names[j] for j in self.joints}
-        for name, mimic in file.mimics.items():
-            if name in moving or mimic.master in moving:
-                coupled = name if name in moving else mimic.master
-                mend = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
-                got = f"a mimic of {mimic.master!r} in the chain"
-                error = checks.fail(f"joint {name!r}", Shown(got), "joints that move by themselves", mend)
-                repairs.meet(Fault(f"joint {name!r}", got, error, "one that moves by itself" if name in moving else "one that is locked"))
         for name in file.mimics:
             if name not in moving and tree.joint(name) not in held:
                 held[tree.joint(name)] = self._mimicked(name, file.mimics)
@@ -132,6 +125,14 @@ class _Chain(NamedTuple):
             for fault in (file.axes.get(tree.joint_names[j]), *(file.motions[tree.joint_names[j]] if j in self.joints else ())):
                 if fault:
                     repairs.meet(fault)
+        for name, mimic in file.mimics.items():
+            if name in moving or mimic.master in moving:
+                coupled = name if name in moving else mimic.master
+                mend = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
+                error = checks.fail(f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", mend)
+                repairs.meet(
+                    Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself" if name in moving else "one that is locked")
+                )
         way = tree.way(0, self.tip) or []
         for b in range(1, tree.model.nbody):
             carried = any(j in self.joints for c in tree.way(0, b) or () for j in tree.joints_of(c))

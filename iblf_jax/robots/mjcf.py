@@ -21,6 +21,7 @@ ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited 
 KEPT = {
     "compiler": "angle autolimits eulerseq inertiafromgeom inertiagrouprange boundmass boundinertia balanceinertia settotalmass alignfree",
     "option": "gravity",
+    "flag": "gravity",
     "default": "class",
     "worldbody": "",
     "body": f"name childclass mocap {PLACE}",
@@ -70,6 +71,7 @@ SINGLE = ("mass", "density", "ref", "stiffness", "damping", "frictionloss", "arm
 """Attributes that hold one number."""
 WIDE = ("damping", "frictionloss", "range", "ctrlrange", "forcerange", "actuatorfrcrange")
 """Attributes that may stand for "none" or "locked" by their size."""
+SWITCHES = ("true", "false", "auto", "enable", "disable")
 LEAST = 1e-15
 """Mass [kg] and moments [kg m^2] below which the library refuses a body that moves."""
 
@@ -113,7 +115,7 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
         kept = COUPLING if (section, tag) == ("equality", "joint") else KEPT[tag]
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
-            if name not in WORDS and text not in ("true", "false", "auto"):
+            if name not in WORDS and text not in SWITCHES:
                 most = {"most": FARTHEST} if name in WIDE else {}
                 floats(f"{label(element)}: {name}", text, 1 if name in SINGLE else None, **most)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)

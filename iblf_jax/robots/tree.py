@@ -50,7 +50,8 @@ class Tree:
         self.sites = names(objects.mjOBJ_SITE, model.nsite)
         self.equalities = names(objects.mjOBJ_EQUALITY, model.neq)
         self.site_type = objects.mjOBJ_SITE
-        self.gravity = np.array(model.opt.gravity)
+        weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        self.gravity = np.zeros(3) if weightless else np.array(model.opt.gravity)
 
     @staticmethod
     def compiled(text: str, path: str, root: str, taken_out: Callable[[Any], list[tuple[Any, Weight]]]) -> Tree:

@@ -27,6 +27,11 @@ class Mimic(NamedTuple):
     multiplier: float
     offset: float
 
+    @property
+    def shown(self) -> str:
+        """How it is called in messages."""
+        return f"a mimic of {self.master!r} in the chain"
+
 
 class Urdf(NamedTuple):
     """What a URDF holds, checked."""
@@ -75,11 +80,10 @@ def checked(robot: ET.Element) -> Urdf:
         ET.SubElement(inertial, "inertia", dict(zip(INERTIA, "111000", strict=True)))
     for joint in joints.values():
         copy.append(_joint(joint, found))
-    for name, mimic in tuple(found.mimics.items()):
+    for name, mimic in found.mimics.items():
         if mimic.master not in joints:
             error = checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
-            found.motions[name].append(Fault(f"joint {name!r}", f"a mimic of {mimic.master!r}", error, "one that moves by itself"))
-            del found.mimics[name]
+            found.motions[name].append(Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself"))
     return found._replace(text=ET.tostring(copy, encoding="unicode"))
 
 
