@@ -573,13 +573,15 @@ def test_mjcf_what_is_not_on_the_chain_refuses_no_file(file, recwarn):
     beside += '<body name="z"><joint name="jz"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/><geom type="mesh" mesh="m"/></body>'
     outside = '<tendon><fixed name="t"><joint joint="jx" coef="1"/><joint joint="jz" coef="1"/></fixed></tendon>'
     outside += '<equality><tendon tendon1="t"/></equality><actuator><motor tendon="t"/><motor joint="ja" ctrlrange="-2 2"/></actuator>'
-    outside += '<default><default class="seen"><geom type="mesh" density="0"/></default></default>'
-    seen = '<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen" mesh="m"/><geom size="0.2" pos="0 0 1"/></body>'
-    arm = ij.robots.load(file(mjcf(seen, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="b")
-    plain = ij.robots.load(file(mjcf(seen.replace('<geom class="seen" mesh="m"/>', ""))), tip="b")
+    outside += '<default><default class="seen"><geom type="mesh" density="0"/></default>'
+    outside += '<default class="drawn"><geom type="capsule" fromto="0 0 0 0 0 1" size="0.1" mass="0"/></default></default>'
+    seen = '<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen" mesh="m"/><geom size="0.2" pos="0 0 1"/>{}</body>'
+    drawn = seen.format('<geom class="drawn"/>')
+    arm = ij.robots.load(file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="b")
+    plain = ij.robots.load(file(mjcf(seen.format("").replace('<geom class="seen" mesh="m"/>', ""))), tip="b")
     assert not recwarn.list
     np.testing.assert_array_equal(arm.mass, plain.mass)
     np.testing.assert_array_equal(arm.inertia, plain.inertia)
     np.testing.assert_allclose(arm.effort, [2.0, np.inf])
     with pytest.raises(ValueError, match=r"body 'x'.*mesh"):
-        ij.robots.load(file(mjcf(seen, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="x", repair=True)
+        ij.robots.load(file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="x", repair=True)

@@ -110,7 +110,7 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
         if tag in REFUSED:
             raise checks.fail(f"<{tag}>", Shown("an element that makes bodies"), "bodies written out", REFUSED[tag])
         drives_no_joint = section == "actuator" and element.get("joint") is None
-        if tag not in KEPT or drives_no_joint or (tag == "geom" and element.get("mass", "").strip() == "0"):
+        if tag not in KEPT or drives_no_joint:
             continue
         kept = COUPLING if (section, tag) == ("equality", "joint") else KEPT[tag]
         attributes = {name: text for name, text in element.items() if name in kept.split()}
