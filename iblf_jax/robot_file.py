@@ -6,6 +6,7 @@
     tip = "tool0"
     locked = { gripper_joint = 0.02 }
     gravity = [0.0, 0.0, -9.81]
+    repair = true                   # mend what can be mended, as `iblf_jax.robots.load` says
 
     [reference]                     # and whatever else is to differ from
     ...                             # `iblf_jax.presets.arm_scenario`: bounds, controller, observer, initial
@@ -28,7 +29,7 @@ from iblf_jax.plain import Words, as_table, known_keys, numbers
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot, load
 
-KEYS = ("file", "base", "tip", "locked", "gravity")
+KEYS = ("file", "base", "tip", "locked", "gravity", "repair")
 ROBOTS = ("robot", "plant", "model")
 
 
@@ -76,7 +77,9 @@ def _robot(table: Any, name: str, folder: str | os.PathLike) -> Robot:
     for key in ("file", "base", "tip"):
         if key in table and not isinstance(table[key], str):
             raise checks.fail(f"{name}.{key}", table[key], "a string")
-    options: dict[str, Any] = {key: table[key] for key in ("base", "tip") if key in table}
+    if not isinstance(table.get("repair", False), bool):
+        raise checks.fail(f"{name}.repair", table["repair"], "true or false")
+    options: dict[str, Any] = {key: table[key] for key in ("base", "tip", "repair") if key in table}
     if "locked" in table:
         locked = as_table(table["locked"], f"{name}.locked")
         options["locked"] = {joint: numbers(at, f"{name}.locked.{joint}", "rad") for joint, at in locked.items()}

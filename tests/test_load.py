@@ -10,6 +10,7 @@ import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from arm_cases import ARMS, as_mjcf, dynamics_of, random_arm, without_constraints
@@ -159,6 +160,11 @@ def test_mjcf_with_classes_references_and_two_hinges_in_a_body(file):
     M, bias = dynamics_of(model, q, v)
     np.testing.assert_allclose(arm.mass_matrix(q), M, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(arm.coriolis(q, v, v) + arm.gravity(q), bias, rtol=1e-9, atol=1e-12)
+
+
+def test_mjcf_without_gravity(file):
+    off = '<option gravity="0 0 -1"><flag gravity="disable"/></option><worldbody>'
+    assert not np.any(ij.robots.load(file(mjcf("").replace("<worldbody>", off)), tip="a").g)
 
 
 def test_mjcf_that_includes_another_file(file):
@@ -388,7 +394,194 @@ def test_mutated_files_load_or_are_refused(tmp_path_factory, data):
 
 def test_nothing_is_written_and_limits_are_stated(file, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="mjMINVAL"):
-        ij.robots.load(file(mjcf('<body name="b"><joint/></body>')))
+    with pytest.raises(ValueError, match="repeated name"):  # in MuJoCo's words
+        ij.robots.load(file(BAD_MJCF["repeated"][0]))
     assert {p.name for p in tmp_path.iterdir()} == {"arm.urdf"}
     assert description.LARGEST < 1 << 30
+
+
+# ---------------------------------------------------------------------------------------------------------------------- repair
+
+
+def weighing(inertia: str, mass: str = "1.5", place: str = "0 0 0.1", also: str = "0 0 0") -> str:
+    xy, xz, yz = also.split()
+    xx, yy, zz = inertia.split()
+    return (
+        f'<inertial><origin xyz="{place}" rpy="0.3 0.2 0.1"/><mass value="{mass}"/>'
+        f'<inertia ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="{xy}" ixz="{xz}" iyz="{yz}"/></inertial>'
+    )
+
+
+def arm_with(*more: str, a: str = SOLID, ja: str = LIMIT) -> str:
+    """A chain base - a - b, and what is to hang on it."""
+    return robot(link("base", ""), link("a", a), link("b"), joint("ja", "base", "a", inside=ja), joint("jb", "a", "b"), *more)
+
+
+NO_INERTIA, NEGATIVE, IMPOSSIBLE = weighing("0 0 0"), weighing("0.02 -0.03 0.01"), weighing("0.02 0.09 0.01")
+
+NO_MATTER = {
+    "inertia of what the base carries": arm_with(link("x", IMPOSSIBLE), joint("jx", "base", "x", "fixed", "")),
+    "inertia on another branch": arm_with(link("x", NEGATIVE), joint("jx", "base", "x")),
+    "numbers on another branch": arm_with(link("x", SOLID.replace("0.02", "nan")), joint("jx", "base", "x").replace("0.3 0 0", "$(x)")),
+    "no range on another branch": arm_with(link("x"), joint("jx", "base", "x", inside='<limit lower="0" upper="0" effort="-1"/>')),
+    "a free body on another branch": arm_with(link("x"), joint("jx", "base", "x", "floating", "")),
+    "no range of a finger": arm_with(link("x", weighing("0 0 0", "0")), joint("jx", "b", "x", "prismatic", "")),
+    "a point welded on": arm_with(link("x", NO_INERTIA.replace("1.5", "0.2")), joint("jx", "b", "x", "fixed", "")),
+    "a moment of rounding": arm_with(link("x", weighing("-2e-35 0.01 0.01")), joint("jx", "b", "x", "fixed", "")),
+    "a rod that moves": arm_with(a=weighing("-2e-35 0.01 0.01")),
+    "a speck": arm_with(link("x", weighing("1e-22 1e-22 1e-22", "1e-18")), joint("jx", "b", "x", "fixed", "")),
+    "an endless wheel": arm_with(ja='<limit lower="-1e16" upper="1e16" effort="7"/>'),
+}
+
+
+@pytest.mark.parametrize("name", NO_MATTER)
+def test_what_does_not_matter_refuses_no_file(name, file, recwarn):
+    plain = ij.robots.load(file(arm_with()), tip="b")
+    arm = ij.robots.load(file(NO_MATTER[name]), tip="b")
+    assert not recwarn.list
+    assert arm.repaired == ()
+    if "point" not in name and "moment" not in name and "rod" not in name:  # these have a weight, and it counts
+        np.testing.assert_allclose(arm.mass, plain.mass, rtol=1e-15)
+        np.testing.assert_allclose(arm.inertia, plain.inertia, rtol=0, atol=1e-17)
+
+
+def test_a_point_that_is_welded_on_counts(file):
+    arm = ij.robots.load(file(NO_MATTER["a point welded on"]), tip="b")
+    c, s = np.cos(0.3), np.sin(0.3)  # in the frame of b: the joint's place, then the point's in the frame of x
+    point, own = np.array([0, -0.1 * s, 0.2 + 0.1 * c]), np.array([0, 0, 0.1])
+    centre = (0.2 * point + 1.5 * own) / 1.7
+    d, e = point - centre, own - centre
+    J = np.diag([0.02, 0.03, 0.01]) + sum(m * (x @ x * np.eye(3) - np.outer(x, x)) for m, x in ((0.2, d), (1.5, e)))
+    np.testing.assert_allclose(arm.mass[1], 1.7, rtol=1e-15)
+    np.testing.assert_allclose(arm.centre[1], centre, atol=1e-15)
+    np.testing.assert_allclose(arm.inertia[1], [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]], rtol=1e-12, atol=1e-15)
+
+
+WITH_REPAIR = {
+    "impossible inertia": (arm_with(a=IMPOSSIBLE), r"link 'a': inertia: from principal moments 0.01, 0.02, 0.09 to"),
+    "negative inertia": (arm_with(a=NEGATIVE), "link 'a': inertia: from principal moments -0.03, 0.01, 0.02 to"),
+    "no inertia": (arm_with(a=NO_INERTIA), "link 'a': inertia: from principal moments 0, 0, 0 to"),
+    "no <inertia>": (
+        arm_with(link("x", MASS_ONLY), joint("jx", "b", "x", "fixed", "")),
+        "link 'x': inertia: from nothing to that of a point",
+    ),
+    "inertia without mass": (arm_with(link("x", WEIGHTLESS), joint("jx", "b", "x", "fixed", "")), "link 'x'.*without a mass to"),
+    "no mass between": (arm_with(a="").replace('"0 1 0"', '"1 0 0"', 1), "link 'a': from no mass to no mass, as it is"),
+    "no range": (arm_with(ja='<limit lower="0" upper="0"/>'), r"joint 'ja': limit: from \(0.0, 0.0\) to no limits"),
+    "no <limit>": (arm_with(ja=""), "joint 'ja': limit: from nothing to no limits"),
+    "negative torque": (arm_with(ja=LIMIT.replace("7", "-1")), "joint 'ja': effort: from -1.0 to no limit"),
+    "mimic of nothing": (
+        arm_with(ja=LIMIT + '<mimic joint="x"/>'),
+        "joint 'ja': from a mimic of 'x' in the chain to one that moves by itself",
+    ),
+    "mimic": (arm_with(ja=LIMIT + '<mimic joint="jb"/>'), "joint 'ja': from a mimic of 'jb' in the chain to one that moves by itself"),
+    "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness: from 3.0 to 0"),
+    "coupled": (BAD_MJCF["coupled"][0], "joint 'ja': from one tied to another by equality 'c' to one that moves by itself"),
+    "tendon": (
+        mjcf(
+            "", '<tendon><fixed name="t"><joint joint="ja" coef="1"/></fixed></tendon><equality><tendon name="e" tendon1="t"/></equality>'
+        ),
+        "joint 'ja': from one tied to another by tendon 'e' to one that moves by itself",
+    ),
+    "motion capture": (
+        mjcf("", '<equality><weld name="w" body1="m" body2="a"/></equality>').replace(
+            "<worldbody>", '<worldbody><body name="m" mocap="true"/>'
+        ),
+        "equality 'w': from 'm' and 'a' tied together to no tie",
+    ),
+    "mjcf inertia": (
+        mjcf('<body name="b"><joint/><inertial pos="0 0 .1" euler="0 30 0" mass="1" diaginertia=".01 .01 .03"/></body>'),
+        "body 'b': inertia: from principal moments 0.01, 0.01, 0.03 to principal moments 0.015, 0.015, 0.03",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WITH_REPAIR)
+def test_repair_mends_and_lists(name, file):
+    text, line = WITH_REPAIR[name]
+    with pytest.raises(ValueError, match="Or load it with repair=True, which makes of it: "):
+        ij.robots.load(file(text))
+    with pytest.warns(UserWarning, match=f"repaired: .*{line}"):
+        arm = ij.robots.load(file(text), repair=True)
+    assert any(re.match(line, one) for one in arm.repaired)
+    M = np.asarray(arm.mass_matrix(np.full(arm.n, 0.3)))
+    assert np.linalg.eigvalsh(M)[0] > 0
+    assert jax.tree.structure(jax.tree.map(lambda x: x, arm)) == jax.tree.structure(arm)
+
+
+@pytest.mark.parametrize("inertia", ["0.02 0.09 0.01", "0.02 -0.03 0.01", "-1 -2 -3"])
+@pytest.mark.parametrize("also", ["0 0 0", "0.01 -0.02 0.03"])
+def test_the_change_is_the_smallest(inertia, also, file):
+    """No positive matrix is nearer to the second moments of the file, and mass and centre stay."""
+    solid = weighing(inertia, also=also)
+    with pytest.warns(UserWarning, match="repaired"):
+        arm = ij.robots.load(file(arm_with(link("x", solid), joint("jx", "b", "x", "fixed", ""))), tip="b", repair=True)
+    assert len(arm.repaired) == 1
+    plain = ij.robots.load(file(arm_with()), tip="b")
+    numbers = ("mass", "centre", "inertia")
+    gained = sum(
+        sign * np.asarray(ij.robots.spatial.pseudo_inertia(*(getattr(x, name)[1] for name in numbers)))
+        for sign, x in ((1, arm), (-1, plain))
+    )
+    turned, place = np.eye(4), np.eye(4)
+    turned[:3, :3] = rpy(0.3, 0.2, 0.1)
+    turned[:3, 3], place[:3, :3], place[:3, 3] = [0, 0, 0.1], rpy(0.3, 0, 0), [0, 0, 0.2]
+    back = np.linalg.inv(place @ turned)
+    P = back @ gained @ back.T
+    np.testing.assert_allclose(P[3], [0, 0, 0, 1.5], atol=1e-14)
+    (xx, yy, zz), (xy, xz, yz) = (map(float, x.split()) for x in (inertia, also))
+    J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    S, mended = 0.5 * np.trace(J) * np.eye(3) - J, P[:3, :3]
+    # the nearest point X of a convex cone to S: X in it, X - S in its dual (here the same cone), and the two orthogonal
+    assert np.linalg.eigvalsh(mended)[0] > -1e-14
+    assert np.linalg.eigvalsh(mended - S)[0] > -1e-14
+    assert abs(np.sum(mended * (mended - S))) < 1e-14
+
+
+def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    def about(i: int, angle: float) -> np.ndarray:
+        K = np.cross(np.eye(3)[i], np.eye(3)).T
+        return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+    return about(2, yaw) @ about(1, pitch) @ about(0, roll)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        arm_with(a=SOLID.replace("1.5", "-1.5")),
+        arm_with(ja='<limit lower="nan" upper="0"/>'),
+        robot(link("base", ""), link("a"), link("b", ""), *CHAIN),
+        robot(link("base", ""), link("a", weighing("0 0 0", place="0 0 0")), joint("ja", "base", "a").replace("0 0 0.2", "0 0 0")),
+        arm_with(a="").replace("0.3 0 0", "0 0 0").replace("0 0 0.2", "0 0 0"),
+        BAD_MJCF["connect"][0],
+        BAD_MJCF["mesh"][0],
+        BAD_MJCF["ball"][0],
+    ],
+)
+def test_what_no_rule_mends_is_refused(text, file):
+    for repair in (False, True):
+        with pytest.raises(ValueError, match="expected") as error:
+            ij.robots.load(file(text), repair=repair)
+        assert "repair=True" not in str(error.value)
+
+
+def test_mjcf_what_is_not_on_the_chain_refuses_no_file(file, recwarn):
+    """Weights of meshes, springs, actuators without a joint, ties of tendons, bodies without weight: all beside the chain."""
+    beside = '<body name="x"><joint name="jx" stiffness="3" damping="1e11"/><geom type="mesh" mesh="m"/></body>'
+    beside += '<body name="y"><joint name="jy" type="ball"/><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'
+    beside += '<body name="z"><joint name="jz"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/><geom type="mesh" mesh="m"/></body>'
+    outside = '<tendon><fixed name="t"><joint joint="jx" coef="1"/><joint joint="jz" coef="1"/></fixed></tendon>'
+    outside += '<equality><tendon tendon1="t"/></equality><actuator><motor tendon="t"/><motor joint="ja" ctrlrange="-2 2"/></actuator>'
+    outside += '<default><default class="seen"><geom type="mesh" density="0"/></default>'
+    outside += '<default class="drawn"><geom type="capsule" fromto="0 0 0 0 0 1" size="0.1" mass="0"/></default></default>'
+    seen = '<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen" mesh="m"/><geom size="0.2" pos="0 0 1"/>{}</body>'
+    drawn = seen.format('<geom class="drawn"/>')
+    arm = ij.robots.load(file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="b")
+    plain = ij.robots.load(file(mjcf(seen.format("").replace('<geom class="seen" mesh="m"/>', ""))), tip="b")
+    assert not recwarn.list
+    np.testing.assert_array_equal(arm.mass, plain.mass)
+    np.testing.assert_array_equal(arm.inertia, plain.inertia)
+    np.testing.assert_allclose(arm.effort, [2.0, np.inf])
+    with pytest.raises(ValueError, match=r"body 'x'.*mesh"):
+        ij.robots.load(file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="x", repair=True)

@@ -135,3 +135,19 @@ def test_without_the_extra_it_says_so(folder, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     with pytest.raises(ValueError, match=r"robot\.file: .*iblf_jax\[robots\]"):
         scenario_file.load_scenario(written(folder, ROBOT + REFERENCE))
+
+
+def test_repair(folder):
+    text = (folder / "ur5.urdf").read_text()
+    (folder / "ur5.urdf").write_text(text.replace('ixx="0.049443313556"', 'ixx="9"'))
+    with pytest.raises(ValueError, match="repair=True"):
+        ij.load_scenario(written(folder, ROBOT + REFERENCE))
+    with pytest.warns(UserWarning, match="repaired: link 'forearm_link': inertia"):
+        scenario = ij.load_scenario(written(folder, ROBOT + "repair = true\n" + REFERENCE))
+    assert len(scenario.plant.repaired) == 1
+    ij.save_scenario(scenario, folder / "saved.toml")
+    again = ij.load_scenario(folder / "saved.toml")
+    assert again.plant.repaired == scenario.plant.repaired
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    with pytest.raises(ValueError, match=r"robot\.repair: got 1, expected true or false"):
+        ij.load_scenario(written(folder, ROBOT + "repair = 1\n" + REFERENCE))

@@ -109,6 +109,8 @@ class Arm:
     """Names of the links, from the first that moves; link1 ... if not given."""
     joints: tuple[str, ...] = static(default=())
     """Names of the joints; joint1 ... if not given."""
+    repaired: tuple[str, ...] = static(default=())
+    """What `load(..., repair=True)` changed, a line a link or joint."""
 
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),

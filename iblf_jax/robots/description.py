@@ -29,6 +29,8 @@ MOST_BODIES = 1000
 """Links or bodies."""
 LARGEST_NUMBER = 1e10
 """No length, mass or inertia of a robot in SI units is beyond."""
+FARTHEST = 1e20
+"""A range or a friction may be, where it stands for "none" or "locked"."""
 
 
 class Shown(str):
@@ -146,16 +148,16 @@ def label(element: ET.Element) -> str:
     return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag[:40]}>"
 
 
-def floats(where: str, text: str, count: int | None = None, *, least: int = 1) -> list[float]:
-    """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as expected, finite and not absurd."""
+def floats(where: str, text: str, count: int | None = None, *, most: float = LARGEST_NUMBER) -> list[float]:
+    """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as expected, finite and below `most`."""
     words = text.split()
     expected = f"{count} numbers" if count and count > 1 else "one number" if count else "numbers"
-    if (count is not None and len(words) != count) or not least <= len(words) <= 100:
+    if (count is not None and len(words) != count) or not 1 <= len(words) <= 100:
         raise checks.fail(where, text, expected)
     try:
         values = [float(word) for word in words]
     except ValueError:
         raise checks.fail(where, text, expected) from None
-    if not all(math.isfinite(x) and abs(x) < LARGEST_NUMBER for x in values):
+    if not all(math.isfinite(x) and abs(x) < most for x in values):
         raise checks.fail(where, text, f"{expected}, finite and in SI units")
     return values

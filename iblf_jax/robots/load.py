@@ -8,6 +8,7 @@ link of the chain that carries it.  The arm's world is the frame of the base.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -17,6 +18,8 @@ from iblf_jax import checks
 from iblf_jax.robots import description, mjcf, urdf
 from iblf_jax.robots.arm import Arm
 from iblf_jax.robots.description import Shown
+from iblf_jax.robots.links import quaternion
+from iblf_jax.robots.repair import Fault, Repairs
 from iblf_jax.robots.tree import Tree
 
 
@@ -27,11 +30,23 @@ def load(
     *,
     locked: Mapping[str, float] | None = None,
     gravity: Any = None,
+    repair: bool = False,
 ) -> Arm:
     """The serial arm of a URDF or MJCF file.
 
     Fixed joints are fused; joints that are not between base and tip are locked, and their links' masses and inertias stay, with the link
-    that carries them.  Meshes are neither needed nor opened.
+    that carries them.  Meshes are neither needed nor opened.  What is wrong with links that the chain does not carry, and with joints that
+    do not move in it, does not matter; nor do moments of inertia that are off by rounding, 1e-6 of them or m (1 um)^2.
+
+    With `repair` the rest is mended where a rule says how, with the least change, and listed: with J = V diag(...) V^T an inertia about
+    the centre of mass m,
+
+        S = 1/2 tr(J) 1 - J = V diag(s) V^T,   S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
+
+    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link, where a link that moves would resist its
+    joint with nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and
+    refused else.  A range that is none, and a torque below 0, become no limits; friction below 0 becomes 0; a spring is left out; a joint
+    of the chain that is tied to another (a mimic, a coupling) moves by itself.
 
     Args:
       path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.
@@ -40,6 +55,7 @@ def load(
       locked: joint name -> position [rad or m] for joints that are not to move; a joint between base and tip may be among them.  Others
         that are left out are locked at 0 (an MJCF's at `ref`).
       gravity: (3,) [m/s^2] in the file's world; the file's own, (0, 0, -9.81) if it has none.
+      repair: whether to mend what can be mended; a warning and the arm's `repaired` then say what changed, a line a link or joint.
 
     Returns:
       An Arm, with the names of links and joints, limits, damping, friction, armature and efforts of the file; its `limits` and `effort`
@@ -51,15 +67,21 @@ def load(
 
     Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
     """
-    root = description.read(path)
-    mimics: dict[str, urdf.Mimic] = {}
+    if not isinstance(repair, bool | np.bool_):
+        raise checks.fail("repair", repair, "True or False")
+    root, repairs = description.read(path), Repairs(bool(repair))
     if root.tag == "robot":
-        description_ = urdf.checked(root)
-        tree = Tree.compiled(description_.text, str(path), root=description_.root)
-        mimics = description_.mimics
+        file = urdf.checked(root)
+        tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
+        chain = _Chain.picked(tree, base, tip, dict(locked or {}), repairs).following(file, repairs)
+        arm = chain.arm(gravity, {}, repairs)
     else:
-        tree = Tree.compiled(mjcf.checked(root), str(path), root="world")
-    return _Chain.picked(tree, base, tip, dict(locked or {}), mimics).arm(gravity)
+        model = mjcf.checked(root)
+        tree = Tree.compiled(model.text, str(path), "world", mjcf.taken_out)
+        arm = _Chain.picked(tree, base, tip, dict(locked or {}), repairs).arm(gravity, model.tendons, repairs)
+    if arm.repaired:
+        warnings.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".", stacklevel=2)
+    return arm
 
 
 class _Chain(NamedTuple):
@@ -76,7 +98,7 @@ class _Chain(NamedTuple):
     """Joints that do not, and where they are."""
 
     @staticmethod
-    def picked(tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], mimics: dict[str, urdf.Mimic]) -> _Chain:
+    def picked(tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], repairs: Repairs) -> _Chain:
         """The chain from base to tip."""
         first = 0 if base is None else tree.body(base, "base")
         held = {tree.joint(name): _position(name, value) for name, value in locked.items()}
@@ -89,54 +111,67 @@ class _Chain(NamedTuple):
             expected = "a chain with a joint that moves"
             raise checks.fail("tip", tree.bodies[last], expected, f"Between it and {tree.bodies[first]!r} there is none.")
         for j in joints:
-            tree.check_joint(j)
-        chain = _Chain(tree, first, last, at_tip, joints, held)
-        chain._follow(mimics)
-        return chain
+            tree.check_joint(j, repairs)
+        return _Chain(tree, first, last, at_tip, joints, held)
 
-    def _follow(self, mimics: dict[str, urdf.Mimic]) -> None:
-        """Locks joints that mimic locked ones where these take them; refuses mimics in the chain."""
-        names = {self.tree.joint_names[j] for j in self.joints}
-        for name, mimic in mimics.items():
-            for moving in (name, mimic.master):
-                if moving in names:
-                    mend = f"Lock it: locked={{{moving!r}: 0.0}}, or take another tip."
-                    raise checks.fail(
-                        f"joint {name!r}", Shown(f"a mimic of {mimic.master!r} in the chain"), "joints that move by themselves", mend
-                    )
-        for name in mimics:
-            joint = self.tree.joint(name)
-            if joint not in self.held:
-                self.held[joint] = self._mimicked(name, mimics)
+    def following(self, file: urdf.Urdf, repairs: Repairs) -> _Chain:
+        """The chain with the mimics that are not in it locked where their joints take them, and what is wrong with its joints met."""
+        tree, held = self.tree, dict(self.held)
+        moving = {tree.joint_names[j] for j in self.joints}
+        for name in file.mimics:
+            if name not in moving and tree.joint(name) not in held:
+                held[tree.joint(name)] = self._mimicked(name, file.mimics)
+        for j in (*self.joints, *(j for j, position in held.items() if position)):
+            for fault in (file.axes.get(tree.joint_names[j]), *(file.motions[tree.joint_names[j]] if j in self.joints else ())):
+                if fault:
+                    repairs.meet(fault)
+        for name, mimic in file.mimics.items():
+            if name in moving or mimic.master in moving:
+                coupled = name if name in moving else mimic.master
+                mend = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
+                error = checks.fail(f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", mend)
+                repairs.meet(
+                    Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself" if name in moving else "one that is locked")
+                )
+        way = tree.way(0, self.tip) or []
+        for b in range(1, tree.model.nbody):
+            carried = any(j in self.joints for c in tree.way(0, b) or () for j in tree.joints_of(c))
+            if tree.bodies[b] in file.places and (carried or b in way):
+                repairs.meet(file.places[tree.bodies[b]])
+        return self._replace(held=held)
 
     def _mimicked(self, name: str, mimics: dict[str, urdf.Mimic]) -> float:
+        """Where a joint is that follows others, of which the last is locked."""
         factor, offset, seen = 1.0, 0.0, {name}
-        while name in mimics and self.tree.joint(name) not in self.held:
+        at = {self.tree.joint_names[j]: position for j, position in self.held.items()}
+        while name in mimics and name not in at:
             mimic = mimics[name]
             offset, factor, name = offset + factor * mimic.offset, factor * mimic.multiplier, mimic.master
             if name in seen:
                 raise checks.fail(f"joint {name!r}: mimic", Shown("a ring of mimics"), "a joint that leads")
             seen.add(name)
-        return offset + factor * self.held.get(self.tree.joint(name), 0.0)
+        return offset + factor * at.get(name, 0.0)
 
-    def arm(self, gravity: Any) -> Arm:
+    def arm(self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs) -> Arm:
         """The Arm, all bodies welded to the links that carry them."""
         tree = self.tree
         g = np.asarray(tree.gravity if gravity is None else checks.as_floats("gravity", gravity), float)
         checks.shape_is("gravity", g, (3,))
         _, upright = tree.pose(self.base, self.held)
-        links = tree.welded(self.base, self.joints, self.held)
-        links.check()
-        tree.check_closed(links, self.joints)
+        joints = tree.of_joints(self.joints)
+        links = tree.welded(self.base, self.joints, self.held, repairs)
+        tree.check_closed(links, self.joints, tendons, repairs)
+        links = links.settled(joints, repairs)
         p, R = links.frames[self.tip]
         tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
         return Arm(
             **links.parameters(),
-            **tree.of_joints(self.joints),
+            **joints,
             tip_position=tip_p,
-            tip_rotation=tree.quaternion(tip_R),
+            tip_rotation=quaternion(tip_R),
             g=upright.T @ g,
             links=links.names,
+            repaired=tuple(repairs.lines),
         )
 
 

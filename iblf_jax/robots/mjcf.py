@@ -1,29 +1,36 @@
 """The part of an MJCF that says how bodies move and what they weigh.
 
 A list of elements and attributes goes on; what draws, collides without weighing anything, senses or refers to other files does not.
+The library resolves defaults and then would refuse a body for what may not matter: so what it would refuse is taken out of its hands
+before it compiles (`taken_out`), to be judged where the body counts.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.robots.description import MOST_BODIES, Shown, floats, label
+from iblf_jax.robots.description import FARTHEST, MOST_BODIES, Shown, floats, label
+from iblf_jax.robots.repair import Fault, Weight, judged
 
 PLACE = "pos quat axisangle xyaxes zaxis euler"
-ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited"
+ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited inheritrange"
 KEPT = {
     "compiler": "angle autolimits eulerseq inertiafromgeom inertiagrouprange boundmass boundinertia balanceinertia settotalmass alignfree",
     "option": "gravity",
+    "flag": "gravity",
     "default": "class",
     "worldbody": "",
-    "body": f"name childclass {PLACE}",
+    "body": f"name childclass mocap {PLACE}",
     "frame": f"name childclass {PLACE}",
     "inertial": f"mass diaginertia fullinertia {PLACE}",
     "joint": "name class type pos axis range limited ref stiffness damping frictionloss armature actuatorfrcrange actuatorfrclimited",
     "freejoint": "name",
     "site": f"name class {PLACE}",
-    "geom": f"name class type mass density size fromto group shellinertia {PLACE}",
+    "geom": f"name class type mesh hfield mass density size fromto group shellinertia {PLACE}",
     "equality": "",
     "connect": "name class active body1 body2 anchor site1 site2",
     "weld": "name class active body1 body2 relpose anchor site1 site2",
@@ -41,6 +48,8 @@ REFUSED = {
     "attach": "Write the model out into one file.",
 }
 WORDS = [
+    "mesh",
+    "hfield",
     "name",
     "class",
     "childclass",
@@ -60,47 +69,123 @@ WORDS = [
 """Attributes that hold words, not numbers."""
 SINGLE = ("mass", "density", "ref", "stiffness", "damping", "frictionloss", "armature")
 """Attributes that hold one number."""
+WIDE = ("damping", "frictionloss", "range", "ctrlrange", "forcerange", "actuatorfrcrange")
+"""Attributes that may stand for "none" or "locked" by their size."""
+SWITCHES = ("true", "false", "auto", "enable", "disable")
+LEAST = 1e-15
+"""Mass [kg] and moments [kg m^2] below which the library refuses a body that moves."""
 
 
-def checked(root: ET.Element) -> str:
+Tendons = dict[str, tuple[set[str], set[str]]]
+"""What the constraints on tendons tie together: label -> (joints, sites)."""
+
+
+class Mjcf(NamedTuple):
+    """What an MJCF holds, checked."""
+
+    text: str
+    """The copy."""
+    tendons: Tendons
+
+
+def checked(root: ET.Element) -> Mjcf:
     """The copy of an MJCF.
 
     Raises:
       ValueError: what is wrong, with the name of the element.
     """
     copy = ET.Element("mujoco")
-    geoms_weigh = any(element.get("inertiafromgeom") == "true" for element in root.iter("compiler"))
-    _copy(root, copy, "", geoms_weigh)
+    _copy(root, copy, "")
     bodies = sum(1 for _ in copy.iter("body"))
     if not bodies:
         raise checks.fail("mujoco", Shown("no <body>"), "an MJCF with bodies and joints")
     if bodies > MOST_BODIES:
         raise checks.fail("mujoco", Shown(f"{bodies} bodies"), f"at most {MOST_BODIES}")
-    return ET.tostring(copy, encoding="unicode")
+    return Mjcf(ET.tostring(copy, encoding="unicode"), _tendons(root))
 
 
-def _copy(source: ET.Element, target: ET.Element, section: str, geoms_weigh: bool) -> None:
+def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
     for element in source:
         tag = element.tag
         if tag in REFUSED:
             raise checks.fail(f"<{tag}>", Shown("an element that makes bodies"), "bodies written out", REFUSED[tag])
-        if section == "equality" and tag == "tendon":
-            raise checks.fail(label(element), Shown("joints coupled by a tendon"), "joints that move by themselves", "Remove it.")
-        if tag not in KEPT or (tag == "geom" and not _weighs(element, source, geoms_weigh)):
+        drives_no_joint = section == "actuator" and element.get("joint") is None
+        if tag not in KEPT or drives_no_joint:
             continue
         kept = COUPLING if (section, tag) == ("equality", "joint") else KEPT[tag]
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
-            if name not in WORDS and text not in ("true", "false", "auto"):
-                floats(f"{label(element)}: {name}", text, 1 if name in SINGLE else None)
-        _copy(element, ET.SubElement(target, tag, attributes), section or tag, geoms_weigh)
+            if name not in WORDS and text not in SWITCHES:
+                most = {"most": FARTHEST} if name in WIDE else {}
+                floats(f"{label(element)}: {name}", text, 1 if name in SINGLE else None, **most)
+        _copy(element, ET.SubElement(target, tag, attributes), section or tag)
 
 
-def _weighs(geom: ET.Element, body: ET.Element, geoms_weigh: bool) -> bool:
-    """Whether a geom counts for the inertia of its body: not where the body has its own, unless the file says that geoms do."""
-    if body.tag == "default" or (body.find("inertial") is not None and not geoms_weigh) or geom.get("mass", "").strip() == "0":
-        return body.tag == "default" and geom.get("type") != "mesh"
-    if geom.get("mesh") is not None or geom.get("type") in ("mesh", "sdf", "hfield"):
-        mend = "Meshes are not opened: give the body an <inertial>."
-        raise checks.fail(f"{label(body)}: {label(geom)}", Shown("an inertia from a mesh"), "masses and inertias in numbers", mend)
-    return True
+def _tendons(root: ET.Element) -> Tendons:
+    """The constraints on tendons, and the joints and sites that each ties together."""
+    made = {
+        tendon.get("name"): ({x.get("joint", "") for x in tendon.findall("joint")}, {x.get("site", "") for x in tendon.findall("site")})
+        for tendons in root.findall("tendon")
+        for tendon in tendons
+    }
+    ties = {}
+    for equality in root.findall("equality"):
+        for element in equality.findall("tendon"):
+            ends = [made.get(element.get(which), (set(), set())) for which in ("tendon1", "tendon2")]
+            ties[label(element)] = (ends[0][0] | ends[1][0], ends[0][1] | ends[1][1])
+    return ties
+
+
+def taken_out(spec: Any) -> list[tuple[Any, Weight]]:
+    """Gives every body whose weight the library would refuse or cannot know a harmless one, and returns what the file says.
+
+    Args:
+      spec: the library's, parsed and not compiled; it is changed.
+
+    Returns:
+      Bodies of it with their weights, along the axes and about the origin of the inertial frame that the library gives them.
+    """
+    c, out = spec.compiler, []
+    bounded = c.boundmass > 0 or c.boundinertia > 0 or c.settotalmass > 0
+    low, high = c.inertiagrouprange
+    for body in spec.bodies:
+        where, from_geoms, from_mesh = f"body {body.name!r}", False, False
+        for geom in list(body.geoms):
+            weighs = not (geom.mass == 0 or (np.isnan(geom.mass) and geom.density == 0)) and low <= geom.group <= high
+            shaped = bool(geom.meshname or geom.hfieldname) or geom.type.name in ("mjGEOM_MESH", "mjGEOM_SDF", "mjGEOM_HFIELD")
+            if shaped or not weighs:
+                from_mesh |= weighs
+                spec.delete(geom)
+            else:
+                from_geoms = True
+        by_geoms = int(c.inertiafromgeom) == 1 or (int(c.inertiafromgeom) == 2 and not body.explicitinertial)
+        if by_geoms and from_mesh:
+            mend = "Meshes are not opened: give the body an <inertial>."
+            error = checks.fail(where, Shown("an inertia from a mesh"), "masses and inertias in numbers", mend)
+            out.append((body, Weight(fault=Fault(where, "", error))))
+        elif (by_geoms and from_geoms) or bounded:
+            continue
+        else:
+            weight = _explicit(body, where, bool(c.balanceinertia))
+            if weight is None:
+                continue
+            out.append((body, weight))
+        body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
+        body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
+        if np.isnan(body.ipos).any():
+            body.ipos = np.zeros(3)
+        for geom in list(body.geoms) if int(c.inertiafromgeom) == 1 else ():
+            spec.delete(geom)
+    return out
+
+
+def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
+    """What a body's <inertial> says, or nothing if it has none; None if the library takes it as it is."""
+    if not body.explicitinertial:
+        return Weight()
+    xx, yy, zz, xy, xz, yz = body.fullinertia
+    J = np.diag(body.inertia) if np.isnan(xx) else np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    moments = np.linalg.eigvalsh(J)
+    if body.mass >= LEAST and moments[0] >= LEAST and (balanced or moments[2] <= moments[0] + moments[1]):
+        return None
+    return judged(where, float(body.mass), J)

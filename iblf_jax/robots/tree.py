@@ -6,18 +6,21 @@ Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
 from __future__ import annotations
 
 import difflib
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.robots.description import Shown
+from iblf_jax.robots.links import Links, Pose
+from iblf_jax.robots.mjcf import Tendons
+from iblf_jax.robots.repair import Fault, Repairs, Weight, second_moments
 
 FREE, BALL, SLIDE, HINGE = range(4)
 CONNECT, WELD, COUPLED = range(3)
 JOINT, FIXED, NO_BIAS = 0, 0, 0
 """The library's numbers for kinds of joints, of constraints, and of an actuator's transmission, gain and bias."""
-Pose = tuple[np.ndarray, np.ndarray]
 
 
 def _mujoco() -> Any:
@@ -30,44 +33,13 @@ def _mujoco() -> Any:
     return mujoco
 
 
-class Links(NamedTuple):
-    """The links of a chain, with all that is welded to them."""
-
-    names: tuple[str, ...]
-    position: np.ndarray
-    rotation: np.ndarray
-    moments: np.ndarray
-    """Pseudo-inertias in the links' frames, (n, 4, 4)."""
-    between: tuple[bool, ...]
-    """Whether a link lies between two joints of one body, and so weighs nothing."""
-    frames: dict[int, Pose]
-    """Body -> its pose in the frame of the link that carries it."""
-    carrier: dict[int, int]
-    """Body -> that link, -1 for the base."""
-
-    def check(self) -> None:
-        """Raises for a link that moves and weighs nothing."""
-        for name, P, between in zip(self.names, self.moments, self.between, strict=True):
-            if not between and not P[3, 3] > 0:
-                mend = "Give it an inertial, or fix its joint."
-                raise checks.fail(f"link {name!r}", Shown("no mass"), "a mass [kg] of each link that moves", mend)
-
-    def parameters(self) -> dict[str, Any]:
-        """The fields of an Arm."""
-        mass = self.moments[:, 3, 3]
-        centre = self.moments[:, :3, 3] / np.where(mass > 0, mass, 1.0)[:, None]
-        second = self.moments[:, :3, :3] - mass[:, None, None] * centre[:, :, None] * centre[:, None, :]
-        J = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-        inertia = np.stack([J[:, i, k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], axis=1)
-        rotation = np.array([Tree.quaternion(R) for R in self.rotation])
-        return {"mass": mass, "centre": centre, "inertia": inertia, "position": self.position, "rotation": rotation}
-
-
 class Tree:
     """A compiled model, by names."""
 
-    def __init__(self, model: Any, mujoco: Any, root: str):
+    def __init__(self, model: Any, mujoco: Any, root: str, weights: dict[int, Weight]):
         self.model = model
+        self.weights = weights
+        """Body -> what it weighs in its inertial frame, where that is not the model's number."""
         names = lambda kind, count: [mujoco.mj_id2name(model, kind, i) for i in range(count)]  # noqa: E731
         objects = mujoco.mjtObj
         self.bodies = [name or f"body{i}" for i, name in enumerate(names(objects.mjOBJ_BODY, model.nbody))]
@@ -78,11 +50,18 @@ class Tree:
         self.sites = names(objects.mjOBJ_SITE, model.nsite)
         self.equalities = names(objects.mjOBJ_EQUALITY, model.neq)
         self.site_type = objects.mjOBJ_SITE
-        self.gravity = np.array(model.opt.gravity)
+        weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        self.gravity = np.zeros(3) if weightless else np.array(model.opt.gravity)
 
     @staticmethod
-    def compiled(text: str, path: str, root: str) -> Tree:
+    def compiled(text: str, path: str, root: str, taken_out: Callable[[Any], list[tuple[Any, Weight]]]) -> Tree:
         """The tree of a checked description.
+
+        Args:
+          text: the description.
+          path: its file, for messages.
+          root: name of the body that the library calls the world.
+          taken_out: from the library's specification, before it is compiled, bodies whose weights are not the library's business.
 
         Raises:
           ValueError: what the library does not accept, in its words.
@@ -92,11 +71,12 @@ class Tree:
         try:
             spec = mujoco.MjSpec.from_string(text)
             spec.compiler.fusestatic = False
+            weights = taken_out(spec)
             model = spec.compile()
         except ValueError as error:
             words = " ".join(str(error).split())
             raise ValueError(f"{path}: {words}") from None
-        return Tree(model, mujoco, root)
+        return Tree(model, mujoco, root, {body.id: weight for body, weight in weights})
 
     # ---------------------------------------------------------------------------------------------------------------- by name
 
@@ -155,15 +135,18 @@ class Tree:
         leaves = [b for b in beyond if b not in parents and (b == ends[0] or self.way(ends[0], b) is not None)]
         return leaves[0] if len(leaves) == 1 else ends[0]
 
-    def check_joint(self, j: int) -> None:
-        """Raises for a joint that an Arm cannot have."""
+    def check_joint(self, j: int, repairs: Repairs) -> None:
+        """Meets what an Arm's joint cannot have."""
         m, name = self.model, self.joint_names[j]
         if m.jnt_type[j] not in (HINGE, SLIDE):
             kind = "free" if m.jnt_type[j] == FREE else "ball"
             mend = "Take a base beyond it." if kind == "free" else "Write it as three hinges."
             raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), "a hinge or slide between base and tip", mend)
-        if m.jnt_stiffness[j]:
-            raise checks.fail(f"joint {name!r}: stiffness", float(m.jnt_stiffness[j]), "0: springs are not modelled", "Remove it.")
+        stiffness = float(m.jnt_stiffness[j])
+        if stiffness:
+            where = f"joint {name!r}: stiffness"
+            error = checks.fail(where, stiffness, "0: springs are not modelled", "Remove it.")
+            repairs.meet(Fault(where, str(stiffness), error, "0: the spring is left out"))
 
     # ----------------------------------------------------------------------------------------------------------------- geometry
 
@@ -192,7 +175,7 @@ class Tree:
                 pose = self._held(pose, j, held)
         return pose
 
-    def welded(self, base: int, joints: tuple[int, ...], held: dict[int, float]) -> Links:
+    def welded(self, base: int, joints: tuple[int, ...], held: dict[int, float], repairs: Repairs) -> Links:
         """The links that `joints` move, and each body beyond the base with the link that carries it."""
         m, origin = self.model, (np.zeros(3), np.eye(3))
         names, position, rotation, between = [], [], [], []
@@ -220,15 +203,16 @@ class Tree:
         moments = np.zeros((len(names), 4, 4))
         for b, link in carrier.items():
             if link >= 0:
-                moments[link] += self._moments(b, frames[b])
+                moments[link] += self._moments(b, frames[b], repairs)
         return Links(tuple(names), np.array(position), np.array(rotation), moments, tuple(between), frames, carrier)
 
-    def _moments(self, body: int, pose: Pose) -> np.ndarray:
+    def _moments(self, body: int, pose: Pose, repairs: Repairs) -> np.ndarray:
         """Pseudo-inertia of one body in the frame in which its pose is given."""
         m = self.model
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
-        principal, mass = np.array(m.body_inertia[body]), float(m.body_mass[body])
-        second = R @ np.diag(0.5 * principal.sum() - principal) @ R.T + mass * np.outer(p, p)
+        own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
+        mass, inertia, *_ = own.settled(repairs)
+        second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
         return np.block([[second, mass * p[:, None]], [mass * p[None, :], np.array([[mass]])]])
 
     def of_joints(self, joints: tuple[int, ...]) -> dict[str, Any]:
@@ -261,40 +245,43 @@ class Tree:
             total += limit * abs(float(m.actuator_gear[a, 0]))
         return total if on_it else np.inf
 
-    def check_closed(self, links: Links, joints: tuple[int, ...]) -> None:
-        """Raises where a constraint ties bodies of different links together, or a joint of the chain to another."""
+    def check_closed(self, links: Links, joints: tuple[int, ...], tendons: Tendons, repairs: Repairs) -> None:
+        """Meets constraints that tie bodies of different links together, or a joint of the chain to another.
+
+        Args:
+          links, joints: the chain.
+          tendons: constraints on tendons, label -> (joints, sites).
+          repairs: meets a coupled joint; a closed chain is refused.
+        """
         m = self.model
         for e in range(m.neq):
             first, second = int(m.eq_obj1id[e]), int(m.eq_obj2id[e])
             if not m.eq_active0[e]:
                 continue
-            name = self.equalities[e] or f"number {e}"
-            if m.eq_type[e] == COUPLED and {first, second} & set(joints):
-                moving = self.joint_names[first if first in joints else second]
-                mend = f"Lock it: locked={{{moving!r}: 0.0}}, or remove the constraint."
-                raise checks.fail(f"equality {name!r}", Shown(f"joint {moving!r} tied to another"), "joints that move by themselves", mend)
+            where = f"equality {self.equalities[e] or f'number {e}'!r}"
+            if m.eq_type[e] == COUPLED:
+                self._meet_coupling(where, {first, second} & set(joints), repairs)
             if m.eq_type[e] in (CONNECT, WELD):
                 bodies = [int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x for x in (first, second)]
-                tied = {links.carrier.get(b, -1) for b in bodies}
-                if len(tied) > 1:
-                    found = Shown(f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together")
-                    mend = "A closed chain has no serial one: cut it open, or lock its joints."
-                    raise checks.fail(f"equality {name!r}", found, "an open chain", mend)
+                self._meet_tie(where, bodies, links, repairs)
+        for where, (named, sites) in tendons.items():
+            self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
+            self._meet_tie(where, [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites], links, repairs)
 
-    @staticmethod
-    def quaternion(R: np.ndarray) -> np.ndarray:
-        """(w, x, y, z) of a rotation matrix, w >= 0."""
-        K = np.array(
-            [
-                [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-                [0.0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
-                [0.0, 0.0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
-                [0.0, 0.0, 0.0, R[2, 2] - R[0, 0] - R[1, 1]],
-            ]
-        )
-        q = np.linalg.eigh(K, UPLO="U")[1][:, -1]
-        q = np.where(np.abs(q) < 1e-15, 0.0, q)
-        return q if q[0] > 0 or (q[0] == 0 and q[np.flatnonzero(q)[0]] > 0) else -q
+    def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
+        for j in sorted(coupled):
+            name = self.joint_names[j]
+            mend = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
+            error = checks.fail(where, Shown(f"joint {name!r} tied to another"), "joints that move by themselves", mend)
+            repairs.meet(Fault(f"joint {name!r}", f"one tied to another by {where}", error, "one that moves by itself"))
+
+    def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
+        """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its links closes the chain."""
+        if len({links.carrier.get(b, -1) for b in bodies}) > 1:
+            tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
+            mend = "A closed chain has no serial one: cut it open, or lock its joints."
+            to = "no tie: a motion-capture body is no link" if any(self.model.body_mocapid[b] >= 0 for b in bodies) else ""
+            repairs.meet(Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", mend), to))
 
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:

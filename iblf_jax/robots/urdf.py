@@ -1,21 +1,23 @@
 """The check of a URDF, element by element, and the part of it that says how links move and what they weigh.
 
-The copy that goes on holds links with their inertials, and joints; each number has been looked at.  Mimic joints go apart: whether one
-matters is known when the chain is.
+The copy that goes on holds links and joints; each number has been looked at.  What links weigh, what is wrong with a link or joint, and
+mimic joints go apart: whether they matter is known when the chain is.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.robots.description import MOST_BODIES, Shown, floats, label
+from iblf_jax.robots.description import FARTHEST, MOST_BODIES, Shown, floats, label
+from iblf_jax.robots.repair import Fault, Weight, judged
 
 MOVING = ("revolute", "continuous", "prismatic")
 INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+ZERO = [0.0, 0.0, 0.0]
 
 
 class Mimic(NamedTuple):
@@ -24,6 +26,11 @@ class Mimic(NamedTuple):
     master: str
     multiplier: float
     offset: float
+
+    @property
+    def shown(self) -> str:
+        """How it is called in messages."""
+        return f"a mimic of {self.master!r} in the chain"
 
 
 class Urdf(NamedTuple):
@@ -34,6 +41,18 @@ class Urdf(NamedTuple):
     root: str
     """Name of the link that no joint moves."""
     mimics: dict[str, Mimic]
+    weights: dict[str, Weight]
+    """Link -> what it weighs, about the centre that the copy has and along the link's axes."""
+    places: dict[str, Fault]
+    """Link -> what is wrong with where it is: matters for each link that hangs on the base."""
+    axes: dict[str, Fault]
+    """Joint -> what is wrong with its kind or axis: matters where it moves, or is locked away from 0."""
+    motions: dict[str, list[Fault]]
+    """Joint -> what is wrong with its range, torque or friction: matters where it moves."""
+
+    def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
+        """The library's bodies with their weights: it gets none of them, as it would refuse what may not matter."""
+        return [(body, self.weights[body.name]) for body in spec.bodies if body.name in self.weights]
 
 
 def checked(robot: ET.Element) -> Urdf:
@@ -51,17 +70,21 @@ def checked(robot: ET.Element) -> Urdf:
     parent_of = {_end(joint, "child", links): (_end(joint, "parent", links), name) for name, joint in reversed(joints.items())}
     _is_tree(links, joints, parent_of)
     root = next(name for name in links if name not in parent_of)
-    moves = _moving(links, joints, parent_of)
+    found = Urdf("", root, {}, {}, {}, {}, {})
     copy = ET.Element("robot", name="robot")
     for name, link in links.items():
-        ET.SubElement(copy, "link", name=name).extend(_inertial(link) if name in moves else [])
-    mimics: dict[str, Mimic] = {}
+        found.weights[name], centre = _weight(link)
+        inertial = ET.SubElement(ET.SubElement(copy, "link", name=name), "inertial")
+        ET.SubElement(inertial, "origin", xyz=_words(centre))
+        ET.SubElement(inertial, "mass", value="1")
+        ET.SubElement(inertial, "inertia", dict(zip(INERTIA, "111000", strict=True)))
     for joint in joints.values():
-        copy.append(_joint(joint, mimics))
-    for name, mimic in mimics.items():
+        copy.append(_joint(joint, found))
+    for name, mimic in found.mimics.items():
         if mimic.master not in joints:
-            raise checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
-    return Urdf(ET.tostring(copy, encoding="unicode"), root, mimics)
+            error = checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
+            found.motions[name].append(Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself"))
+    return found._replace(text=ET.tostring(copy, encoding="unicode"))
 
 
 def _by_name(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
@@ -114,21 +137,6 @@ def _is_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element], parent
         )
 
 
-def _moving(links: dict[str, ET.Element], joints: dict[str, ET.Element], parent_of: dict[str, tuple[str, str]]) -> set[str]:
-    """The links that some joint can move."""
-    moves: dict[str, bool] = {}
-    for name in links:
-        trail = []
-        while name not in moves and name in parent_of:
-            trail.append(name)
-            if joints[parent_of[name][1]].get("type") != "fixed":
-                break
-            name = parent_of[name][0]
-        answer = moves.get(name, False) if not trail or trail[-1] != name else True
-        moves.update(dict.fromkeys(trail, answer))
-    return {name for name, yes in moves.items() if yes}
-
-
 def _one(parent: ET.Element, tag: str) -> ET.Element | None:
     found = parent.findall(tag)
     if len(found) > 1:
@@ -136,101 +144,142 @@ def _one(parent: ET.Element, tag: str) -> ET.Element | None:
     return found[0] if found else None
 
 
-def _origin(parent: ET.Element, where: str) -> ET.Element:
+def _origin(parent: ET.Element, where: str) -> tuple[list[float], list[float]]:
+    """Position and roll, pitch, yaw of an element's <origin>."""
     origin = _one(parent, "origin")
-    copy = ET.Element("origin")
-    for name in ("xyz", "rpy"):
-        text = origin.get(name, "0 0 0") if origin is not None else "0 0 0"
-        copy.set(name, " ".join(map(repr, floats(f"{where}: origin {name}", text, 3))))
-    return copy
+    xyz, rpy = (
+        floats(f"{where}: origin {name}", origin.get(name, "0 0 0") if origin is not None else "0 0 0", 3) for name in ("xyz", "rpy")
+    )
+    return xyz, rpy
 
 
-def _inertial(link: ET.Element) -> list[ET.Element]:
-    """The inertial of a link that moves, as a list of one; none if it has none."""
-    where, inertial = label(link), _one(link, "inertial")
-    if inertial is None:
-        return []
+def _weight(link: ET.Element) -> tuple[Weight, list[float]]:
+    """What a link weighs, and its centre."""
+    where = label(link)
+    try:
+        inertial = _one(link, "inertial")
+        return (Weight(), ZERO) if inertial is None else _inertial(where, inertial)
+    except ValueError as error:
+        return Weight(fault=Fault(where, "", error)), ZERO
+
+
+def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
     mass, inertia = _one(inertial, "mass"), _one(inertial, "inertia")
     if mass is None:
         raise checks.fail(f"{where}: inertial", Shown("no <mass>"), "a mass [kg]")
     (kg,) = floats(f"{where}: mass", mass.get("value", ""), 1)
-    if kg < 0:
-        raise checks.fail(f"{where}: mass", kg, "a mass >= 0 kg")
+    centre, (roll, pitch, yaw) = _origin(inertial, f"{where}: inertial")
     if inertia is None:
-        if kg > 0:
-            raise checks.fail(f"{where}: inertial", Shown("no <inertia>"), "an inertia [kg m^2]")
-        return []
-    numbers = [floats(f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1)[0] for name in INERTIA]
-    if kg == 0:
-        if any(numbers):
-            mend = "Give it its mass, or remove its inertia: tools differ in what they make of this."
-            raise checks.fail(f"{where}: inertial", Shown("an inertia without a mass"), "both or neither", mend)
-        return []
-    check_inertia(where, np.array(numbers))
-    copy = ET.Element("inertial")
-    copy.append(_origin(inertial, f"{where}: inertial"))
-    ET.SubElement(copy, "mass", value=repr(kg))
-    ET.SubElement(copy, "inertia", {name: repr(x) for name, x in zip(INERTIA, numbers, strict=True)})
-    return [copy]
-
-
-def check_inertia(where: str, numbers: np.ndarray) -> None:
-    """Raises unless xx yy zz xy xz yz are the inertia of a body: positive definite, no principal moment above the sum of the others."""
+        if kg <= 0:
+            return judged(where, kg, np.zeros((3, 3))), centre
+        error = checks.fail(f"{where}: inertial", Shown("no <inertia>"), "an inertia [kg m^2]")
+        return Weight(kg, fault=Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")), centre
+    numbers = (floats(f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1)[0] for name in INERTIA)
     xx, yy, zz, xy, xz, yz = numbers
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    shown = Shown("principal moments " + ", ".join(f"{x:.4g}" for x in moments))
-    if not moments[0] > 0:
-        raise checks.fail(f"{where}: inertia", shown, "a positive definite inertia [kg m^2]", "A body that moves needs one.")
-    if moments[2] > (moments[0] + moments[1]) * (1 + 1e-6):
-        mend = "No body has such an inertia: look at the units, the signs and the frame."
-        raise checks.fail(f"{where}: inertia", shown, "none above the sum of the two others", mend)
+    R = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+    return judged(where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T), centre
 
 
-def _joint(joint: ET.Element, mimics: dict[str, Mimic]) -> ET.Element:
-    where, kind = label(joint), joint.get("type", "")
-    if kind not in (*MOVING, "fixed"):
-        mend = "Floating and planar joints are not part of a serial arm." if kind in ("floating", "planar") else ""
-        raise checks.fail(f"{where}: type", kind, "revolute, continuous, prismatic or fixed", mend)
-    copy = ET.Element("joint", name=str(joint.get("name")), type=kind)
-    copy.append(_origin(joint, where))
-    for which in ("parent", "child"):
-        ET.SubElement(copy, which, link=str(joint.findall(which)[0].get("link")))
+def _about(axis: int, angle: float) -> np.ndarray:
+    """Rotation about a coordinate axis."""
+    R, (i, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
+    R[i, i] = R[k, k] = np.cos(angle)
+    R[k, i] = np.sin(angle)
+    R[i, k] = -R[k, i]
+    return R
+
+
+def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
+    """The copy of a joint, with something harmless in the place of what is wrong with it."""
+    where, name, kind = label(joint), str(joint.get("name")), joint.get("type", "")
+    parent, child = (str(joint.findall(which)[0].get("link")) for which in ("parent", "child"))
+    copy = ET.Element("joint", name=name, type="fixed" if kind == "fixed" else "prismatic" if kind == "prismatic" else "continuous")
+    xyz, rpy = ZERO, ZERO
+    try:
+        xyz, rpy = _origin(joint, where)
+    except ValueError as error:
+        found.places[child] = Fault(where, "", error)
+    ET.SubElement(copy, "origin", xyz=_words(xyz), rpy=_words(rpy))
+    ET.SubElement(copy, "parent", link=parent)
+    ET.SubElement(copy, "child", link=child)
     if kind == "fixed":
         return copy
+    axis = [1.0, 0.0, 0.0]
+    try:
+        axis = _axis(joint, where, kind)
+    except ValueError as error:
+        found.axes[name] = Fault(where, "", error)
+    ET.SubElement(copy, "axis", xyz=_words(axis))
+    faults = found.motions[name] = []
+    for read in (_limit, _dynamics):
+        try:
+            faults += read(joint, where, copy)
+        except ValueError as error:
+            faults.append(Fault(where, "", error))
+    try:
+        _mimic(joint, where, found)
+    except ValueError as error:
+        faults.append(Fault(where, "", error))
+    return copy
+
+
+def _words(numbers: list[float]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
+    if kind not in MOVING:
+        mend = "Floating and planar joints are not part of a serial arm." if kind in ("floating", "planar") else ""
+        raise checks.fail(f"{where}: type", kind, "revolute, continuous, prismatic or fixed", mend)
     axis = _one(joint, "axis")
     direction = floats(f"{where}: axis", axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3)
     if not np.linalg.norm(direction) > 1e-6:
         raise checks.fail(f"{where}: axis", direction, "a direction")
-    ET.SubElement(copy, "axis", xyz=" ".join(map(repr, direction)))
-    _limit(joint, where, kind, copy)
-    dynamics = _one(joint, "dynamics")
-    if dynamics is not None:
-        found = {name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1)[0] for name in ("damping", "friction")}
-        for name, value in found.items():
-            if value < 0:
-                raise checks.fail(f"{where}: {name}", value, "a number >= 0")
-        ET.SubElement(copy, "dynamics", {name: repr(value) for name, value in found.items()})
-    mimic = _one(joint, "mimic")
-    if mimic is not None:
-        (multiplier,), (offset,) = (
-            floats(f"{where}: mimic {name}", mimic.get(name, default), 1) for name, default in (("multiplier", "1"), ("offset", "0"))
-        )
-        mimics[str(joint.get("name"))] = Mimic(mimic.get("joint", ""), multiplier, offset)
-    return copy
+    return direction
 
 
-def _limit(joint: ET.Element, where: str, kind: str, copy: ET.Element) -> None:
-    limit = _one(joint, "limit")
+def _limit(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
+    """Range and largest torque of a joint, into the copy; what cannot be, and is left out there."""
+    limit, endless, faults = _one(joint, "limit"), joint.get("type") == "continuous", []
     if limit is None:
-        if kind != "continuous":
-            mend = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
-            raise checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", mend)
-        return
-    values = {name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1)[0] for name in ("lower", "upper", "effort")}
-    if kind != "continuous" and not values["lower"] < values["upper"]:
-        raise checks.fail(f"{where}: limit", (values["lower"], values["upper"]), "lower < upper")
+        if endless:
+            return []
+        mend = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
+        error = checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", mend)
+        return [Fault(f"{where}: limit", "nothing", error, "no limits")]
+    names = ("effort",) if endless else ("lower", "upper", "effort")
+    values = {name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0] for name in names}
+    if not endless and not values["lower"] < values["upper"]:
+        got = (values.pop("lower"), values.pop("upper"))
+        faults.append(Fault(f"{where}: limit", str(got), checks.fail(f"{where}: limit", got, "lower < upper"), "no limits"))
     if values["effort"] < 0:
-        raise checks.fail(f"{where}: effort", values["effort"], "a number >= 0")
-    if kind == "continuous":
-        values = {"effort": values["effort"]}
+        torque = values.pop("effort")
+        faults.append(Fault(f"{where}: effort", str(torque), checks.fail(f"{where}: effort", torque, "a number >= 0"), "no limit"))
+    if "lower" in values and copy.get("type") == "continuous":
+        copy.set("type", "revolute")
     ET.SubElement(copy, "limit", {name: repr(value) for name, value in values.items()})
+    return faults
+
+
+def _dynamics(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
+    """Damping and friction of a joint, into the copy."""
+    dynamics, faults = _one(joint, "dynamics"), []
+    if dynamics is None:
+        return []
+    found = {name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1, most=FARTHEST)[0] for name in ("damping", "friction")}
+    for name, value in found.items():
+        if value < 0:
+            error = checks.fail(f"{where}: {name}", value, "a number >= 0")
+            faults.append(Fault(f"{where}: {name}", str(value), error, "0"))
+    ET.SubElement(copy, "dynamics", {name: repr(max(value, 0.0)) for name, value in found.items()})
+    return faults
+
+
+def _mimic(joint: ET.Element, where: str, found: Urdf) -> None:
+    mimic = _one(joint, "mimic")
+    if mimic is None:
+        return
+    (multiplier,), (offset,) = (
+        floats(f"{where}: mimic {name}", mimic.get(name, default), 1) for name, default in (("multiplier", "1"), ("offset", "0"))
+    )
+    found.mimics[str(joint.get("name"))] = Mimic(mimic.get("joint", ""), multiplier, offset)
