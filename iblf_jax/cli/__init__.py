@@ -19,8 +19,8 @@ from typing import NoReturn
 
 import jax
 
+from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.lowering.toolchain import ToolchainError, cache_directory, not_ours
-from iblf_jax.studies.interrupt import INTERRUPTED, end_process
 
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
