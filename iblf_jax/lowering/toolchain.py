@@ -247,18 +247,22 @@ def content_of(path: Path) -> bytes:
     return image
 
 
+_libraries: dict[str, ctypes.CDLL] = {}
+"""Key -> what this process has loaded of it: once, as XLA takes one address for a name."""
+
+
 def loaded(library: Path, *names: str) -> ctypes.CDLL:
     """A library of `built` in this process, from a copy that nobody can change; ToolchainError if it does not load or lacks a name."""
-    image = content_of(library)
+    key = library.stem
     try:
-        found = _load(image)
+        found = _libraries[key] if key in _libraries else _load(content_of(library))
         for name in names:
             getattr(found, name)
     except (OSError, AttributeError) as error:
         with contextlib.suppress(OSError):
             library.unlink()  # the compiler may do better another time
         raise ToolchainError(f"a kernel does not load: {error}") from None
-    return found
+    return _libraries.setdefault(key, found)
 
 
 def _load(image: bytes) -> ctypes.CDLL:
