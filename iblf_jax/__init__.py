@@ -1,5 +1,8 @@
 """iblf_jax: simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots, in JAX."""
 
+from iblf_jax import _start as _start
+
+# isort: split
 import importlib as _importlib
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING

@@ -4,16 +4,21 @@ Every process runs the same program.  `initialize` comes first; after it `monte_
 its blocks or units on its own devices, and all get the same result at the end.  Runs are independent, so processes talk only at
 the start and at the end, and results are bit-identical to those of one process.
 
-When a process is lost, the others end too, within about `heartbeat` seconds and with a message; what is in a store stays valid, and
-the same command goes on from there.  A process that is alive but makes no progress is waited for, `PATIENCE` times as long as a
+When a process is lost, the others end too, within about `heartbeat` seconds, with a message and exit code 3; what is in a store stays
+valid, and the same command goes on from there.  A process that is alive but makes no progress is waited for, `PATIENCE` times as long as a
 piece of work took here.
+
+Workers of one's own (`multiprocessing`) are another matter, and to be started by `spawn` or `forkserver`: JAX has threads, and a `fork` of
+a process in which it has run hangs.
 """
 
 from __future__ import annotations
 
 import atexit
+import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -31,10 +36,17 @@ PATIENCE = 20.0
 """How many times the longest piece of work here another process may take before it is given up."""
 LEAST_PATIENCE = 120.0
 """Seconds that another process is waited for at least."""
+LOST = 3
+"""Exit code of a process that ends because another one was lost."""
+LONGEST = 86400
+"""Seconds of a heartbeat or of a start, at most: a day."""
 
 _WATCHER = (
     "import sys\nlast = sys.stdin.buffer.read()\nif not last.endswith(b'bye'):\n    print(sys.argv[1], file=sys.stderr, flush=True)\n"
 )
+
+
+_GO_ON = "What is written in a store is valid: start the same command again, on all processes, to go on from there."
 
 
 class ProcessLostError(RuntimeError):
@@ -69,21 +81,24 @@ def initialize(
       coordinator: address of process 0, "host:port".
       num_processes: number of processes.
       process_id: number of this one, from 0.
-      heartbeat: seconds after which a process that gives no sign of life counts as lost.
-      start: seconds to wait for all processes to be there.
+      heartbeat: seconds after which a process that gives no sign of life counts as lost, 1 to 86400.
+      start: seconds to wait for all processes to be there, 1 to 86400.
 
     Raises:
-      ValueError: some of the three are given and some are not, or do not fit together.
-      ProcessLostError: not all processes came.
+      ValueError: some of the three are given and some are not, they do not fit together, or the port is not free on process 0.
+      ProcessLostError: not all processes came, where JAX says so; where it ends the process instead, that has exit code 3.
 
     Source: jax.distributed.
     """
     given = (coordinator, num_processes, process_id)
     if any(x is None for x in given) and not all(x is None for x in given):
         raise checks.fail("coordinator, num_processes, process_id", given, "all three, or none where JAX finds them by itself")
+    check_seconds("heartbeat", heartbeat)
+    check_seconds("start", start)
     if coordinator is not None:
         _check_job(coordinator, num_processes, process_id)
     watcher = _last_words(process_id)
+    _end_with_a_code(f"not all processes of the job came within {start} s, or the coordinator is not at {coordinator}.", watcher)
     try:
         jax.distributed.initialize(
             coordinator,
@@ -94,26 +109,49 @@ def initialize(
             shutdown_timeout_seconds=max(heartbeat, 30),
         )
     except ValueError as error:
+        _end_with_a_code(None, watcher)
         _say_bye(watcher)
         mend = "Start the processes with srun." if "SLURM_JOB_ID" in os.environ else "Give coordinator, num_processes and process_id."
         raise ValueError(f"No cluster was found that says where the processes meet: {error} {mend}") from error
     except RuntimeError as error:
+        _end_with_a_code(None, watcher)
         _say_bye(watcher)
         raise ProcessLostError(
             f"Not all processes of the job came within {start} s, or the coordinator is not at {coordinator}: {error}"
         ) from error
+    _end_with_a_code(f"another process was lost (what JAX says of it is above). {_GO_ON}", watcher)
     sys.excepthook = _leave_on_error
     if threading.current_thread() is threading.main_thread():  # JAX's runtime swallows SIGTERM, with which a cluster asks a job to end
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 
+def check_seconds(name: str, seconds: Any) -> None:
+    """ValueError unless it is a number of seconds that JAX's runtime can take."""
+    if isinstance(seconds, bool) or not isinstance(seconds, int) or not 1 <= seconds <= LONGEST:
+        raise checks.fail(name, seconds, f"a whole number of seconds from 1 to {LONGEST}")
+
+
 def _check_job(coordinator: Any, num_processes: Any, process_id: Any) -> None:
     host, _, port = str(coordinator).rpartition(":")
-    if not isinstance(coordinator, str) or not host or not port.isdigit():
-        raise checks.fail("coordinator", coordinator, 'an address and a port, such as "10.0.0.1:1234"')
+    expected = 'an address and a port from 1 to 65535, such as "10.0.0.1:1234"'
+    digits = port.isascii() and port.isdigit() and len(port) < 10
+    if not isinstance(coordinator, str) or not host or not host.isprintable() or " " in host or not digits or not 0 < int(port) < 2**16:
+        raise checks.fail("coordinator", coordinator, expected)
     number = checks.positive_integer("num_processes", num_processes)
     if isinstance(process_id, bool) or not isinstance(process_id, int) or not 0 <= process_id < number:
         raise checks.fail("process_id", process_id, f"a whole number from 0 to {number - 1}")
+    if process_id == 0 and (why := _not_free(int(port))):
+        raise checks.fail("coordinator", coordinator, f"a port that is free on process 0 ({why})")
+
+
+def _not_free(port: int) -> str | None:
+    """Why this process cannot listen at a port, or None if it can; JAX's runtime would end the process."""
+    family = socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET
+    try:
+        socket.create_server(("", port), family=family, dualstack_ipv6=family == socket.AF_INET6).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 def _last_words(process_id: int | None) -> subprocess.Popen:
@@ -122,13 +160,32 @@ def _last_words(process_id: int | None) -> subprocess.Popen:
     JAX's runtime ends a process whose peer is lost by an abort, which Python can neither catch nor explain.
     """
     who = "" if process_id is None else f" {process_id}"
-    text = (
-        f"iblf_jax: process{who} of this job was ended before it was done: another process was lost, or this one was killed. "
-        "What is written in a store is valid: start the same command again, on all processes, to go on from there."
-    )
+    text = f"iblf_jax: process{who} of this job was ended before it was done: another process was lost, or this one was killed. {_GO_ON}"
     watcher = subprocess.Popen([sys.executable, "-I", "-S", "-c", _WATCHER, text], stdin=subprocess.PIPE, start_new_session=True)
     atexit.register(_say_bye, watcher)  # before jax registers its own goodbye, so that it comes after
     return watcher
+
+
+def _end_with_a_code(text: str | None, watcher: subprocess.Popen) -> None:
+    """Has an abort of JAX's runtime end this process with a line and the exit code `LOST`; without a text it is an abort again.
+
+    The runtime aborts from a thread of its own, and takes no other advice (in jaxlib 0.10 its callback for that fails).  The handler is
+    the C library's, because Python's own runs when the main thread comes round to it, which an abort does not wait for.
+    """
+    if os.name != "posix":
+        return
+
+    def end(_: int) -> None:
+        os.write(2, f"\niblf_jax: {text}\n".encode())
+        _say_bye(watcher)
+        os._exit(LOST)
+
+    _handlers.append(ctypes.CFUNCTYPE(None, ctypes.c_int)(end) if text else ctypes.c_void_p(signal.SIG_DFL))
+    ctypes.CDLL(None).signal(ctypes.c_int(signal.SIGABRT), _handlers[-1])
+
+
+_handlers: list[Any] = []
+"""Kept for C, which does not."""
 
 
 def _say_bye(watcher: subprocess.Popen) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tomllib
@@ -16,7 +17,7 @@ import tomli_w
 from conftest import ROOT
 
 import iblf_jax as ij
-from iblf_jax import cli, scenario_file
+from iblf_jax import _start, cli, scenario_file
 from iblf_jax.cli import _claims, _common
 
 SHORT = ["--duration", "0.05", "--dt", "0.001", "--method", "heun"]
@@ -236,6 +237,48 @@ def test_as_a_process_with_its_own_cache(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     assert "status: ok" in done.stdout
     assert any((tmp_path / "iblf_jax").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("module", "started"), [("_start", "-m"), ("numpy", "-m"), ("iblf_jax.cli", "-m"), ("_start", "script"), ("jax", "script")]
+)
+def test_a_command_is_interrupted_quietly_while_python_imports(module, started, tmp_path):
+    script = tmp_path / "iblf-jax"
+    script.write_text("from iblf_jax.cli import entry\nentry()\n")
+    words = ["-m", "iblf_jax"] if started == "-m" else [str(script)]
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", *words, "simulate", "zhang_yan_2024"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    for line in process.stderr:
+        if line.split("|")[-1].strip().endswith(module):
+            break
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=60)
+    said = [line for line in errors.splitlines() if not line.startswith("import time:")]
+    assert (process.returncode, out, said) == (130, "", ["iblf-jax: error: interrupted"])
+
+
+@pytest.mark.parametrize(
+    ("argv", "orig", "command"),
+    [
+        (["-m", "a"], ["python", "-X", "dev", "-m", "iblf_jax", "a"], True),
+        (["-m"], ["python", "-miblf_jax"], True),
+        (["/bin/iblf-jax", "a"], ["python", "/bin/iblf-jax", "a"], True),
+        (["-m", "iblf_jax"], ["python", "-m", "other", "iblf_jax"], False),
+        (["-c", "iblf_jax"], ["python", "-c", "import iblf_jax", "iblf_jax"], False),
+        (["iblf_jax.py"], ["python", "iblf_jax.py"], False),
+        ([""], ["python"], False),
+        ([], [], False),
+    ],
+)
+def test_who_imports_the_package_keeps_his_interrupts(monkeypatch, argv, orig, command):
+    monkeypatch.setattr(sys, "argv", argv)
+    monkeypatch.setattr(sys, "orig_argv", orig)
+    assert _start._is_a_command() == command
 
 
 @pytest.mark.parametrize("cache", ["file", "missing"])

@@ -15,7 +15,8 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax import distributed
+from iblf_jax import cli, distributed
+from iblf_jax.cli._studies import UNFINISHED
 
 
 def free_address():
@@ -39,17 +40,21 @@ def job(compiled, tmp_path, words, more=((), ()), devices="2"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("devices", ["1", "2"])
-def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path, devices):
+@pytest.mark.parametrize(("devices", "lost"), [("1", 0), ("2", 1)])
+def test_two_processes_agree_with_one_and_a_killed_one_ends_the_other(compiled, tmp_path, devices, lost):
+    """Whether it is the one at whose address they meet or another: exit code 3."""
     path = tmp_path / "sweep.zarr"
     words = ("--store", str(path))
-    survivor, victim = job(compiled, tmp_path, words, (("--slow", "1.0"), ("--die-after", "2")), devices)
+    how = [("--slow", "1.0"), ("--slow", "1.0")]
+    how[lost] = ("--die-after", "2")
+    both = job(compiled, tmp_path, words, how, devices)
+    survivor, victim = both[1 - lost], both[lost]
     victim.communicate(timeout=300)
     assert victim.returncode == -signal.SIGKILL
     begin = time.monotonic()
     _, errors = survivor.communicate(timeout=60)
     assert time.monotonic() - begin < 30
-    assert survivor.returncode != 0
+    assert survivor.returncode == distributed.LOST == UNFINISHED, errors
     assert "another process was lost" in errors
     assert "start the same command again" in errors
     assert 0 < ij.load_sweep(path).attrs["computed_cases"] < 6 * cases.RUNS
@@ -126,11 +131,57 @@ def test_progress_of_others_keeps_the_patience(monkeypatch):
         (("localhost", 2, 0), "port"),
         (("localhost:1", 0, 0), "num_processes"),
         (("localhost:1", 2, 2), "from 0 to 1"),
+        (("localhost:0", 2, 0), "1 to 65535"),
+        (("localhost:99999", 2, 0), "1 to 65535"),
+        (("localhost:-1", 2, 0), "1 to 65535"),
+        (("localhost:²", 2, 0), "1 to 65535"),
+        (("localhost:" + "9" * 5000, 2, 0), "1 to 65535"),
+        ((":1234", 2, 0), "address"),
+        (("local host:1234", 2, 0), "address"),
     ],
 )
 def test_bad_jobs_are_refused(words, message):
     with pytest.raises(ValueError, match=message):
         distributed.initialize(*words)
+
+
+@pytest.mark.parametrize("seconds", [0, -5, 86401, 99999999999, 1.5, True, "10", None])
+@pytest.mark.parametrize("name", ["heartbeat", "start"])
+def test_seconds_that_the_runtime_cannot_take_are_refused(name, seconds):
+    with pytest.raises(ValueError, match=f"{name}: got .*, expected a whole number of seconds from 1 to 86400"):
+        distributed.initialize("localhost:1", 1, 0, **{name: seconds})
+
+
+def test_a_port_in_use_is_refused():
+    """JAX's runtime would end process 0 with a segmentation fault."""
+    in_use = pytest.raises(ValueError, match=r"coordinator: .*a port that is free on process 0 \(.*in use")
+    with socket.create_server(("", 0)) as taken, in_use:
+        distributed.initialize(f"localhost:{taken.getsockname()[1]}", 1, 0)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--heartbeat", "0"),
+        ("--heartbeat", "-3"),
+        ("--heartbeat", "99999999999"),
+        ("--coordinator", "localhost:99999", "--num-processes", "2", "--process-id", "0"),
+    ],
+)
+def test_the_command_line_refuses_them_too(tmp_path, capsys, words):
+    (tmp_path / "sweep.toml").write_text(cases.SWEEP)
+    assert cli.main(["sweep", str(tmp_path / "sweep.toml"), "--quiet", *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+START = "import sys, iblf_jax as ij; ij.distributed.initialize(sys.argv[1], 2, 1, start=1)"
+
+
+def test_nobody_at_the_address_is_a_line_and_an_exit_code(compiled):
+    process = cases.start_python(compiled, "-c", START, free_address())
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == distributed.LOST
+    assert errors.rstrip().splitlines()[-1].startswith("iblf_jax: not all processes of the job came within 1 s")
 
 
 def test_importing_the_package_starts_no_device(compiled):

@@ -6,7 +6,7 @@
     3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  time_loop  rollout  lowering/
     2 the law     barriers/  observers/  controllers/
     1 the world   robots/  references  bounds  disturbances
-    0 ground      pytree  linalg  checks  status
+    0 ground      pytree  linalg  checks  status  drafts  _start
 
 An import inside a function may go up: that is how `run.plot()` finds matplotlib when it is asked for a picture.
 """
@@ -23,7 +23,7 @@ from conftest import ROOT
 PACKAGE = ROOT / "iblf_jax"
 
 LAYERS = {
-    0: ("pytree", "linalg", "checks", "status", "one_function"),
+    0: ("pytree", "linalg", "checks", "status", "one_function", "drafts", "_start"),
     1: ("robots", "references", "bounds", "disturbances"),
     2: ("barriers", "observers", "controllers"),
     3: (

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
+import pickle
 import random
 import shutil
 import signal
@@ -221,6 +223,89 @@ def test_what_is_no_store_is_refused(tmp_path):
         ij.load_sweep(tmp_path / "nothing")
 
 
+class Payload:
+    """What is unpickled makes a file."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
+
+
+def crafted(path, marker, kind):
+    """A store, written by hand, in which the chunks of `margin` are unpickled."""
+    attributes = {"iblf_jax_store": 1, "config": {}, "cases": 1, "unit": 1, "variables": ["margin"]}
+    array = {"zarr_format": 2, "shape": [1], "chunks": [1], "dtype": "<f8", "fill_value": 0, "order": "C"}
+    done = array | {"dtype": "<u8", "fill_value": 1, "compressor": None, "filters": None}
+    array |= {"dtype": "|O", "fill_value": "", "compressor": None, "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}
+    group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+    inline = {"kind": "inline", "must_understand": False, "metadata": {"margin": array, "done": done}}
+    for folder, each in (("margin", array), ("done", done)):
+        (path / folder).mkdir(parents=True)
+        (path / folder / ".zarray").write_text(json.dumps(each))
+    if kind == "format 2":
+        (path / ".zgroup").write_text('{"zarr_format": 2}')
+        (path / ".zattrs").write_text(json.dumps(attributes))
+    else:
+        (path / "zarr.json").write_text(json.dumps(group | ({"consolidated_metadata": inline} if kind == "hidden in format 3" else {})))
+    (path / "margin" / "0").write_bytes(pickle.dumps(Payload(marker)))
+
+
+@pytest.mark.parametrize("kind", ["format 2", "hidden in format 3", "format 2 in a group of format 3"])
+def test_a_store_that_would_run_code_is_not_opened(tmp_path, monkeypatch, kind):
+    """Issue 12: metadata of zarr's older format may name the codec `pickle`, which numcodecs before 0.16.6 obeys."""
+    import numcodecs.pickles
+    import zarr
+
+    monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
+    path, marker = tmp_path / "sweep.zarr", tmp_path / "marker"
+    crafted(path, marker, kind)
+    for read in (ij.load_sweep, lambda place: cases.table(store=place)):
+        with pytest.raises(ij.StoreError, match=r"sweep.zarr.*(not a store|is damaged)") as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+    assert not marker.exists()
+    if kind != "format 2 in a group of format 3":
+        with contextlib.suppress(Exception):  # what comes out is no array
+            zarr.open_group(str(path), mode="r")["margin"][:]
+        assert marker.exists(), "this store is no danger, so the test shows nothing"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda attributes, margin: margin.update(data_type="string", fill_value=""),
+        lambda attributes, margin: margin.update(data_type="bytes", fill_value=""),
+        lambda attributes, margin: margin.update(shape=[3000, 3]),
+        lambda attributes, margin: margin.update(shape=[10**15, 2]),
+        lambda attributes, margin: margin.update(zarr_format=2),
+        lambda attributes, margin: attributes.update(cases=10**15),
+        lambda attributes, margin: attributes.update(cases="3000"),
+        lambda attributes, margin: attributes.update(unit=0),
+        lambda attributes, margin: attributes.update(unit=10**15),
+        lambda attributes, margin: attributes.update(variables=["../../margin"]),
+        lambda attributes, margin: attributes.update(variables=[["margin"]]),
+        lambda attributes, margin: attributes.update(variables="margin"),
+        lambda attributes, margin: attributes.update(config={}),
+        lambda attributes, margin: attributes.update(config=[]),
+        lambda attributes, margin: attributes.update(config=None),
+        lambda attributes, margin: attributes.pop("config"),
+        lambda attributes, margin: attributes["config"].update(dims=3),
+        lambda attributes, margin: attributes["config"].update(points={"controller.K2": None}),
+    ],
+)
+def test_a_description_that_is_wrong_is_refused(finished, change):
+    group, margin = (json.loads((finished / name / "zarr.json").read_text()) for name in ("", "margin"))
+    change(group["attributes"], margin)
+    (finished / "zarr.json").write_text(json.dumps(group))
+    (finished / "margin" / "zarr.json").write_text(json.dumps(margin))
+    with pytest.raises(ij.StoreError, match=r"sweep.zarr: .*damaged") as caught:
+        ij.load_sweep(finished)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600 + len(str(finished))
+
+
 def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(ij.StoreError, match="cannot be written"):
@@ -274,6 +359,82 @@ def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
     assert "StoreWriteError" in done.stderr
     assert "no space left" in done.stderr
     assert list(tmp_path.iterdir()) == [], "half a store was left behind"
+
+
+def cut_in(monkeypatch, count, deed):
+    """Does something before the so-many-th write of an array."""
+    import zarr
+
+    plain, written = zarr.Array.__setitem__, []
+
+    def write(self, *words):
+        written.append(1)
+        if len(written) == count:
+            deed()
+        return plain(self, *words)
+
+    monkeypatch.setattr(zarr.Array, "__setitem__", write)
+
+
+@pytest.mark.parametrize("count", [1, 6, 9, 25])
+def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkeypatch, count):
+    """Noticed at the unit at hand; nothing of it stays that would be in the way of the same call."""
+    path = tmp_path / "sweep.zarr"
+    with monkeypatch.context() as patch:
+        cut_in(patch, count, lambda: shutil.rmtree(path))
+        with pytest.raises(store.StoreWriteError, match=r"was deleted while it was in use\. Start the same call again"):
+            cases.table(store=path)
+    assert list(tmp_path.iterdir()) == []
+    assert cases.table(store=path).identical(table)
+
+
+def test_a_store_that_is_deleted_at_the_very_end_is_noticed(tmp_path, monkeypatch):
+    path, plain = tmp_path / "sweep.zarr", store.Store.write
+
+    def write(self, unit, data):
+        plain(self, unit, data)
+        if unit == 11:
+            shutil.rmtree(path)
+
+    monkeypatch.setattr(store.Store, "write", write)
+    with pytest.raises(store.StoreWriteError, match="was deleted"):
+        cases.table(store=path)
+
+
+@pytest.mark.parametrize("what", ["an array", "another store"])
+def test_a_store_that_is_changed_meanwhile_is_not_written_on(tmp_path, finished, monkeypatch, what):
+    path = tmp_path / "new" / "sweep.zarr"
+
+    def deed():
+        if what == "an array":
+            shutil.rmtree(path / "margin")
+        else:
+            shutil.rmtree(path)
+            shutil.copytree(finished, path)
+            settings = json.loads((path / "zarr.json").read_text())
+            settings["attributes"]["config"]["seed"] = 4
+            (path / "zarr.json").write_text(json.dumps(settings))
+
+    cut_in(monkeypatch, 9, deed)
+    with pytest.raises(store.StoreWriteError, match="lost arrays" if what == "an array" else "was replaced"):
+        cases.table(store=path)
+
+
+def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
+    """At once, not after an hour; the store's name may hold what a pattern would mean something else by."""
+    path = tmp_path / "sweep[1].zarr"
+    code = (
+        "import os, signal, sys; from pathlib import Path; from iblf_jax.studies import store\n"
+        "os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "store.open_store(Path(sys.argv[1]), {}, {'x': store.Variable((2,), 'float64', ('joint',), 'rad')}, 4, 2)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], env=cases.environment(tmp_path / "compiled"), timeout=300)
+    assert done.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left.name.endswith(".partial")
+    assert (left / "store" / "x").is_dir()
+    assert cases.table(store=path).identical(table)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # -------------------------------------------------------------------------------------------------------- killed, interrupted

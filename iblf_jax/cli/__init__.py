@@ -15,12 +15,12 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NoReturn
 
 import jax
 
-from iblf_jax.studies.interrupt import INTERRUPTED, end_process
+from iblf_jax._start import INTERRUPTED, end_process
+from iblf_jax.lowering.toolchain import ToolchainError, cache_directory, not_ours
 
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
@@ -117,10 +117,13 @@ def prepare_jax() -> None:
     jax.config.update("jax_enable_x64", True)
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+        folder = cache_directory()
+        stranger = not_ours(folder)
+    except (ToolchainError, OSError):
+        return
+    if stranger is not None:
+        warnings.warn(f"compiled programs are not kept: {folder} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
         return
     if os.access(folder, os.W_OK | os.X_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))

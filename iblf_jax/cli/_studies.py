@@ -47,6 +47,7 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
     from iblf_jax.studies.store import StoreError, StoreWriteError
 
     _check_out(args.out)
+    distributed.check_seconds("--heartbeat", args.heartbeat)
     if args.devices is not None:
         jax.config.update("jax_num_cpu_devices", checks.positive_integer("--devices", args.devices))
     job = (args.coordinator, args.num_processes, args.process_id)

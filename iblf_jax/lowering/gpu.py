@@ -89,7 +89,7 @@ def kernel(program: Program, shared: int, lane: int, target: str) -> str:
     library, key = built(launcher(program, shared, lane, image))
     name = f"iblf_jax_{key}"
     if name not in _registered:
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library).iblf_jax_kernel), platform="CUDA")
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="CUDA")
         _registered.add(name)
     return name
 

@@ -47,7 +47,7 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
     library, key = built(source(program, shared, lane), ("-DVECTOR_BYTES=16",) if narrow else ())
     name = f"iblf_jax_{key}"
     if name not in _registered:
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library).iblf_jax_kernel), platform="cpu")
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="cpu")
         _registered.add(name)
     return name
 

@@ -16,7 +16,7 @@ from ctypes import byref, c_char_p, c_int, c_size_t, c_void_p
 from functools import cache
 from pathlib import Path
 
-from iblf_jax.lowering.toolchain import ToolchainError, kept
+from iblf_jax.lowering.toolchain import ToolchainError, content_of, kept
 
 FLAGS = ("--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true", "-w")
 """Products go into sums unrounded, as on `native`; otherwise every operation is rounded as IEEE 754 wants it."""
@@ -98,4 +98,4 @@ def compiled(source: str, architecture: str) -> bytes:
     """
     flags = (*FLAGS, f"--gpu-architecture={architecture}")
     path, _ = kept([source, *flags, version()], ".cubin", lambda result: result.write_bytes(_compile(source, flags)))
-    return path.read_bytes()
+    return content_of(path)

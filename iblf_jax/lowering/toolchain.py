@@ -1,32 +1,49 @@
 """The system's C++ compiler: found, run without a shell, its results kept by content in a directory that only the user can write.
 
 The key of a kernel is a hash of its source, the flags, the compiler's version, the processor and the header of XLA's interface, so a
-stale kernel is never loaded.  A kernel is built under a temporary name and renamed, so that two processes do not disturb each other.
+stale kernel is never loaded.  A kernel is made in a draft, written out to the disk and renamed, so that two processes do not disturb each
+other.  A digest of key and content stands at its end: a file that does not fit it, for whatever reason, is made again, and what is loaded
+is a copy of what was checked.  Nothing here follows a symbolic link that it finds in the directory.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
 import platform
 import shutil
+import signal
 import stat
 import subprocess
 import tempfile
+import threading
+import time
+import warnings
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 
 import jax
 
+from iblf_jax.drafts import draft, remove_abandoned
+
 FLAGS = (
     "-x", "c++", "-std=gnu++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math",
     "-ffp-contract=fast", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden", "-w",
 )  # fmt: skip
 """NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only."""
-TIMEOUT = 300
+TIMEOUT = 300.0
 """Seconds that a compiler may take."""
+VERSION_TIMEOUT = 20.0
+"""Seconds that it may take to say its version."""
+MOST_TEXT = 1 << 20
+"""Bytes of a compiler's text that are read."""
+MOST_THREADS = 256
+"""Threads that a kernel takes at most (`c/driver.h`)."""
+DIGEST = hashlib.sha256
+"""Of the key and the content, at the end of every kept file."""
 
 
 class ToolchainError(Exception):
@@ -43,9 +60,27 @@ def compiler() -> str:
     raise ToolchainError("there is no C++ compiler" + (f" {wanted!r} ($CXX)" if wanted else " (c++, g++, clang++)"))
 
 
-@cache
 def _version(path: str) -> str:
-    return _run([path, "--version"]).splitlines()[0]
+    """What a compiler says of itself in its first line."""
+    try:
+        version = _version_of(path, os.stat(path).st_mtime_ns)
+    except OSError as error:
+        raise ToolchainError(f"{Path(path).name} could not be run: {error.strerror}") from None
+    if isinstance(version, ToolchainError):
+        raise version
+    return version
+
+
+@cache
+def _version_of(path: str, changed: int) -> str | ToolchainError:
+    """The version, or why there is none: a compiler that hangs is asked once."""
+    try:
+        lines = _run([path, "--version"], "stdout", VERSION_TIMEOUT).decode().splitlines()
+    except ToolchainError as error:
+        return error
+    except UnicodeDecodeError:
+        return ToolchainError(f"{Path(path).name} --version prints what is no text")
+    return next((line.strip() for line in lines if line.strip()), None) or ToolchainError(f"{Path(path).name} --version prints nothing")
 
 
 @cache
@@ -65,31 +100,66 @@ def built_for() -> dict[str, str]:
     return {"processor": f"{', '.join(names) or platform.machine()}, features {features}", "compiler": f"{_version(path)}, {path}"}
 
 
-def _run(command: list[str]) -> str:
+def _run(command: list[str], stream: str, seconds: float) -> bytes:
+    """What a command says on one of its streams; ToolchainError if it fails, or takes too long, it and all that it has started."""
+    name, said = Path(command[0]).name, list[bytes]()
+    out, err = (subprocess.PIPE if stream == x else subprocess.DEVNULL for x in ("stdout", "stderr"))
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False, stdin=subprocess.DEVNULL)
-    except (OSError, subprocess.SubprocessError) as error:
-        raise ToolchainError(f"{Path(command[0]).name} could not be run: {error}") from None
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines() or ["no message"]
-        raise ToolchainError(f"{Path(command[0]).name} failed: {lines[0][:200]}")
-    return done.stdout
+        process = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+    except (OSError, ValueError) as error:
+        raise ToolchainError(f"{name} could not be run: {error}") from None
+
+    def listen() -> None:
+        with getattr(process, stream) as pipe:
+            said.append(pipe.read(MOST_TEXT))
+
+    listener, end = threading.Thread(target=listen, daemon=True), time.monotonic() + seconds
+    listener.start()
+    try:
+        listener.join(seconds)
+        code = process.wait(max(0.0, end - time.monotonic()))
+    except BaseException as error:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if isinstance(error, subprocess.TimeoutExpired):
+            raise ToolchainError(f"{name} took longer than {seconds:g} s and was stopped") from None
+        raise
+    text = said[0] if said else b""
+    if code:
+        lines = text.decode(errors="replace").splitlines()
+        named = [line for line in lines if "error" in line] or lines or ["no message"]
+        raise ToolchainError(f"{name} failed: " + (f"ended by signal {-code}" if code < 0 else named[0][:200]))
+    return text
 
 
 def cache_directory() -> Path:
     """Where kernels are kept: $XDG_CACHE_HOME/iblf_jax, mode 0700; ToolchainError if it cannot be made or is not this user's."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    path = (Path(base) if base else Path.home() / ".cache") / "iblf_jax"
+    path = None
     try:
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = path.lstat()
+        if path.is_symlink():
+            raise ToolchainError(f"the kernel cache {path} is a link and not a directory of this user")
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            status = os.fstat(folder)
+            if status.st_uid != os.getuid():
+                raise ToolchainError(f"the kernel cache {path} is not a directory of this user")
+            if stat.S_IMODE(status.st_mode) & 0o077:
+                os.fchmod(folder, 0o700)
+        finally:
+            os.close(folder)
     except (OSError, RuntimeError) as error:
-        raise ToolchainError(f"the kernel cache {path} cannot be made: {error}") from None
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
-        raise ToolchainError(f"the kernel cache {path} is not a directory of this user")
-    if stat.S_IMODE(status.st_mode) & 0o077:
-        path.chmod(0o700)
+        raise ToolchainError(f"the kernel cache {path or '~/.cache/iblf_jax'} cannot be made: {error}") from None
     return path
+
+
+def not_ours(folder: Path) -> str | None:
+    """The name of something in a folder that another user owns, or that is a link; None if there is none."""
+    with os.scandir(folder) as entries:
+        found = (x.name for x in entries if x.is_symlink() or x.stat(follow_symlinks=False).st_uid != os.getuid())
+        return next(found, None)
 
 
 def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
@@ -102,39 +172,114 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     def compile_to(result: Path) -> None:
         text = result.with_suffix(".cc")
         text.write_text(source)
-        _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"])
+        _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"], "stderr", TIMEOUT)
 
     return kept(content, ".so", compile_to)
 
 
 def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) -> tuple[Path, str]:
-    """The file that `make(path)` writes, and the key of its content, made unless it is in the cache; ToolchainError on failure."""
+    """The file that holds what `make(path)` writes, and the key of its content; made unless it is in the cache, whole and this user's.
+
+    Raises:
+      ToolchainError: it cannot be made, or there is no safe place or no room for it.
+    """
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
     directory = cache_directory()
     path = directory / f"{key}{suffix}"
-    if not _is_ours(path):
-        with tempfile.TemporaryDirectory(dir=directory) as folder:
-            result = Path(folder) / f"kernel{suffix}"
-            make(result)
-            result.chmod(0o700)
-            os.replace(result, path)
+    try:
+        if _checked(path) is None:
+            for left in directory.glob("tmp????????"):  # of version 0.1.0
+                remove_abandoned(left, lockable=False)
+            with draft(directory, "kernel") as folder:
+                made = folder / f"made{suffix}"
+                make(made)
+                image = _read(made)
+                if not image:
+                    raise ToolchainError("the compiler left no file")
+                _write(folder, image, path)
+    except OSError as error:
+        raise ToolchainError(f"the kernel cache {directory} cannot be used: {error}") from None
     return path, key
 
 
-def _is_ours(path: Path) -> bool:
+def _write(folder: Path, image: bytes, path: Path) -> None:
+    """Puts a file with its digest into its place, from a draft, and on to the disk's surface."""
+    whole = folder / "whole"
+    file = os.open(whole, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o700)
+    with open(file, "wb") as out:
+        os.fchmod(file, 0o700)
+        out.write(image + DIGEST(path.stem.encode() + image).digest())
+        out.flush()
+        os.fsync(file)
+    if path.is_dir() and not path.is_symlink():
+        path.rename(folder / "in the way")
+    whole.replace(path)
+    parent = os.open(path.parent, os.O_RDONLY)
+    with contextlib.suppress(OSError):  # not every disk can do that for a directory
+        os.fsync(parent)
+    os.close(parent)
+
+
+def _read(path: Path, forbidden: int = 0) -> bytes | None:
+    """The bytes of a file; None if it is none of this user's, or has a bit of `forbidden` in its mode."""
     try:
-        status = path.lstat()
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # neither follows a link nor waits at a pipe
+        with open(file, "rb") as opened:
+            status = os.fstat(file)
+            fits = stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & forbidden
+            return opened.read() if fits else None
     except OSError:
-        return False
-    return stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid() and not stat.S_IMODE(status.st_mode) & 0o022
+        return None
 
 
-def loaded(library: Path) -> ctypes.CDLL:
-    """The library in this process; ToolchainError if it does not load."""
+def _checked(path: Path) -> bytes | None:
+    """What a kept file holds; None if it is not there, not whole, of another key, or could have been written by another user."""
+    whole, size = _read(path, forbidden=0o022) or b"", DIGEST().digest_size
+    image, digest = whole[:-size], whole[-size:]
+    return image if DIGEST(path.stem.encode() + image).digest() == digest else None
+
+
+def content_of(path: Path) -> bytes:
+    """What a file of `kept` holds; ToolchainError if it has been damaged since."""
+    image = _checked(path)
+    if image is None:
+        raise ToolchainError(f"the kernel {path} was damaged just now")
+    return image
+
+
+_libraries: dict[str, ctypes.CDLL] = {}
+"""Key -> what this process has loaded of it: once, as XLA takes one address for a name."""
+
+
+def loaded(library: Path, *names: str) -> ctypes.CDLL:
+    """A library of `built` in this process, from a copy that nobody can change; ToolchainError if it does not load or lacks a name."""
+    key = library.stem
     try:
-        return ctypes.CDLL(str(library))
-    except OSError as error:
+        found = _libraries[key] if key in _libraries else _load(content_of(library))
+        for name in names:
+            getattr(found, name)
+    except (OSError, AttributeError) as error:
+        with contextlib.suppress(OSError):
+            library.unlink()  # the compiler may do better another time
         raise ToolchainError(f"a kernel does not load: {error}") from None
+    return _libraries.setdefault(key, found)
+
+
+def _load(image: bytes) -> ctypes.CDLL:
+    """A library from its bytes."""
+    file = None
+    try:
+        file = os.memfd_create("iblf_jax")
+        with open(file, "wb", closefd=False) as out:
+            out.write(image)
+        return ctypes.CDLL(f"/proc/self/fd/{file}")  # and stays open: the loader takes another library of this name for this one
+    except (OSError, AttributeError):  # no such files on this system, or none that may be executed
+        if file is not None:
+            os.close(file)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kernel.so"
+        path.write_bytes(image)
+        return ctypes.CDLL(str(path))
 
 
 def processors() -> int:
@@ -143,8 +288,16 @@ def processors() -> int:
 
 
 def threads() -> int:
-    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the process's processors, divided among its CPU devices."""
+    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the process's processors, divided among its CPU devices.
+
+    What is no whole number from 1 to 256 is warned of: a larger one counts as 256, anything else as not given.
+    """
     wanted = os.environ.get("IBLF_JAX_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
-        return int(wanted)
-    return max(1, processors() // jax.local_device_count("cpu"))
+    usual = max(1, processors() // jax.local_device_count("cpu"))
+    number = wanted.lstrip("0") if wanted.isascii() and wanted.isdigit() else ""
+    if not wanted or (0 < len(number) < 10 and int(number) <= MOST_THREADS):
+        return int(number) if wanted else usual
+    chosen = MOST_THREADS if number else usual
+    expected = f"expected a whole number from 1 to {MOST_THREADS}. Running with {chosen} threads."
+    warnings.warn(f"IBLF_JAX_THREADS: got {wanted[:40]!r}, {expected}", stacklevel=2)
+    return chosen

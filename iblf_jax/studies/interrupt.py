@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
 from types import FrameType, TracebackType
-from typing import Any, NoReturn
+from typing import Any
 
-INTERRUPTED = 130
-"""Exit code of a process that was interrupted."""
-
-
-def end_process(number: int, frame: FrameType | None) -> NoReturn:
-    """A signal's handler for a process of its own: it ends here and now.
-
-    Nothing is unwound: XLA may be compiling in a thread, and crashes when what it works on goes.
-    """
-    sys.stdout.flush()
-    sys.stderr.write("iblf-jax: error: interrupted\n")
-    sys.stderr.flush()
-    os._exit(INTERRUPTED)
-
+from iblf_jax._start import end_process
 
 SIGNALS = {signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)), signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,))}
 """Signals that ask, what they are called, and who handles them where nobody else does.  A cluster sends SIGTERM before it kills."""

@@ -2,6 +2,8 @@
 
 Only the results of the metrics are kept of each run, so memory does not grow with the length of a run; any run can be looked
 at again in full with `study.replay(i)`.
+
+Workers of one's own (`multiprocessing`) are to be started by `spawn` or `forkserver`: a `fork` of a process in which JAX has run hangs.
 """
 
 from __future__ import annotations

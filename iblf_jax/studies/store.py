@@ -1,11 +1,13 @@
 """A store of runs on disk (zarr) that survives a kill at any moment.
 
-- It is made in a temporary folder and renamed in: there is never half a store.
+- It is made in a draft and renamed in: there is never half a store.
 - A **unit** is a number of consecutive cases, and one whole chunk of every array, so processes that write different units never touch the
   same file, and two that write the same unit write the same bytes.  zarr writes a chunk to a temporary file and renames it.
 - A unit's data are written first, its mark in `done` after them, one unit a chunk.  The mark holds a checksum of the unit's data and of
   the configuration: data that are torn, missing, or of another store do not fit their mark and are not read.
 - The attributes hold the whole configuration.  A store that was made with another one is refused, naming the difference.
+- Only arrays of numbers in zarr's format 3 are opened: the older format, and objects, can make the reader run code.
+- What describes the store is looked at again around every write: one that was deleted or replaced meanwhile is not written on.
 
 zarr does not force data to the disk's surface: a kill cannot tear a store, a power failure can, and then the checksum tells.
 """
@@ -16,9 +18,6 @@ import contextlib
 import errno
 import json
 import os
-import shutil
-import time
-import uuid
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -27,13 +26,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax.drafts import draft
+
 FORMAT = 1
 DONE = "done"
 CASE = "case"
 _MARK = "iblf_jax_store"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
-_STALE = 3600.0
+_NUMBERS = "fiub"
+"""Kinds of data types that a store may hold; no objects, which zarr unpickles."""
 
 
 class StoreError(RuntimeError):
@@ -88,10 +90,13 @@ class Store:
         self.config: dict[str, Any] = attributes["config"]
         self.cases: int = attributes["cases"]
         self.unit: int = attributes["unit"]
+        if any(isinstance(x, bool) or not isinstance(x, int) or x < 1 for x in (self.cases, self.unit)):
+            raise ValueError(f"{self.cases!r} cases in units of {self.unit!r}")
         self.units = -(-self.cases // self.unit)
         self._salt = zlib.crc32(json.dumps(self.config, sort_keys=True).encode())
-        self._arrays = {name: group[name] for name in attributes["variables"]}
-        self._done = group[DONE]
+        self._arrays = {name: _numbers(group, name, self.cases, self.unit) for name in attributes["variables"]}
+        self._done = _numbers(group, DONE, self.units, 1)
+        self._description = self._described()
 
     @property
     def names(self) -> list[str]:
@@ -104,6 +109,7 @@ class Store:
 
     def marks(self) -> np.ndarray:
         """Which units are marked as done, (units,) bool."""
+        self._check_it_is_there()
         with self._reading("the marks"):
             return np.asarray(self._done[:]) != 0
 
@@ -122,11 +128,59 @@ class Store:
         return (1 << 32) | total
 
     def write(self, unit: int, data: Mapping[str, np.ndarray]) -> None:
-        """Writes one unit: its data, then its mark."""
-        with self._writing():
-            for name, array in self._arrays.items():
-                array[self.span(unit)] = data[name]
-            self._done[unit] = self._mark(data)
+        """Writes one unit: its data, then its mark.
+
+        Raises:
+          StoreWriteError: it cannot be written, or somebody has deleted or replaced the store; nothing of the unit stays then.
+        """
+        self._check_it_is_there()
+        try:
+            with self._writing():
+                for name, array in self._arrays.items():
+                    array[self.span(unit)] = data[name]
+                self._done[unit] = self._mark(data)
+            self._check_it_is_there()
+        except StoreWriteError:
+            self._take_back(unit)
+            raise
+
+    def _described(self) -> list[bytes | None]:
+        """What describes this store on disk: the group's file and those of its arrays; None for one that is not there."""
+
+        def content(file: Path) -> bytes | None:
+            try:
+                return file.read_bytes()
+            except OSError:
+                return None
+
+        return [content(self.path / name / "zarr.json") for name in ("", *self._arrays, DONE)]
+
+    def _check_it_is_there(self) -> None:
+        """StoreWriteError if the store was deleted, wholly or in part, or another one is in its place."""
+        now = self._described()
+        if now == self._description:
+            return
+        if now[0] is None:
+            text = "was deleted while it was in use. Start the same call again to begin anew, or choose another path."
+        elif now[0] != self._description[0]:
+            text = "was replaced by another store while it was in use. Choose another path, and start the same call again."
+        else:
+            text = "lost arrays while it was in use. Delete what is left of it, and start the same call again."
+        raise StoreWriteError(f"{self.path}: {text}")
+
+    def _take_back(self, unit: int) -> None:
+        """Removes what was written of a unit into a store that was deleted meanwhile, with the folders that came to be by it."""
+        if (self.path / "zarr.json").exists():
+            return
+        for array in (*self._arrays.values(), self._done):
+            first = (unit, *[0] * (array.ndim - 1))
+            chunk = self.path / array.path / array.metadata.encode_chunk_key(first)
+            with contextlib.suppress(OSError):
+                chunk.unlink(missing_ok=True)
+                for folder in chunk.parents:  # up to the first that holds something else
+                    folder.rmdir()
+                    if folder == self.path:
+                        break
 
     def read(self, unit: int) -> dict[str, np.ndarray] | None:
         """The data of one unit; None if they do not fit its mark."""
@@ -166,7 +220,7 @@ class Store:
         try:
             yield
         except Exception as error:
-            raise StoreError(f"{self.path}: {what} cannot be read ({type(error).__name__}: {error}).") from error
+            raise StoreError(f"{self.path}: {what} cannot be read ({_said(error)}).") from error
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -175,6 +229,22 @@ class Store:
         except OSError as error:
             kept = f"{int(self.marks().sum())} of {self.units} units are written and valid: start the same call again to go on"
             raise _why(self.path, error, kept) from error
+
+
+def _numbers(group: Any, name: str, rows: int, chunk: int) -> Any:
+    """An array of a group; ValueError if it is none of numbers that this package could have written."""
+    array = group[name]
+    format_, kind = getattr(array.metadata, "zarr_format", None), getattr(getattr(array, "dtype", None), "kind", None)
+    if format_ != 3 or kind is None or kind not in _NUMBERS:
+        raise ValueError(f"{name!r} is no array of numbers in zarr's format 3")
+    if array.shape[:1] != (rows,) or array.chunks != (min(chunk, rows), *array.shape[1:]):
+        raise ValueError(f"{name!r} has the shape {array.shape} in chunks of {array.chunks}, which is not that of {rows} rows")
+    return array
+
+
+def _said(error: Exception) -> str:
+    """An error of a library, in one line of a bounded length."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]
 
 
 def _why(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
@@ -198,7 +268,8 @@ def load_store(path: str | os.PathLike) -> Store:
     if not place.exists():
         raise StoreError(f"{place}: there is no store here.")
     try:
-        group = zarr.open_group(str(place), mode="r+")
+        # Not the consolidated metadata, in which arrays of the older format may hide.
+        group = zarr.open_group(str(place), mode="r+", zarr_format=3, use_consolidated=False)
         known = group.attrs.get(_MARK)
     except PermissionError as error:
         raise StoreError(f"{place}: cannot be read ({error.strerror}).") from error
@@ -210,7 +281,7 @@ def load_store(path: str | os.PathLike) -> Store:
     try:
         return Store(place, group)
     except Exception as error:
-        raise StoreError(f"{place}: is damaged: its description is incomplete ({type(error).__name__}: {error}).") from error
+        raise StoreError(f"{place}: is damaged: its description is wrong ({_said(error)}). Delete it, or choose another path.") from error
 
 
 def open_store(
@@ -264,37 +335,27 @@ def _exists(place: Path) -> bool:
 def _make(place: Path, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int) -> None:
     """Makes a store beside its place and renames it in; if another process was first, its store stays."""
     zarr = _zarr()
-    draft = place.parent / f".{place.name}.{uuid.uuid4().hex}.partial"
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        _sweep_up(place)
-        group = zarr.open_group(str(draft), mode="w")
-        for name, v in variables.items():
-            array = group.create_array(
-                name,
-                shape=(cases, *v.shape),
-                chunks=(unit, *v.shape),
-                dtype=v.dtype,
-                fill_value=np.nan if np.dtype(v.dtype).kind == "f" else -1,
-                dimension_names=(CASE, *v.dims),
-                config={"write_empty_chunks": True},
-            )
-            array.attrs["units"] = v.unit
-        group.create_array(DONE, shape=(-(-cases // unit),), chunks=(1,), dtype="uint64", fill_value=0, dimension_names=("unit",))
-        group.attrs.update({_MARK: FORMAT, "config": config, "cases": cases, "unit": unit, "variables": list(variables)})
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # zarr says that consolidated metadata are not in its specification yet
-            zarr.consolidate_metadata(group.store)
-        os.rename(draft, place)
+        with draft(place.parent, place.name) as folder:
+            group = zarr.open_group(str(folder / "store"), mode="w", zarr_format=3)
+            for name, v in variables.items():
+                array = group.create_array(
+                    name,
+                    shape=(cases, *v.shape),
+                    chunks=(unit, *v.shape),
+                    dtype=v.dtype,
+                    fill_value=np.nan if np.dtype(v.dtype).kind == "f" else -1,
+                    dimension_names=(CASE, *v.dims),
+                    config={"write_empty_chunks": True},
+                )
+                array.attrs["units"] = v.unit
+            group.create_array(DONE, shape=(-(-cases // unit),), chunks=(1,), dtype="uint64", fill_value=0, dimension_names=("unit",))
+            group.attrs.update({_MARK: FORMAT, "config": config, "cases": cases, "unit": unit, "variables": list(variables)})
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # zarr says that consolidated metadata are not in its specification yet
+                zarr.consolidate_metadata(group.store)
+            os.rename(folder / "store", place)
     except OSError as error:
-        shutil.rmtree(draft, ignore_errors=True)
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not place.is_dir():
             raise _why(place, error) from error
-
-
-def _sweep_up(place: Path) -> None:
-    """Removes what a process that was killed while making this store has left behind an hour ago or more."""
-    for draft in place.parent.glob(f".{place.name}.*.partial"):
-        with contextlib.suppress(OSError):
-            if time.time() - draft.stat().st_mtime > _STALE:
-                shutil.rmtree(draft, ignore_errors=True)

@@ -148,7 +148,11 @@ def load_sweep(store: str | os.PathLike) -> xarray.Dataset:
     Raises:
       StoreError: no store, a foreign or a damaged one.
     """
-    return _dataset(load_store(store))
+    opened = load_store(store)
+    try:
+        return _dataset(opened)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, MemoryError) as error:
+        raise StoreError(f"{store}: is damaged: its configuration is wrong ({type(error).__name__}). Choose another store.") from error
 
 
 def _dataset(store: Store) -> xarray.Dataset:

@@ -1,0 +1,449 @@
+"""The compiler and the cache of kernels: whatever is wrong with either, a kernel is right or is not there."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import jax
+import pytest
+from conftest import ROOT
+
+from iblf_jax import cli, drafts, lowering
+from iblf_jax.lowering import native, nvrtc, toolchain
+from iblf_jax.lowering.toolchain import ToolchainError
+
+SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { return 41; }'
+OTHER = SOURCE.replace("41", "42")
+
+needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+
+
+def value(source=SOURCE):
+    """What a small library returns, built if need be."""
+    return toolchain.loaded(toolchain.built(source)[0], "value").value()
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    """A cache with two kernels, to be copied, and the name of the first."""
+    folder = tmp_path_factory.mktemp("filled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        patch.setattr(toolchain, "_libraries", {})
+        assert [value(), value(OTHER)] == [41, 42]
+        return folder, toolchain.built(SOURCE)[0].name
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of its own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(toolchain, "_libraries", {})  # as in another process
+    return tmp_path / "cache" / "iblf_jax"
+
+
+@pytest.fixture
+def library(filled, cache):
+    """The first kernel in a cache with both."""
+    shutil.copytree(filled[0], cache.parent)
+    return cache / filled[1]
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def damages():
+    """Ways in which a file comes to hold something else, as functions of the folder and the file."""
+    draw = random.Random(0)
+    cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1], [draw.random() for _ in range(8)]
+    ways = {f"cut at {x:.3f}": lambda _, f, x=x: f.write_bytes(f.read_bytes()[: int(x * f.stat().st_size) if x >= 0 else -1]) for x in cuts}
+    ways |= {f"bit at {x:.3f}": lambda _, f, x=x: f.write_bytes(flipped(f.read_bytes(), int(x * 8 * f.stat().st_size))) for x in bits}
+    ways |= {
+        "text": lambda _, f: f.write_text("this is no library\n"),
+        "longer": lambda _, f: f.write_bytes(f.read_bytes() + b"\0"),
+        "zeros": lambda _, f: f.write_bytes(bytes(f.stat().st_size)),
+        "another kernel": lambda folder, f: shutil.copy(next(x for x in folder.iterdir() if x != f), f),
+        "another library": lambda _, f: shutil.copy(Path(jax.__file__).parents[1] / "jaxlib" / "_jax.so", f),
+        "a folder": lambda _, f: (f.unlink(), f.mkdir(), (f / "x").write_text("")),
+        "a pipe": lambda _, f: (f.unlink(), os.mkfifo(f)),
+        "gone": lambda _, f: f.unlink(),
+        "writable by others": lambda _, f: f.chmod(0o722),
+    }
+    return ways
+
+
+DAMAGES = damages()
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_kernel_is_built_again(library, damage):
+    """Never loaded, in this process or a later one: truncated it kills, with one bit flipped it may return anything."""
+    DAMAGES[damage](library.parent, library)
+    assert toolchain._checked(library) is None, "the damage is seen"
+    assert value() == 41
+    assert toolchain._checked(library) is not None
+    assert sorted(x.suffix for x in library.parent.iterdir()) == [".so", ".so"], "nothing temporary stays"
+    assert stat.S_IMODE(library.stat().st_mode) == 0o700
+
+
+@needs_compiler
+def test_a_whole_kernel_is_not_built_again(library, monkeypatch):
+    monkeypatch.setattr(toolchain, "draft", lambda *_: pytest.fail("built again"))
+    assert value() == 41
+    assert value(OTHER) == 42
+
+
+@needs_compiler
+def test_what_was_checked_is_loaded(library):
+    """A file that is damaged between the check and the load is not loaded; one that is damaged after it does no harm."""
+    loaded = toolchain.loaded(library, "value")
+    with open(library, "r+b") as file:
+        file.truncate(100)  # a library that was mapped from this file would now kill with SIGBUS
+    assert loaded.value() == 41
+    assert toolchain.loaded(library) is loaded
+    toolchain._libraries.clear()
+    with pytest.raises(ToolchainError, match="damaged"):
+        toolchain.loaded(library)
+
+
+def test_machine_code_of_gpus_is_checked_too(cache, monkeypatch):
+    monkeypatch.setattr(nvrtc, "version", lambda: "13.0")
+    monkeypatch.setattr(nvrtc, "_compile", lambda source, flags: b"machine code")
+    assert nvrtc.compiled("source", "sm_90") == b"machine code"
+    (file,) = cache.iterdir()
+    file.write_bytes(flipped(file.read_bytes(), 5))
+    assert nvrtc.compiled("source", "sm_90") == b"machine code"
+
+
+# ------------------------------------------------------------------------------------------------------------------------- links
+
+
+@needs_compiler
+def test_links_in_the_cache_are_not_followed(library, tmp_path):
+    """Neither one in a kernel's place, nor one that poses as a draft, nor one to the cache itself."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "file").write_bytes(library.read_bytes())
+    (elsewhere / "file").chmod(0o640)
+    library.unlink()
+    library.symlink_to(elsewhere / "file")
+    for name in (".kernel.planted.partial", "tmp12345678"):
+        (library.parent / name).symlink_to(elsewhere)
+        os.utime(library.parent / name, (0, 0), follow_symlinks=False)
+    assert value() == 41
+    assert not library.is_symlink()
+    assert stat.S_IMODE((elsewhere / "file").stat().st_mode) == 0o640
+    assert [x.name for x in elsewhere.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("link", ["symbolic", "hard", "to a folder"])
+def test_a_compiler_that_leaves_a_link(cache, tmp_path, monkeypatch, link):
+    """Issue 12: the mode of the file that it points to was changed."""
+    target = tmp_path / "precious"
+    target.mkdir() if link == "to a folder" else target.write_text("precious")
+    target.chmod(0o750)
+    words = "ln" if link == "hard" else "ln -s"
+    fake(tmp_path, monkeypatch, f'echo "fake 1"; for o; do [ "$p" = -o ] && {words} {target} "$o"; p=$o; done; exit 0')
+    with pytest.raises(ToolchainError):
+        value()
+    assert stat.S_IMODE(target.lstat().st_mode) == 0o750
+    assert target.is_dir() or target.read_text() == "precious"
+
+
+def chosen_cache(monkeypatch):
+    """Where the command line keeps JAX's compiled programs, and what it says."""
+    seen, said = {}, []
+    monkeypatch.setattr(jax.config, "update", seen.__setitem__)
+    monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
+    monkeypatch.setattr(warnings, "warn", lambda text, *_, **__: said.append(text))
+    cli.prepare_jax()
+    return seen.get("jax_compilation_cache_dir"), said
+
+
+def test_programs_of_jax_get_the_check_of_the_kernels(cache, tmp_path, monkeypatch):
+    cache.mkdir(parents=True)
+    cache.chmod(0o777)
+    assert chosen_cache(monkeypatch) == (str(cache), [])
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+    (cache / "jit_run-cache").symlink_to(tmp_path)
+    found, (said,) = chosen_cache(monkeypatch)
+    assert found is None
+    assert "jit_run-cache" in said
+    shutil.rmtree(cache)
+    (tmp_path / "elsewhere").mkdir(mode=0o755)
+    cache.symlink_to(tmp_path / "elsewhere")
+    assert chosen_cache(monkeypatch)[0] is None
+    assert stat.S_IMODE((tmp_path / "elsewhere").stat().st_mode) == 0o755
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
+def test_files_and_folders_of_others_are_not_used(cache, monkeypatch):
+    cache.mkdir(parents=True)
+    (cache / "jit_run-cache").write_text("code of another user")
+    os.chown(cache / "jit_run-cache", 12345, 12345)
+    assert chosen_cache(monkeypatch)[0] is None
+    (cache / "jit_run-cache").unlink()
+    os.chown(cache, 12345, 12345)
+    assert chosen_cache(monkeypatch)[0] is None
+    with pytest.raises(ToolchainError, match="not a directory of this user"):
+        toolchain.cache_directory()
+
+
+# ------------------------------------------------------------------------------------------------------------- an unusable cache
+
+
+def a_file_in_its_place(base, monkeypatch):
+    base.mkdir()
+    (base / "iblf_jax").write_text("")
+
+
+def under_a_file(base, monkeypatch):
+    base.write_text("")
+
+
+def in_proc(base, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/self/nothing")
+
+
+def no_home(base, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("Could not determine home directory.")))
+
+
+def a_name_too_long(base, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(base / ("x" * 300)))
+
+
+def nothing_fits(number):
+    """A disk on which a folder can be entered and nothing made."""
+
+    def prepare(base, monkeypatch):
+        base.mkdir()
+        (base / "iblf_jax").mkdir(mode=0o700)
+        plain = Path.mkdir
+
+        def mkdir(self, *words, **more):
+            if self.parent.name == "iblf_jax":
+                raise OSError(number, os.strerror(number), str(self))
+            plain(self, *words, **more)
+
+        monkeypatch.setattr(Path, "mkdir", mkdir)
+
+    return prepare
+
+
+def no_room_to_write(base, monkeypatch):
+    def write(*_):
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(os, "fsync", write)
+
+
+UNUSABLE = {
+    "a file in its place": a_file_in_its_place,
+    "under a file": under_a_file,
+    "in /proc": in_proc,
+    "no home": no_home,
+    "a name too long": a_name_too_long,
+    "read-only": nothing_fits(30),
+    "no inodes": nothing_fits(28),
+    "quota": nothing_fits(122),
+    "full at the last write": no_room_to_write,
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("way", UNUSABLE)
+def test_an_unusable_cache_is_one_line_and_xla(tmp_path, monkeypatch, way):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "base"))
+    UNUSABLE[way](tmp_path / "base", monkeypatch)
+    assert falls_back(lambda: toolchain.built(SOURCE)).startswith("The native backend is not available (the kernel cache ")
+    chosen_cache(monkeypatch)
+
+
+def falls_back(work):
+    """The one line with which `work`, on the native backend, ends up on xla."""
+
+    def run_on(executor):
+        if executor is native.run:
+            work()
+        return executor
+
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        patch.setattr(lowering, "_told", set())
+        assert lowering.with_fallback("native", run_on, lambda: None) is lowering.xla.run
+    (line,) = [str(x.message) for x in said]
+    assert line.endswith("running on xla.")
+    assert "\n" not in line
+    return line
+
+
+# --------------------------------------------------------------------------------------------------------------------- compilers
+
+
+def fake(folder, monkeypatch, script):
+    """Puts a shell script in the compiler's place; $REAL is the real one."""
+    path = folder / "fake-compiler"
+    path.write_bytes(b"#!/bin/sh\n" + (script.encode() if isinstance(script, str) else script) + b"\n")
+    path.chmod(0o755)
+    monkeypatch.setenv("REAL", shutil.which("c++") or shutil.which("g++") or "")
+    monkeypatch.setenv("CXX", str(path))
+
+
+def compiles(script: str, version: str = "echo fake 1.0") -> str:
+    """A compiler that says its version and else does what `script` does, with $out the file that it is to write."""
+    return f'[ "$1" = --version ] && {{ {version}; exit 0; }}\nfor o; do [ "$p" = -o ] && out=$o; p=$o; done\n{script}'
+
+
+COMPILERS = {
+    "says no version": (compiles('"$REAL" "$@"', ":"), "prints nothing"),
+    "says empty lines": (compiles('"$REAL" "$@"', "echo; echo"), "prints nothing"),
+    "says bytes": (compiles('"$REAL" "$@"', r"printf '\377\376\200'"), "no text"),
+    "fails with bytes": (compiles(r"printf 'error: \377\376\n' >&2; exit 1"), "failed: error"),
+    "is killed": (compiles("kill -9 $$"), "signal 9"),
+    "makes nothing": (compiles("exit 0"), "left no file"),
+    "makes an empty file": (compiles(': > "$out"'), "left no file"),
+    "makes a pipe": (compiles('mkfifo "$out"'), "left no file"),
+    "makes text": (compiles('echo hello > "$out"'), "does not load"),
+    "lacks the symbol": (compiles('echo "int x;" | "$REAL" -x c++ -shared -fPIC - -o "$out"'), "undefined symbol"),
+    "says very much": (compiles("yes error >&2; exit 1"), "failed: error"),
+    "hangs": (compiles("sleep 100"), "longer than 0.5 s"),
+    "hangs in a child": (compiles("sleep 100 | cat"), "longer than 0.5 s"),
+    "hangs at its version": (compiles("exit 0", "sleep 100"), "longer than 0.5 s"),
+    "removes its folder": (compiles('rm -r "$(dirname "$out")"'), "left no file"),
+    "is no program": (b"\0\1\2", ""),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("what", COMPILERS)
+def test_a_broken_compiler_is_one_line_and_xla(cache, tmp_path, monkeypatch, what):
+    script, words = COMPILERS[what]
+    fake(tmp_path, monkeypatch, script)
+    if "hangs" in what:
+        monkeypatch.setattr(toolchain, "TIMEOUT", 0.5)
+        monkeypatch.setattr(toolchain, "VERSION_TIMEOUT", 0.5)
+    assert words in falls_back(value)
+    assert not cache.exists() or list(cache.iterdir()) == [], "nothing is left in the cache"
+    monkeypatch.delenv("CXX")
+    assert value() == 41
+
+
+@needs_compiler
+def test_a_compiler_that_hangs_takes_its_children_along(cache, tmp_path, monkeypatch):
+    fake(tmp_path, monkeypatch, compiles(f"sh -c 'echo $$ > {tmp_path}/pid; exec sleep 100'"))
+    monkeypatch.setattr(toolchain, "TIMEOUT", 0.5)
+    with pytest.raises(ToolchainError, match="longer"):
+        value()
+    number = int((tmp_path / "pid").read_text())
+    for _ in range(100):
+        if not is_running(number):
+            break
+        time.sleep(0.05)
+    assert not is_running(number)
+
+
+def is_running(number):
+    try:
+        return "Z" not in Path(f"/proc/{number}/stat").read_text().rpartition(")")[2]
+    except OSError:
+        return False
+
+
+BUILD = "import sys; from iblf_jax.lowering import toolchain as t; print(t.loaded(t.built(sys.argv[1])[0]).value())"
+
+
+@needs_compiler
+def test_two_processes_build_at_once_and_one_is_killed(cache, tmp_path, monkeypatch):
+    """Both get the kernel; of a third that is killed while it compiles nothing stays."""
+    fake(tmp_path, monkeypatch, compiles(f': > {tmp_path}/begun; sleep 0.5; "$REAL" "$@"'))
+    command = [sys.executable, "-c", BUILD, SOURCE]
+    killed = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    while not (tmp_path / "begun").exists():
+        time.sleep(0.01)
+    assert drafts_in(cache)
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    monkeypatch.delenv("CXX")
+    both = [subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert [process.communicate(timeout=60)[0] for process in both] == ["41\n", "41\n"]
+    assert [x.suffix for x in cache.iterdir()] == [".so"]
+
+
+def drafts_in(folder):
+    return list(folder.glob(".*.partial"))
+
+
+# ------------------------------------------------------------------------------------------------------------------------ drafts
+
+
+HOLD = """
+import importlib.util, pathlib, sys, time
+spec = importlib.util.spec_from_file_location("drafts", sys.argv[1])
+spec.loader.exec_module(drafts := importlib.util.module_from_spec(spec))
+with drafts.draft(pathlib.Path(sys.argv[2]), "x"):
+    print("there", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, drafts.__file__, str(tmp_path)], stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b"there\n"
+    (held,) = drafts_in(tmp_path)
+    with drafts.draft(tmp_path, "x"):
+        assert held.exists()
+        assert len(drafts_in(tmp_path)) == 2
+    holder.kill()
+    holder.communicate()
+    assert held.exists()
+    with drafts.draft(tmp_path, "y"):
+        assert held.exists(), "of something else"
+    with drafts.draft(tmp_path, "x"):
+        assert not held.exists()
+    assert drafts_in(tmp_path) == []
+
+
+def test_drafts_of_other_machines_go_by_age(tmp_path, monkeypatch):
+    young, old = (tmp_path / f".x.{name}.partial" for name in ("00000000.1", "00000000.2"))
+    young.mkdir()
+    old.mkdir()
+    os.utime(old, (1.0, 1.0))
+    with drafts.draft(tmp_path, "x"):
+        assert (young.exists(), old.exists()) == (True, False)
+
+
+# ----------------------------------------------------------------------------------------------------------------------- threads
+
+
+@pytest.mark.parametrize("wanted", ["99999999999", "9" * 5000, "257", "²", "0", "000", "-1", "abc", "1.5", " 2", "٣"])
+def test_a_number_of_threads_that_is_none_is_one_line(monkeypatch, wanted):
+    monkeypatch.delenv("IBLF_JAX_THREADS", raising=False)
+    usual = toolchain.threads()
+    monkeypatch.setenv("IBLF_JAX_THREADS", wanted)
+    with pytest.warns(UserWarning, match="IBLF_JAX_THREADS: got .*, expected a whole number from 1 to 256") as said:
+        assert toolchain.threads() == (256 if wanted[0] in "92" else usual)
+    assert len(said) == 1
+    assert len(str(said[0].message)) < 200
+
+
+@pytest.mark.parametrize(("wanted", "threads"), [("1", 1), ("007", 7), ("256", 256)])
+def test_a_number_of_threads(monkeypatch, wanted, threads):
+    monkeypatch.setenv("IBLF_JAX_THREADS", wanted)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert toolchain.threads() == threads
