@@ -135,6 +135,8 @@ class Tube(NamedTuple):
     """Rate of k_lc, (n,) [rad/s]."""
     dupper: jax.Array
     """Rate of k_uc, (n,) [rad/s]."""
+    ddq_d: jax.Array | None = None
+    """Its acceleration, (n,) [rad/s^2], for laws that feed it forward; None in a tube that barriers take alpha from."""
 
     @property
     def k_l(self) -> jax.Array:
@@ -172,20 +174,31 @@ def positive_width(k: jax.Array) -> jax.Array:
     return jnp.maximum(k, NARROWEST)
 
 
-def tube_at(reference: Reference, bounds: Bounds, t: jax.Array) -> Tube:
+def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration: bool = True) -> Tube:
     """Reference, bounds and their rates at time t, the rates by jvp.
+
+        q_d, q_d', q_d",   k_lc, k_uc and their rates
 
     Args:
       reference, bounds: the components.
       t: time, () [s].
+      acceleration: whether q_d" is wanted; False where the tube is itself differentiated in time, so that a reference need not have a
+        third derivative.
+
+    Returns:
+      `Tube`; its ddq_d costs nothing where it is not used, as what is not used is not compiled.
     """
 
     def values(t):
         q_d = reference.position(t)
         return q_d, bounds.lower.at(t, q_d), bounds.upper.at(t, q_d)
 
+    def velocity(t):
+        return jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
+
     (q_d, lower, upper), (dq_d, dlower, dupper) = jax.jvp(values, (t,), (jnp.ones_like(t),))
-    return Tube(q_d, dq_d, lower, upper, dlower, dupper)
+    ddq_d = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1] if acceleration else None
+    return Tube(q_d, dq_d, lower, upper, dlower, dupper, ddq_d)
 
 
 MEMBERS = {"constant": Constant, "sinusoid": Sinusoid, "funnel": Funnel}

@@ -90,6 +90,6 @@ def alpha_and_rate(law, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Sett
     """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,), for a law with `barrier`, `k1`, `o`."""
 
     def alpha_at(t, q):
-        return law.barrier.virtual_velocity(setting.tube(t), q, law.k1, law.o)
+        return law.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, law.k1, law.o)
 
     return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))
