@@ -32,7 +32,11 @@ class Side(Protocol):
 
 @component
 class Constant:
-    """The bound is `value`, for all time."""
+    """The bound is `value`, for all time.
+
+    Args:
+      value: the bound, () or (n,) [rad].
+    """
 
     value: Leaf = leaf("rad")
 
@@ -44,6 +48,12 @@ class Constant:
 @component
 class Sinusoid:
     """The bound is offset + amplitude sin(frequency t + phase).
+
+    Args:
+      offset: middle of its motion, () or (n,) [rad].
+      amplitude: half of its range, () or (n,) [rad].
+      frequency: angular frequency, () or (n,) [rad/s]; 1 if not given.
+      phase: phase at t = 0, () or (n,) [rad]; 0 if not given.
 
     Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
     """
@@ -63,6 +73,12 @@ class Funnel:
     """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
 
     `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a lower one.
+
+    Args:
+      initial: distance from the reference at t = 0, () or (n,) [rad].
+      final: distance that it shrinks to, () or (n,) [rad].
+      rate: how fast it shrinks, () or (n,) [1/s], >= 0.
+
     Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
     """
 
@@ -77,7 +93,12 @@ class Funnel:
 
 @component
 class Bounds:
-    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`."""
+    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`.
+
+    Args:
+      lower: the lower side, any `Side`.
+      upper: the upper side, any `Side`.
+    """
 
     lower: Side
     upper: Side

@@ -29,7 +29,12 @@ from iblf_jax.status import VELOCITY_LIMIT
 
 @component
 class Initial:
-    """Where a run starts."""
+    """Where a run starts.
+
+    Args:
+      q: position, () or (n,) [rad].
+      dq: velocity, () or (n,) [rad/s]; 0 if not given.
+    """
 
     q: Leaf = leaf("rad")
     dq: Leaf = leaf("rad/s", default=0.0)
@@ -52,6 +57,16 @@ class Scenario:
 
     Leaves that hold one number a joint may be given as a scalar; they are repeated for the plant's n joints.
 
+    Args:
+      plant: the robot that moves, any of `iblf_jax.robots`.
+      reference: what it should follow, any of `iblf_jax.references`.
+      bounds: what its joints must keep, a `bounds.Bounds`.
+      controller: the law, any of `iblf_jax.controllers`.
+      initial: where it starts, an `Initial`.
+      observer: what estimates f, any of `iblf_jax.observers`; `NoObserver()` if not given.
+      disturbance: what acts on the plant and the law does not know, any of `iblf_jax.disturbances`; `Nothing()` if not given.
+      model: the robot that law and observer know; the plant itself if not given.
+
     Raises:
       ValueError: if a leaf has the wrong number of joints, or model and plant differ in theirs.
     """
@@ -64,7 +79,6 @@ class Scenario:
     observer: Observer = NoObserver()
     disturbance: Disturbance = Nothing()
     model: Robot = None  # type: ignore[assignment]
-    """What law and observer know; the plant itself if not given."""
 
     def check(self) -> None:
         """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""

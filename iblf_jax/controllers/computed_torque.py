@@ -20,13 +20,16 @@ class ComputedTorque:
     """tau = M0 (q_d" - Kd e1' - Kp e1) + C0 q' + G0 - f_hat.
 
     alpha is q_d' and V1 = 1/2 Kp e1^2; it claims nothing about the bounds.
+
+    Args:
+      Kp: stiffness of the error equation, () or (n,) [1/s^2], > 0.
+      Kd: damping of the error equation, () or (n,) [1/s], > 0; 2 sqrt(Kp) is critical.
+
     Source: M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, chapter 8.
     """
 
     Kp: Leaf = leaf("1/s^2", sign="positive")
-    """Stiffness of the error equation."""
     Kd: Leaf = leaf("1/s", sign="positive")
-    """Damping of the error equation; 2 sqrt(Kp) is critical."""
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
