@@ -35,6 +35,11 @@ class VectorField:
 
     scenario: Scenario
 
+    def check(self) -> None:
+        """Raises ValueError for something that is not a scenario."""
+        if not isinstance(self.scenario, Scenario):
+            raise checks.fail("VectorField.scenario", self.scenario, "a Scenario", "Make the field with ij.vector_field(scenario).")
+
     def __call__(self, t: Any, x: Any, args: Any = None) -> jax.Array:
         """The rate of the state.
 
@@ -49,9 +54,9 @@ class VectorField:
           (m,), in the units of x a second.
 
         Raises:
-          ValueError: an x of another shape.
+          ValueError: a t or x that is no array of real numbers, or of another shape.
         """
-        return _rate(self.scenario, t, x)
+        return _rate(self.scenario, *_numbers(t, x))
 
     @property
     def start(self) -> jax.Array:
@@ -93,7 +98,7 @@ class VectorField:
         Raises:
           ValueError: another last axis.
         """
-        return _unpack(self.scenario, jnp.asarray(x))
+        return _unpack(self.scenario, checks.as_floats("x", x))
 
     def sample(self, t: Any, x: Any) -> Sample:
         """Everything that can be looked at in one instant: tau, e1, xi, the bounds, f and f_hat, V ...; a trajectory by `jax.vmap`.
@@ -106,9 +111,9 @@ class VectorField:
           `closed_loop.Sample`; its vectors are (n,).
 
         Raises:
-          ValueError: an x of another shape.
+          ValueError: as the field itself.
         """
-        return _sample(self.scenario, t, x)
+        return _sample(self.scenario, *_numbers(t, x))
 
 
 def vector_field(scenario: Scenario) -> VectorField:
@@ -141,16 +146,16 @@ def _layout(scenario: Scenario) -> LoopState:
 
 
 def _pack(scenario: Scenario, state: LoopState) -> jax.Array:
-    layout = _layout(scenario)
-    leaves, structure = jax.tree.flatten(layout)
-    given = jax.tree.leaves(state)
-    of: Any = jax.tree.structure(state)
-    shapes = [x.shape for x in leaves]
-    lead = jnp.shape(given[0])[: jnp.ndim(given[0]) - len(shapes[0])] if given else ()
-    if of != structure or [jnp.shape(x) for x in given] != [(*lead, *shape) for shape in shapes]:
-        raise checks.fail("state", jax.tree.map(jnp.shape, state), f"a LoopState with the shapes {jax.tree.map(lambda x: x.shape, layout)}")
-    flat = [jnp.asarray(x).reshape(*lead, math.prod(shape)) for x, shape in zip(given, shapes, strict=True)]
-    return jnp.concatenate(flat, axis=-1)
+    leaves, structure = jax.tree.flatten(_layout(scenario))
+    shapes, of = [x.shape for x in leaves], jax.tree.structure(state)
+    expected = f"a LoopState whose arrays have the shapes {shapes}, behind leading axes that all share"
+    if of != structure:  # type: ignore[operator]
+        raise checks.fail("state", state, expected)
+    given = [checks.as_floats("state", x) for x in jax.tree.leaves(state)]
+    lead = given[0].shape[: given[0].ndim - len(shapes[0])]
+    if [x.shape for x in given] != [(*lead, *shape) for shape in shapes]:
+        raise checks.fail("state", [x.shape for x in given], expected)
+    return jnp.concatenate([x.reshape(*lead, math.prod(shape)) for x, shape in zip(given, shapes, strict=True)], axis=-1)
 
 
 def _unpack(scenario: Scenario, x: jax.Array) -> LoopState:
@@ -163,10 +168,17 @@ def _unpack(scenario: Scenario, x: jax.Array) -> LoopState:
     return jax.tree.unflatten(structure, [part.reshape(*x.shape[:-1], *leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
 
 
-def _at(scenario: Scenario, t: Any, x: Any) -> tuple[jax.Array, LoopState]:
+def _numbers(t: Any, x: Any) -> tuple[jax.Array, jax.Array]:
+    """Time and state as arrays, or a ValueError."""
+    time = checks.as_floats("t", t)
+    checks.shape_is("t", time, ())
+    return time, checks.as_floats("x", x)
+
+
+def _at(scenario: Scenario, t: jax.Array, x: jax.Array) -> tuple[jax.Array, LoopState]:
     """Time and state in the scenario's floating-point type."""
     dtype = scenario.initial.q.dtype
-    return jnp.asarray(t, dtype), _unpack(scenario, jnp.asarray(x, dtype))
+    return t.astype(dtype), _unpack(scenario, x.astype(dtype))
 
 
 @jax.jit
@@ -175,10 +187,10 @@ def _start(scenario: Scenario) -> jax.Array:
 
 
 @jax.jit
-def _rate(scenario: Scenario, t: Any, x: Any) -> jax.Array:
+def _rate(scenario: Scenario, t: jax.Array, x: jax.Array) -> jax.Array:
     return _pack(scenario, evaluate(scenario, *_at(scenario, t, x))[0])
 
 
 @jax.jit
-def _sample(scenario: Scenario, t: Any, x: Any) -> Sample:
+def _sample(scenario: Scenario, t: jax.Array, x: jax.Array) -> Sample:
     return evaluate(scenario, *_at(scenario, t, x))[1]

@@ -123,10 +123,20 @@ def test_bad_arguments(paper):
     field = ij.vector_field(paper)
     with pytest.raises(ValueError, match=r"x: .* expected shape \(\.\.\., 6\)\. Its shape is \(5,\)\. .*solution\.y\.T"):
         field(0.0, np.zeros(5))
-    with pytest.raises(ValueError, match="x: "):
-        field.unpack(3.0)
-    with pytest.raises(ValueError, match=r"state: .* expected a LoopState"):
-        field.pack(field.unpack(field.start)._replace(q=np.zeros(3)))
+    for x in (3.0, "q", None, 1j * np.zeros(6), [[1.0], [2.0, 3.0]], {"q": 1.0}):
+        with pytest.raises(ValueError, match="x: "):
+            field.unpack(x)
+        with pytest.raises(ValueError, match="x: "):
+            field(0.0, x)
+    for t in ([0.0, 1.0], "now", None):
+        with pytest.raises(ValueError, match="t: "):
+            field.sample(t, field.start)
+    state = field.unpack(field.start)
+    for wrong in (3.0, None, state._replace(q=np.zeros(3)), state._replace(controller=np.zeros(2)), state._replace(q="ab"), (1, 2, 3, 4)):
+        with pytest.raises(ValueError, match="state: "):
+            field.pack(wrong)
+    with pytest.raises(ValueError, match=r"VectorField.scenario: .* ij.vector_field"):
+        ij.VectorField(3)
     with pytest.raises(ValueError, match="scenario: got 3, expected a Scenario"):
         ij.vector_field(3)
     with pytest.raises(ValueError, match=r"initial.q\[0\]"):
