@@ -164,14 +164,11 @@ def diffrax_vmap(count: int, duration: float) -> float:
 
     jax.config.update("jax_enable_x64", True)
     import diffrax
-    from jax.flatten_util import ravel_pytree
 
     import iblf_jax as ij
-    from iblf_jax.closed_loop import initial_state, rate
 
-    scenario = ij.presets.zhang_yan_2024()
-    x0, unravel = ravel_pytree(initial_state(scenario))
-    term = diffrax.ODETerm(lambda t, x, _: ravel_pytree(rate(scenario, t, unravel(x)))[0])
+    field = ij.vector_field(ij.presets.zhang_yan_2024())
+    term = diffrax.ODETerm(field)
     control = diffrax.PIDController(rtol=1e-6, atol=1e-9)
 
     @jax.jit
@@ -179,7 +176,7 @@ def diffrax_vmap(count: int, duration: float) -> float:
     def solve(x):
         return diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, duration, None, x, stepsize_controller=control, max_steps=200_000).ys
 
-    starts = np.tile(np.asarray(x0), (count, 1))
+    starts = np.tile(np.asarray(field.start), (count, 1))
     starts[:, :2] += SPREAD * np.random.default_rng(0).normal(size=(count, 2))
     jax.block_until_ready(solve(starts))
     begin = time.perf_counter()

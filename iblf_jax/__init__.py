@@ -23,6 +23,8 @@ from iblf_jax.distributions import normal as normal
 from iblf_jax.distributions import offset as offset
 from iblf_jax.distributions import uniform as uniform
 from iblf_jax.distributions import value as value
+from iblf_jax.flat_loop import VectorField as VectorField
+from iblf_jax.flat_loop import vector_field as vector_field
 from iblf_jax.io import load_rollouts as load_rollouts
 from iblf_jax.io import save_rollouts as save_rollouts
 from iblf_jax.lowering.explain import explain as explain
@@ -39,6 +41,7 @@ from iblf_jax.rollout import SimulationWarning as SimulationWarning
 from iblf_jax.rollout import simulate as simulate
 from iblf_jax.scenario import Initial as Initial
 from iblf_jax.scenario import Scenario as Scenario
+from iblf_jax.scenario import with_parts as with_parts
 from iblf_jax.scenario_file import load_scenario as load_scenario
 from iblf_jax.scenario_file import save_scenario as save_scenario
 from iblf_jax.status import Status as Status

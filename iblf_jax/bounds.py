@@ -32,7 +32,11 @@ class Side(Protocol):
 
 @component
 class Constant:
-    """The bound is `value`, for all time."""
+    """The bound is `value`, for all time.
+
+    Args:
+      value: the bound, () or (n,) [rad].
+    """
 
     value: Leaf = leaf("rad")
 
@@ -44,6 +48,12 @@ class Constant:
 @component
 class Sinusoid:
     """The bound is offset + amplitude sin(frequency t + phase).
+
+    Args:
+      offset: middle of its motion, () or (n,) [rad].
+      amplitude: half of its range, () or (n,) [rad].
+      frequency: angular frequency, () or (n,) [rad/s]; 1 if not given.
+      phase: phase at t = 0, () or (n,) [rad]; 0 if not given.
 
     Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
     """
@@ -63,6 +73,12 @@ class Funnel:
     """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
 
     `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a lower one.
+
+    Args:
+      initial: distance from the reference at t = 0, () or (n,) [rad].
+      final: distance that it shrinks to, () or (n,) [rad].
+      rate: how fast it shrinks, () or (n,) [1/s], >= 0.
+
     Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
     """
 
@@ -77,7 +93,12 @@ class Funnel:
 
 @component
 class Bounds:
-    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`."""
+    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`.
+
+    Args:
+      lower: the lower side, any `Side`.
+      upper: the upper side, any `Side`.
+    """
 
     lower: Side
     upper: Side
@@ -135,6 +156,8 @@ class Tube(NamedTuple):
     """Rate of k_lc, (n,) [rad/s]."""
     dupper: jax.Array
     """Rate of k_uc, (n,) [rad/s]."""
+    ddq_d: jax.Array | None = None
+    """Its acceleration, (n,) [rad/s^2], for laws that feed it forward; None in a tube that barriers take alpha from."""
 
     @property
     def k_l(self) -> jax.Array:
@@ -172,20 +195,31 @@ def positive_width(k: jax.Array) -> jax.Array:
     return jnp.maximum(k, NARROWEST)
 
 
-def tube_at(reference: Reference, bounds: Bounds, t: jax.Array) -> Tube:
+def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration: bool = True) -> Tube:
     """Reference, bounds and their rates at time t, the rates by jvp.
+
+        q_d, q_d', q_d",   k_lc, k_uc and their rates
 
     Args:
       reference, bounds: the components.
       t: time, () [s].
+      acceleration: whether q_d" is wanted; False where the tube is itself differentiated in time, so that a reference need not have a
+        third derivative.
+
+    Returns:
+      `Tube`; its ddq_d costs nothing where it is not used, as what is not used is not compiled.
     """
 
     def values(t):
         q_d = reference.position(t)
         return q_d, bounds.lower.at(t, q_d), bounds.upper.at(t, q_d)
 
+    def velocity(t):
+        return jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
+
     (q_d, lower, upper), (dq_d, dlower, dupper) = jax.jvp(values, (t,), (jnp.ones_like(t),))
-    return Tube(q_d, dq_d, lower, upper, dlower, dupper)
+    ddq_d = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1] if acceleration else None
+    return Tube(q_d, dq_d, lower, upper, dlower, dupper, ddq_d)
 
 
 MEMBERS = {"constant": Constant, "sinusoid": Sinusoid, "funnel": Funnel}

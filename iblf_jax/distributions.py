@@ -49,7 +49,12 @@ def is_distribution(thing: Any) -> bool:
 
 @component
 class Uniform:
-    """Evenly between `low` and `high`."""
+    """Evenly between `low` and `high`.
+
+    Args:
+      low: the lower end, () or as the leaf, in its unit.
+      high: the upper end, () or as the leaf, in its unit.
+    """
 
     low: jax.Array = leaf("", shape="any")
     high: jax.Array = leaf("", shape="any")
@@ -69,7 +74,12 @@ class Uniform:
 
 @component
 class Normal:
-    """Gaussian, with mean `mean` and standard deviation `std`."""
+    """Gaussian, with mean `mean` and standard deviation `std`.
+
+    Args:
+      mean: centre of the draws, () or as the leaf, in its unit.
+      std: standard deviation, () or as the leaf, in its unit, > 0.
+    """
 
     mean: jax.Array = leaf("", shape="any")
     std: jax.Array = leaf("", sign="positive", shape="any")
@@ -86,7 +96,12 @@ class Normal:
 
 @component
 class LogUniform:
-    """Evenly between `low` and `high` on a logarithmic scale."""
+    """Evenly between `low` and `high` on a logarithmic scale.
+
+    Args:
+      low: the lower end, () or as the leaf, in its unit, > 0.
+      high: the upper end, () or as the leaf, in its unit, > 0.
+    """
 
     low: jax.Array = leaf("", sign="positive", shape="any")
     high: jax.Array = leaf("", sign="positive", shape="any")
@@ -106,7 +121,12 @@ class LogUniform:
 
 @component
 class Choice:
-    """One of a list of numbers, with weights."""
+    """One of a list of numbers, with weights.
+
+    Args:
+      values: (m,) numbers, in the leaf's unit.
+      weights: (m,) numbers >= 0, of any sum.
+    """
 
     values: jax.Array = leaf("", shape="any")
     weights: jax.Array = leaf("", sign="nonnegative", shape="any")
@@ -133,12 +153,17 @@ class Choice:
 
 @component
 class Perturbation:
-    """A distribution and how its draw acts on a leaf; made by `factor`, `offset` and `value`."""
+    """A distribution and how its draw acts on a leaf; made by `factor`, `offset` and `value`.
+
+    Args:
+      distribution: of the draw, any `Distribution`; of a factor [1], else in the leaf's unit.
+      kind: "factor", "offset" or "value"; "value" if not given.
+      shared: whether all entries of a vector leaf get the same draw; False if not given.
+    """
 
     distribution: Distribution
     kind: str = static(default="value")
     shared: bool = static(default=False)
-    """One draw for all entries of a vector leaf."""
 
     def check(self) -> None:
         """Raises ValueError for something that is not a distribution."""

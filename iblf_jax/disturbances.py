@@ -60,7 +60,18 @@ class ModelShaped:
         f = M0(q) a(t) + C0(q, q') b(t)
         a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase),   b likewise
 
-    `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.  Source: Zhang & Yan 2024, (4.3).
+    `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.
+
+    Args:
+      acceleration_amplitude: amplitude of a, () or (n,) [rad/s^2].
+      acceleration_frequency: angular frequency of a, () or (n,) [rad/s].
+      acceleration_phase: phase of a at t = 0, () or (n,) [rad].
+      velocity_amplitude: amplitude of b, () or (n,) [rad/s].
+      velocity_frequency: angular frequency of b, () or (n,) [rad/s].
+      velocity_phase: phase of b at t = 0, () or (n,) [rad].
+      phase: shift of all of it, () [rad]; 0 if not given.
+
+    Source: Zhang & Yan 2024, (4.3).
     """
 
     acceleration_amplitude: Leaf = leaf("rad/s^2")
@@ -84,7 +95,14 @@ class ModelShaped:
 
 @component
 class Sinusoids:
-    """Joint torques offset + amplitude sin(frequency t + phase)."""
+    """Joint torques offset + amplitude sin(frequency t + phase).
+
+    Args:
+      amplitude: amplitude of the torque, () or (n,) [N m].
+      frequency: angular frequency, () or (n,) [rad/s].
+      phase: phase at t = 0, () or (n,) [rad]; 0 if not given.
+      offset: mean torque, () or (n,) [N m]; 0 if not given.
+    """
 
     amplitude: Leaf = leaf("N m")
     frequency: Leaf = leaf("rad/s")
@@ -102,7 +120,12 @@ class Sinusoids:
 
 @component
 class Step:
-    """Joint torques that appear at one time: `size` from `time` on."""
+    """Joint torques that appear at one time: `size` from `time` on.
+
+    Args:
+      size: the torques, () or (n,) [N m].
+      time: when they appear, () [s].
+    """
 
     size: Leaf = leaf("N m")
     time: Leaf = leaf("s", shape="scalar")
@@ -121,10 +144,15 @@ class TipForce:
     """A force that acts on the tip, +J(q)^T F(t) with F = offset + amplitude sin(frequency t + phase).
 
     (The paper's f_ext in (2.1) is the force that the tip exerts, hence its minus sign: F = -f_ext.)
+
+    Args:
+      amplitude: one number a coordinate of the tip, () or (2,) for a planar arm, (3,) in space [N].
+      frequency: angular frequency, of the same shape or () [rad/s]; 0 if not given.
+      phase: phase at t = 0, of the same shape or () [rad]; 0 if not given.
+      offset: mean force, of the same shape or () [N]; 0 if not given.
     """
 
     amplitude: Leaf = leaf("N", shape="any")
-    """One number a coordinate of the tip, (2,) for a planar arm."""
     frequency: Leaf = leaf("rad/s", shape="any", default=0.0)
     phase: Leaf = leaf("rad", shape="any", default=0.0)
     offset: Leaf = leaf("N", shape="any", default=0.0)
@@ -142,12 +170,17 @@ class TipForce:
 
 @component
 class Friction:
-    """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' / width))."""
+    """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' / width)).
+
+    Args:
+      viscous: torque per speed, () or (n,) [N m s/rad], >= 0; 0 if not given.
+      coulomb: torque at speeds well above the width, () or (n,) [N m], >= 0; 0 if not given.
+      width: velocity over which the Coulomb part changes sign, () or (n,) [rad/s], > 0; smaller is sharper and stiffer; 0.05 if not given.
+    """
 
     viscous: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
     coulomb: Leaf = leaf("N m", sign="nonnegative", default=0.0)
     width: Leaf = leaf("rad/s", sign="positive", default=0.05)
-    """Velocity over which the Coulomb part changes sign; smaller is sharper and stiffer."""
 
     def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
         """(n,) [N m]."""
@@ -160,7 +193,11 @@ class Friction:
 
 @component
 class Sum:
-    """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`."""
+    """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`.
+
+    Args:
+      parts: any disturbances, a tuple or a list.
+    """
 
     parts: tuple[Disturbance, ...]
 

@@ -94,6 +94,9 @@ class Settling:
 
     settling_time: the first sample time from which on |e1| < tolerance; infinite if the run ends outside.
     overshoot: the largest |e1| on the side of zero opposite to the start's.
+
+    Args:
+      tolerance: below which |e1| counts as settled, () or (n,) [rad], > 0; 0.01 if not given.
     """
 
     tolerance: Leaf = leaf("rad", sign="positive", default=0.01)
@@ -303,3 +306,14 @@ def standard() -> tuple[Fold, ...]:
     Made on the call: an array made at import would start JAX's backend and fix its precision before a user can choose.
     """
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
+
+
+MEMBERS = {
+    "tracking": Tracking,
+    "settling": Settling,
+    "margin": Margin,
+    "torque": Torque,
+    "above_gravity": AboveGravity,
+    "estimation": Estimation,
+}
+"""Every fold by the name that a saved tuning result gives it."""

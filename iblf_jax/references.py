@@ -31,6 +31,12 @@ class Reference(Protocol):
 class Sinusoid:
     """q_d = offset + amplitude sin(frequency t + phase), joint by joint.                             (4.2)
 
+    Args:
+      offset: middle of the motion, () or (n,) [rad].
+      amplitude: half of its range, () or (n,) [rad].
+      frequency: angular frequency, () or (n,) [rad/s]; 1 if not given.
+      phase: phase at t = 0, () or (n,) [rad]; 0 if not given.
+
     Source: Zhang & Yan 2024, equation (4.2).
     """
 
@@ -50,7 +56,14 @@ class Quintic:
 
         q_d = start + (end - start) (10 s^3 - 15 s^4 + 6 s^5),   s = clip(t / duration, 0, 1)
 
-    Velocity and acceleration vanish at both ends.  Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
+    Velocity and acceleration vanish at both ends.
+
+    Args:
+      start: where it begins, () or (n,) [rad].
+      end: where it ends, () or (n,) [rad].
+      duration: how long it takes, () [s], > 0.
+
+    Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
     """
 
     start: Leaf = leaf("rad")
@@ -70,13 +83,15 @@ class WaypointSpline:
     It has four continuous derivatives between the ends, and zero velocity and acceleration at them.  It is linear in the
     waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them or differentiate by them.
 
+    Args:
+      times: strictly increasing times of the waypoints, a tuple of m numbers [s].
+      waypoints: one row a time, (m, n) [rad].
+
     Source: C. de Boor, A Practical Guide to Splines, 1978 (basis computed by SciPy's `make_interp_spline`).
     """
 
     times: tuple[float, ...] = static()
-    """Strictly increasing times of the waypoints [s]."""
     waypoints: Leaf = leaf("rad", shape="any")
-    """One row a time, (m, n)."""
 
     def check(self) -> None:
         """Raises ValueError for times that do not increase or do not match the waypoints."""

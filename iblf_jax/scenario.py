@@ -21,7 +21,7 @@ from iblf_jax.bounds import Bounds, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
-from iblf_jax.pytree import Leaf, component, is_leaf_field, leaf
+from iblf_jax.pytree import Leaf, astype, component, is_leaf_field, leaf
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
 from iblf_jax.status import VELOCITY_LIMIT
@@ -29,7 +29,12 @@ from iblf_jax.status import VELOCITY_LIMIT
 
 @component
 class Initial:
-    """Where a run starts."""
+    """Where a run starts.
+
+    Args:
+      q: position, () or (n,) [rad].
+      dq: velocity, () or (n,) [rad/s]; 0 if not given.
+    """
 
     q: Leaf = leaf("rad")
     dq: Leaf = leaf("rad/s", default=0.0)
@@ -52,6 +57,16 @@ class Scenario:
 
     Leaves that hold one number a joint may be given as a scalar; they are repeated for the plant's n joints.
 
+    Args:
+      plant: the robot that moves, any of `iblf_jax.robots`.
+      reference: what it should follow, any of `iblf_jax.references`.
+      bounds: what its joints must keep, a `bounds.Bounds`.
+      controller: the law, any of `iblf_jax.controllers`.
+      initial: where it starts, an `Initial`.
+      observer: what estimates f, any of `iblf_jax.observers`; `NoObserver()` if not given.
+      disturbance: what acts on the plant and the law does not know, any of `iblf_jax.disturbances`; `Nothing()` if not given.
+      model: the robot that law and observer know; the plant itself if not given.
+
     Raises:
       ValueError: if a leaf has the wrong number of joints, or model and plant differ in theirs.
     """
@@ -64,7 +79,6 @@ class Scenario:
     observer: Observer = NoObserver()
     disturbance: Disturbance = Nothing()
     model: Robot = None  # type: ignore[assignment]
-    """What law and observer know; the plant itself if not given."""
 
     def check(self) -> None:
         """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""
@@ -90,6 +104,44 @@ class Scenario:
     def setting(self) -> Setting:
         """What the law knows: model, reference and bounds."""
         return Setting(self.model, self.reference, self.bounds)
+
+
+def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
+    """The scenario with whole parts exchanged by name: `with_parts(scenario, observer=Momentum(kf=20.0), disturbance=Step(1.0, 5.0))`.
+
+    `robot` stands for plant and model together, as in paths.  `plant` alone leaves the model as it is, what the law knew before, also
+    where the model was the plant itself: then plant and model differ from here on.  `model=None` is the plant itself.  A law
+    that stands in a `Saturated` goes with it: exchange the whole controller.
+
+    Args:
+      scenario: what to change; it stays as it is.
+      parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance, initial; each as `Scenario` takes it, so
+        that one number stands for one number a joint.  Numbers take the scenario's floating-point type.
+
+    Returns:
+      A new Scenario; it runs like any other, and compiles where the structure is new.
+
+    Raises:
+      ValueError: an unknown name, `robot` beside plant or model, a part of the wrong kind, or parts that differ in their number of joints.
+    """
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
+    names = [field.name for field in dataclasses.fields(Scenario)]
+    for name in parts:
+        if name not in (*names, "robot"):
+            raise checks.fail("part", name, f"the name of a part: robot, {', '.join(names)}", "Leaves change by ij.with_parameters.")
+    if "robot" in parts:
+        for name in ("plant", "model"):
+            if name in parts:
+                raise checks.fail(name, parts[name], "robot alone, or plant and model", "`robot` is plant and model together.")
+        robot = parts.pop("robot")
+        parts |= {"plant": robot, "model": robot}
+    elif "plant" in parts and "model" not in parts and getattr(parts["plant"], "n", scenario.n) != scenario.model.n:
+        got = f"{parts['plant'].n} joints"
+        raise checks.fail("plant", got, f"{scenario.model.n} joints, as the model has", "Exchange plant and model together: robot=...")
+    new = dataclasses.replace(scenario, **parts)
+    dtype = _shared_dtype(scenario)
+    return new if _shared_dtype(new) == dtype else astype(new, dtype)
 
 
 def fit_joints(part: Any, n: int, path: str) -> Any:

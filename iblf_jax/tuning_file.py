@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import checks, codec, distributions
+from iblf_jax import checks, codec, distributions, metrics
 from iblf_jax.distributions import Distribution, Perturbation
 from iblf_jax.paths import with_parameters
 from iblf_jax.plain import Words, as_table, known_keys
@@ -51,6 +51,7 @@ DISTRIBUTIONS = {
     "choice": distributions.Choice,
 }
 codec.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
+codec.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
 codec.FAMILIES.setdefault(Distribution, ("distributions", DISTRIBUTIONS))
 
 OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin")

@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from iblf_jax.barriers import Integral, Log
+from iblf_jax.barriers import Integral, Log, guard_is_active, guarded_error
 from iblf_jax.barriers._base import bound_motion_gain
 from iblf_jax.bounds import Tube
 
@@ -108,7 +108,7 @@ def test_without_the_root_kappa_fails_on_the_papers_bounds():
 def test_limit_of_wide_bounds(barrier):
     """k -> infinity: the slope vanishes and alpha = q_d' - (k1 + sqrt(o)) e1."""
     t, e1 = tube(1e9, 1e9), np.asarray([0.3, -0.2])
-    t = Tube(*(np.broadcast_to(x, (2,)) for x in t))
+    t = jax.tree.map(lambda x: np.broadcast_to(x, (2,)), t)
     np.testing.assert_allclose(slope(barrier, t, e1), 0, atol=1e-15)
     np.testing.assert_allclose(alpha(barrier, t, e1, 2.0, 0.1), -(2.0 + np.sqrt(0.1)) * e1, rtol=1e-9)
 
@@ -123,6 +123,18 @@ def test_the_guard_is_exact_inside_and_tangent_beyond():
     assert float(slope(barrier, t, [100.0])[0]) == pytest.approx(held)
     rise = float(value(barrier, t, [beyond])[0] - value(barrier, t, [edge])[0])
     assert rise == pytest.approx(held * (beyond - edge))
+
+
+def test_the_guarded_error_on_both_sides():
+    """e = min(|e1|, (1 - guard) k) sign(e1) and the rest beyond, with the width and the rate of the side that e1 is on."""
+    t = tube(*np.array([[0.3] * 4, [0.5] * 4]), dk_l=0.1, dk_u=-0.2, q_d=1.0)
+    e1 = np.array([-0.4, -0.1, 0.49, 0.7])
+    got = guarded_error(t, jnp.asarray(1.0 + e1), 0.1)
+    np.testing.assert_allclose(got.e, [-0.27, -0.1, 0.45, 0.45], rtol=1e-12)
+    np.testing.assert_allclose(got.e + got.beyond, e1, rtol=1e-12)
+    np.testing.assert_allclose(got.k, [0.3, 0.3, 0.5, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(got.dk, [0.1, 0.1, -0.2, -0.2], rtol=1e-12)
+    assert list(guard_is_active(t, jnp.asarray(1.0 + e1), 0.1)) == [True, False, True, True]
 
 
 @given(e=st.floats(allow_nan=False, allow_infinity=False, width=32), k_l=st.floats(0, 10), k_u=st.floats(0, 10))

@@ -3,7 +3,7 @@
     6 outside     presets  arms  robot_file  scenario_file  io  codec  plain  plotting/  cli/  testing/
     5 studies     studies/  tuning/  distributions  distributed
     4 judgement   certificates
-    3 the run     integrators  scenario  closed_loop  stability  metrics  results  paths  time_loop  rollout  lowering/
+    3 the run     integrators  scenario  closed_loop  flat_loop  stability  metrics  results  paths  time_loop  rollout  lowering/
     2 the law     barriers/  observers/  controllers/
     1 the world   robots/  references  bounds  disturbances
     0 ground      pytree  linalg  checks  status  drafts  _start
@@ -30,6 +30,7 @@ LAYERS = {
         "integrators",
         "scenario",
         "closed_loop",
+        "flat_loop",
         "stability",
         "accuracy",
         "step_size",

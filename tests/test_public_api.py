@@ -15,7 +15,19 @@ import iblf_jax as ij
 PROMISED = [
     *("simulate", "recommended_dt", "Scenario", "Initial", "Rollout", "Metrics", "Status", "SimulationError", "SimulationWarning"),
     *("parameters", "with_parameters", "astype", "component", "leaf", "static", "robots", "references", "bounds", "disturbances"),
-    *("compare", "Comparison", "barriers", "observers", "controllers", "metrics", "presets", "testing"),
+    *(
+        "with_parts",
+        "vector_field",
+        "VectorField",
+        "compare",
+        "Comparison",
+        "barriers",
+        "observers",
+        "controllers",
+        "metrics",
+        "presets",
+        "testing",
+    ),
 ]
 
 HEAVY = ("matplotlib", "optax", "xarray", "pandas", "scipy", "zarr", "tqdm", "mujoco", "IPython", "hypothesis")
@@ -71,7 +83,7 @@ def test_all_lists_what_exists(module):
 
 
 def test_entry_points_document_arguments_returns_and_errors():
-    for function in (ij.simulate, ij.with_parameters, ij.compare):
+    for function in (ij.simulate, ij.with_parameters, ij.with_parts, ij.vector_field, ij.compare):
         for part in ("Args:", "Returns:", "Raises:"):
             assert part in function.__doc__, (function.__name__, part)
         for name in inspect.signature(function).parameters:

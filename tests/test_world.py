@@ -11,7 +11,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 import iblf_jax as ij
-from iblf_jax import bounds, disturbances, references
+from iblf_jax import bounds, closed_loop, controllers, disturbances, references
 from iblf_jax.bounds import tube_at
 
 TWO_LINK = ij.presets.customary_two_link()
@@ -94,12 +94,61 @@ def test_tube_rates_against_finite_differences(sides):
     h = 1e-6
     for t in (0.0, 0.8, 7.1):
         tube, ahead, behind = at(t), at(t + h), at(t - h)
-        for value, rate in (("q_d", "dq_d"), ("lower", "dlower"), ("upper", "dupper"), ("k_l", "dk_l"), ("k_u", "dk_u")):
+        for value, rate in (("q_d", "dq_d"), ("dq_d", "ddq_d"), ("lower", "dlower"), ("upper", "dupper"), ("k_l", "dk_l"), ("k_u", "dk_u")):
             difference = (np.asarray(getattr(ahead, value)) - np.asarray(getattr(behind, value))) / (2 * h)
             np.testing.assert_allclose(getattr(tube, rate), difference, atol=1e-8)
         np.testing.assert_allclose(tube.xi(tube.upper), 1.0, rtol=1e-12)
         np.testing.assert_allclose(tube.xi(tube.lower), -1.0, rtol=1e-12)
         np.testing.assert_allclose(tube.xi(tube.q_d), 0.0)
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [references.Quintic([0.1, 0.5], [0.9, -0.2], 2.5), references.WaypointSpline((0.0, 1.0, 2.2), [[0.0, 0.1], [0.4, 0.3], [0.2, 0.8]])],
+    ids=["quintic", "spline"],
+)
+def test_the_tube_has_the_acceleration_of_its_reference(reference):
+    sides = bounds.Bounds(lower=bounds.Funnel(-0.5, -0.1, 1.5), upper=bounds.Constant(3.0))
+    at, tube = derivatives(reference.position, 2), jax.jit(lambda t: tube_at(reference, sides, t))
+    for t in (0.3, 1.7, 2.4):
+        np.testing.assert_allclose(tube(t).ddq_d, at(t)[2], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_an_acceleration_that_is_not_used_costs_nothing(paper, monkeypatch):
+    """The same operations as without it.  Two guards, so that the second program is not the first one from a cache."""
+
+    def counted(guard):
+        law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=ij.barriers.Integral(guard=guard))
+        return ij.explain(ij.with_parts(paper, controller=law)).counts
+
+    with_it = counted(1.1e-3)
+    monkeypatch.setattr(controllers._base, "tube_at", lambda *args, acceleration: tube_at(*args, acceleration=False))
+    assert counted(1.2e-3) == with_it
+
+
+def test_a_reference_needs_two_derivatives_and_no_third():
+    """One from outside of JAX, say: it gives position, velocity and acceleration, and there it ends."""
+
+    def outside(function):
+        shape = jax.ShapeDtypeStruct((2,), float)
+        return lambda t: jax.pure_callback(lambda t: np.asarray(function(float(t))), shape, t, vmap_method="sequential")
+
+    acceleration = outside(lambda t: [-0.1 * np.sin(t), -0.1 * np.cos(t)])
+    velocity = jax.custom_jvp(outside(lambda t: [0.1 * np.cos(t), -0.1 * np.sin(t)]))
+    position = jax.custom_jvp(outside(lambda t: [0.5 + 0.1 * np.sin(t), 0.5 + 0.1 * np.cos(t)]))
+    velocity.defjvp(lambda t, dt: (velocity(*t), acceleration(*t) * dt[0]))
+    position.defjvp(lambda t, dt: (position(*t), velocity(*t) * dt[0]))
+
+    @ij.component
+    class Outside:
+        def position(self, t):
+            return position(t)
+
+    for law in ("integral", "computed_torque", "pd"):
+        scenario = ij.with_parts(ij.presets.zhang_yan_2024(law=law), reference=Outside())
+        rate = jax.eval_shape(lambda s: closed_loop.rate(s, jnp.asarray(0.3), closed_loop.initial_state(s)), scenario)
+        assert rate.dq.shape == (2,)
 
 
 def test_funnel_shrinks_onto_the_reference():

@@ -1,6 +1,12 @@
-"""Barriers: V1, its slope and the virtual velocity of each.  The contract is `Barrier` in `_base.py`."""
+"""Barriers: V1, its slope and the virtual velocity of each.  The contract is `Barrier` in `_base.py`.
+
+A barrier or a law of your own stays finite at the wall by `guarded_error`, and says so by `guard_is_active`.
+"""
 
 from iblf_jax.barriers._base import Barrier as Barrier
+from iblf_jax.barriers._base import GuardedError as GuardedError
+from iblf_jax.barriers._base import guard_is_active as guard_is_active
+from iblf_jax.barriers._base import guarded_error as guarded_error
 from iblf_jax.barriers.integral import Integral as Integral
 from iblf_jax.barriers.log import Log as Log
 from iblf_jax.barriers.mapping import Mapping as Mapping
@@ -20,4 +26,17 @@ MEMBERS = {
 }
 """Every barrier by the name that a scenario file gives it."""
 
-__all__ = ["MEMBERS", "Barrier", "Integral", "Log", "Mapping", "PrescribedPerformance", "Quadratic", "State", "Tan"]
+__all__ = [
+    "MEMBERS",
+    "Barrier",
+    "GuardedError",
+    "Integral",
+    "Log",
+    "Mapping",
+    "PrescribedPerformance",
+    "Quadratic",
+    "State",
+    "Tan",
+    "guard_is_active",
+    "guarded_error",
+]

@@ -80,7 +80,7 @@ def check_guard(owner: str, guard: float) -> None:
 
 
 class GuardedError(NamedTuple):
-    """The error at which a barrier is evaluated, and the side of the tube that it is on."""
+    """The error at which a barrier is evaluated, and the side of the tube that it is on; each (n,)."""
 
     e: jax.Array
     """e1 inside the guard, the edge of the guarded range beyond it [rad]."""
@@ -93,12 +93,23 @@ class GuardedError(NamedTuple):
 
 
 def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
-    """The error e1 = q - q_d held inside (1 - guard) of its bound.
+    """The error e1 = q - q_d held inside (1 - guard) of its bound: what a barrier is evaluated at, so that it is finite past its wall.
+
+        e = e1 where |e1| <= (1 - guard) k, else (1 - guard) k sign(e1),   beyond = e1 - e
+        k = h k_u + (1 - h) k_l,   k' = h k_u' + (1 - h) k_l',   h = 1 if e1 > 0 else 0                          (2.5), (3.15)
+
+    With V and s of the barrier at e, V + s beyond goes on along its tangent and s stays constant: both are finite, with finite
+    derivatives, at every q.
 
     Args:
-      tube: reference and bounds at this time.
+      tube: reference and bounds at this time, a `bounds.Tube`.
       q: positions, (n,) [rad].
-      guard: distance from the wall in xi, static.
+      guard: distance from the wall in xi, a Python number in (0, 1) [1]; `guard` of the barriers, 1e-3 by default.
+
+    Returns:
+      `GuardedError`: e, beyond and k, (n,) [rad], and dk, the rate of k, (n,) [rad/s].
+
+    Source: design of this package; the sides are Zhang & Yan 2024, (3.15).
     """
     e1 = q - tube.q_d
     above = e1 > 0
@@ -110,7 +121,18 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
 
 
 def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
-    """Whether each joint is so near its wall that the guard holds the slope, (n,) bool."""
+    """Whether each joint is so near its wall that the guard holds the slope: what a law answers in `Command.guard_active`.
+
+        |xi| > 1 - guard
+
+    Args:
+      tube: reference and bounds at this time, a `bounds.Tube`.
+      q: positions, (n,) [rad].
+      guard: as `guarded_error`; -infinity for a barrier that needs no guard.
+
+    Returns:
+      (n,) bool.
+    """
     return jnp.abs(tube.xi(q)) > 1.0 - guard
 
 

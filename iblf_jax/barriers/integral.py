@@ -19,6 +19,10 @@ class Integral:
         s = dV1/de1 = 2 e1 / (k^2 - e1^2),   alpha = q_d' - (k1 + kappa) e1                     (3.15), (3.5)
 
     It is twice the logarithmic barrier with p = 1, identically.  Theorem 1: xi^2/2 <= V1 <= xi^2/(1 - xi^2).
+
+    Args:
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
     Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.
     """
 

@@ -19,6 +19,10 @@ class Log:
 
         s = e1^(2p-1) / (k^(2p) - e1^(2p)),   alpha = q_d' - (k1 + kappa) e1
 
+    Args:
+      p: exponent, a whole number >= 1; 1 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
     Source: K. P. Tee, B. Ren, S. S. Ge, Automatica 47 (2011) 2511-2516.
     """
 

@@ -20,6 +20,10 @@ class Mapping:
 
     z_t is the rate of z at fixed e1.  At e2 = 0, V1' = -k1 z^2.  For k -> infinity z -> e1: unconstrained backstepping, without a change of
     law ("uniform": one law with and without bounds).
+
+    Args:
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
     Source: K. Zhao, Y. Song, IEEE Trans. Automatic Control 64 (2019) 1265-1272.
     """
 

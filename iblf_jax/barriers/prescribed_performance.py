@@ -21,6 +21,10 @@ class PrescribedPerformance:
     eps_e = 1/2 (1/(k_l + e1) + 1/(k_u - e1)), and eps_t is the rate of eps at fixed e1.  At e2 = 0, V1' = -k1 eps^2.
     Its bounds are usually a `bounds.Funnel`, r(t) = (r0 - rinf) exp(-l t) + rinf; any bounds do.  For k -> infinity s -> 0 and the
     gain of alpha is k1.
+
+    Args:
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
     Source: C. P. Bechlioulis, G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099.
     """
 

@@ -64,6 +64,10 @@ class State:
 
     (symbols and derivation at the head of this module).  At e2 = 0, V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) <= -k1 V1.  For
     kc -> infinity it is unconstrained backstepping.
+
+    Args:
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
     Source: K. P. Tee, S. S. Ge, 51st IEEE CDC (2012) 3239-3244 (constant kc); the compensation of kc'(t) is derived here.
     """
 

@@ -22,6 +22,10 @@ class Tan:
 
     sin(2th)/e1 is removable at e1 = 0 and written as such.  At e2 = 0, V1' = -k1 V1.  For k -> infinity s -> e1 and the gain of
     alpha is k1/2.
+
+    Args:
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
     Source: X. Yu, W. He, H. Li, J. Sun, IEEE Trans. Syst. Man Cybern. Syst. 51 (2021) 6994-7007.
     """
 

@@ -26,9 +26,9 @@ class Setting(NamedTuple):
     reference: Reference
     bounds: Bounds
 
-    def tube(self, t: jax.Array) -> Tube:
-        """Reference, bounds and their rates at time t [s]."""
-        return tube_at(self.reference, self.bounds, t)
+    def tube(self, t: jax.Array, *, acceleration: bool = True) -> Tube:
+        """Reference, bounds and their rates at time t [s]; arguments as `bounds.tube_at`."""
+        return tube_at(self.reference, self.bounds, t, acceleration=acceleration)
 
 
 class Command(NamedTuple):

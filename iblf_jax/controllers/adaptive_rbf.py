@@ -35,32 +35,36 @@ class AdaptiveRBF:
     """tau = -s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
 
     s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes, n) [N m].
+
+    Args:
+      k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
+      K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0.
+      o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not given.
+      Gamma: rate of adaptation of each joint's weights, () or (n,) [N m/rad], > 0; 20 if not given.
+      sigma: leak that bounds the weights, () or (n,) [rad/(N m s)], > 0; what it forgets stays as an error; 0.005 if not given.
+      middle: position at the centre of the nodes' box, () or (n,) [rad]; 0.5 if not given.
+      span_q: half the box in q, () or (n,) [rad], > 0; 0.5 if not given.
+      span_dq: half the box in q' and alpha, () or (n,) [rad/s], > 0; 1 if not given.
+      span_ddq: half the box in alpha', () or (n,) [rad/s^2], > 0; 3 if not given.
+      width: width of the Gaussians in half boxes, () [1], > 0; 2 if not given.
+      barrier: any `Barrier`; `Log()` if not given.
+      nodes: number of Gaussians, a whole number; 64 if not given.
+
     Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068; numbers as said at the head of this module.
     """
 
     k1: Leaf = leaf("1/s", sign="positive")
-    """Gain of the virtual velocity."""
     K2: Leaf = leaf("N m s/rad", sign="positive")
-    """Diagonal of the velocity error's gain."""
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
-    """As `Backstepping.o`."""
     Gamma: Leaf = leaf("N m/rad", sign="positive", default=20.0)
-    """Rate of adaptation of each joint's weights."""
     sigma: Leaf = leaf("rad/(N m s)", sign="positive", default=0.005)
-    """Leak that bounds the weights; what it forgets stays as an error."""
     middle: Leaf = leaf("rad", default=0.5)
-    """Position at the centre of the nodes' box."""
     span_q: Leaf = leaf("rad", sign="positive", default=0.5)
-    """Half the box in q."""
     span_dq: Leaf = leaf("rad/s", sign="positive", default=1.0)
-    """Half the box in q' and alpha."""
     span_ddq: Leaf = leaf("rad/s^2", sign="positive", default=3.0)
-    """Half the box in alpha'."""
     width: Leaf = leaf("1", sign="positive", shape="scalar", default=2.0)
-    """Width of the Gaussians, in half boxes."""
     barrier: Barrier = Log()
     nodes: int = static(default=64)
-    """Number of Gaussians."""
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     uses_observer: ClassVar[bool] = False
 

@@ -30,15 +30,20 @@ READINGS = ("printed", "corrected")
 class Backstepping:
     """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - s,   v = q' (printed) or alpha (corrected).                (3.14)
 
+    Args:
+      k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
+      K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0; Theorem 2 asks for more than 1/2.
+      o: margin under the root of kappa (3.7), () or (n,) [1/s^2], > 0, for barriers that compensate a moving bound by kappa and for no
+        others; 0.1, the paper's, for these, if not given.
+      barrier: any `Barrier`; `Integral()` if not given.
+      reading: "printed" or "corrected"; "printed" if not given.
+
     Source: Zhang & Yan 2024, (3.5), (3.14); `corrected` as said at the head of this module.
     """
 
     k1: Leaf = leaf("1/s", sign="positive")
-    """Gain of the virtual velocity."""
     K2: Leaf = leaf("N m s/rad", sign="positive")
-    """Diagonal of the velocity error's gain; Theorem 2 asks for more than 1/2."""
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
-    """Margin under the root of kappa (3.7), for barriers that compensate a moving bound by kappa; else None."""
     barrier: Barrier = Integral()
     reading: str = static(default="printed")
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
@@ -90,6 +95,6 @@ def alpha_and_rate(law, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Sett
     """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,), for a law with `barrier`, `k1`, `o`."""
 
     def alpha_at(t, q):
-        return law.barrier.virtual_velocity(setting.tube(t), q, law.k1, law.o)
+        return law.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, law.k1, law.o)
 
     return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))

@@ -20,13 +20,16 @@ class ComputedTorque:
     """tau = M0 (q_d" - Kd e1' - Kp e1) + C0 q' + G0 - f_hat.
 
     alpha is q_d' and V1 = 1/2 Kp e1^2; it claims nothing about the bounds.
+
+    Args:
+      Kp: stiffness of the error equation, () or (n,) [1/s^2], > 0.
+      Kd: damping of the error equation, () or (n,) [1/s], > 0; 2 sqrt(Kp) is critical.
+
     Source: M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, chapter 8.
     """
 
     Kp: Leaf = leaf("1/s^2", sign="positive")
-    """Stiffness of the error equation."""
     Kd: Leaf = leaf("1/s", sign="positive")
-    """Damping of the error equation; 2 sqrt(Kp) is critical."""
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
@@ -38,9 +41,8 @@ class ComputedTorque:
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
         tube, model = setting.tube(t), setting.model
-        ddq_d = jax.jvp(lambda t: setting.tube(t).dq_d, (t,), (jnp.ones_like(t),))[1]
         e1, de1 = q - tube.q_d, dq - tube.dq_d
-        accelerate = matvec(model.mass_matrix(q), ddq_d - self.Kd * de1 - self.Kp * e1)
+        accelerate = matvec(model.mass_matrix(q), tube.ddq_d - self.Kd * de1 - self.Kp * e1)
         tau = accelerate + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * self.Kp * e1**2, never, never), ()

@@ -17,6 +17,11 @@ class PDGravity:
 
     Classical without an observer (`NoObserver`, f_hat = 0).  alpha is q_d' and V1 = 1/2 Kp e1^2; it claims nothing about the
     bounds, and convergence only for a reference at rest.
+
+    Args:
+      Kp: stiffness, () or (n,) [N m/rad], > 0.
+      Kd: damping, () or (n,) [N m s/rad], > 0.
+
     Source: M. Takegaki, S. Arimoto, ASME J. Dynamic Systems, Measurement and Control 103 (1981) 119-125.
     """
 

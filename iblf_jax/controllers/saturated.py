@@ -27,12 +27,17 @@ class Saturated:
     """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8) (smooth, for gradients).
 
     Paths reach through: "controller.K2" is the wrapped law's K2.
+
+    Args:
+      law: the law whose torque is limited, any `Controller`.
+      limit: largest torque of each joint, () or (n,) [N m], > 0.
+      edge: "hard" or "smooth"; "hard" if not given.
+
     Source: none; the construction is common.
     """
 
     law: Controller
     limit: Leaf = leaf("N m", sign="positive")
-    """Largest torque of each joint."""
     edge: str = static(default="hard")
     wraps: ClassVar[str] = "law"
 

@@ -34,6 +34,12 @@ class ExtendedState:
     Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then f_tilde = f - f_hat obeys
     f_tilde" + l1 f_tilde' + l2 f_tilde = f" + l1 f': a constant f is found exactly, a changing one with the lag l1/l2.
     It starts at the measured momentum and f_hat = 0.
+
+    Args:
+      bandwidth: w, () or (n,) [1/s], > 0; l1 and l2 count if not given.
+      l1: gain of the innovation on p_hat, () or (n,) [1/s], > 0; 2 w if not given.
+      l2: gain of the innovation on f_hat, () or (n,) [1/s^2], > 0; w^2 if not given.
+
     Source: J. Han, IEEE Trans. Industrial Electronics 56 (2009) 900-906; Z. Gao, ACC 2003, 4989-4996 (one bandwidth).
     """
 

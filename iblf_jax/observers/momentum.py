@@ -16,14 +16,18 @@ class Momentum:
     """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').        (3.11), corrected
 
     Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.  (M0' q' - C0 q' is dT/dq.)
+
+    Args:
+      kf: gain, () or (n,) [1/s], > 0; Theorem 2 asks for more than 1/2, and for more than 1 where f changes.
+      eta0: eta(0), added to what `start` says, () or (n,) [N m]; 0 if not given.
+      start: "zero": eta(0) = eta0, as printed; "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0; "zero" if not given.
+
     Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for the form.
     """
 
     kf: Leaf = leaf("1/s", sign="positive")
     eta0: Leaf = leaf("N m", default=0.0)
-    """eta(0), added to what `start` says."""
     start: str = static(default="zero")
-    """"zero": eta(0) = eta0, as printed.  "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0."""
 
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""

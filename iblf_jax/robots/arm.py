@@ -67,50 +67,58 @@ class Arm:
 
     "plant.link[forearm].mass" and "plant.joint[elbow].damping" address one link or joint by its name or number.
 
+    Args:
+      mass: mass of each link, (n,) [kg], >= 0.
+      centre: centres of mass in the links' frames, (n, 3) [m].
+      inertia: about the centres, along the links' axes, (n, 6): xx, yy, zz, xy, xz, yz [kg m^2].
+      position: origin of each joint's frame in the frame of the link before, (n, 3) [m].
+      rotation: orientation of each joint's frame there, quaternions (w, x, y, z), (4,) or (n, 4) [1]; their length does not matter;
+        the identity if not given.
+      axis: axes of the joints in their frames, (3,) or (n, 3) [1]; their length does not matter; z if not given.
+      armature: inertia of the rotors seen from the joints, added to the diagonal of M, () or (n,) [kg m^2], >= 0; 0 if not given.
+      damping: viscous friction of each joint, () or (n,) [N m s/rad], >= 0; 0 if not given.
+      friction: Coulomb friction of each joint, () or (n,) [N m], >= 0; 0 if not given.
+      friction_width: speed over which the Coulomb friction changes its sign, () or (n,) [rad/s], > 0; smaller is sharper and stiffer; 0.05
+        if not given.
+      tip_position: origin of the tip's frame in the frame of the last link, (3,) [m]; the same origin if not given.
+      tip_rotation: orientation of the tip's frame there, a quaternion (w, x, y, z), (4,) [1]; the identity if not given.
+      g: acceleration of gravity in the base's frame, (3,) [m/s^2]: it says how the arm is mounted; (0, 0, -9.81) if not given.
+      payload: point mass at the tip, () [kg], >= 0; 0 if not given.
+      lower: lower ends of the joints' ranges, () or (n,) [rad]; of the dynamics nothing depends on them; -infinite if not given.
+      upper: upper ends of the joints' ranges, () or (n,) [rad]; infinite if not given.
+      effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; of the dynamics nothing depends on them; infinite if not
+        given.
+      carried: a load with an extent of its own, which may be picked up at a time, a `Payload`; nothing if not given.
+      kinds: "revolute" or "prismatic", one a joint, (n,); all revolute if not given.
+      links: names of the links, from the first that moves, (n,); link1 ... if not given.
+      joints: names of the joints, (n,); joint1 ... if not given.
+      repaired: what `load(..., repair=True)` changed, a line a link or joint; nothing if not given.
+
     Source: Featherstone, Rigid Body Dynamics Algorithms, 2008; Echeandia & Wensing 2021 for C; see the head of this module.
     """
 
     mass: Leaf = leaf("kg", sign="nonnegative")
     centre: Leaf = leaf("m", shape="any")
-    """Centres of mass in the links' frames, (n, 3)."""
     inertia: Leaf = leaf("kg m^2", shape="any")
-    """About the centres, along the links' axes, (n, 6): xx, yy, zz, xy, xz, yz."""
     position: Leaf = leaf("m", shape="any")
-    """Origin of each joint's frame in the frame of the link before, (n, 3)."""
     rotation: Leaf = leaf("1", shape="any", default=(1.0, 0.0, 0.0, 0.0))
-    """Orientation of each joint's frame there, quaternions (w, x, y, z), (n, 4); their length does not matter."""
     axis: Leaf = leaf("1", shape="any", default=(0.0, 0.0, 1.0))
-    """Axes of the joints in their frames, (n, 3); their length does not matter."""
     armature: Leaf = leaf("kg m^2", sign="nonnegative", default=0.0)
-    """Inertia of the rotors, seen from the joints: added to the diagonal of M."""
     damping: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
     friction: Leaf = leaf("N m", sign="nonnegative", default=0.0)
-    """Coulomb friction."""
     friction_width: Leaf = leaf("rad/s", sign="positive", default=0.05)
-    """Speed over which the Coulomb friction changes its sign; smaller is sharper and stiffer."""
     tip_position: Leaf = leaf("m", shape="any", default=(0.0, 0.0, 0.0))
-    """Origin of the tip's frame in the frame of the last link, (3,)."""
     tip_rotation: Leaf = leaf("1", shape="any", default=(1.0, 0.0, 0.0, 0.0))
-    """Orientation of the tip's frame there, a quaternion (w, x, y, z), (4,)."""
     g: Leaf = leaf("m/s^2", shape="any", default=(0.0, 0.0, -9.81))
-    """Acceleration of gravity in the base's frame, (3,): it says how the arm is mounted."""
     payload: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
-    """Point mass at the tip."""
     lower: Leaf = leaf("rad", sign="limit", default=-np.inf)
-    """Lower ends of the joints' ranges; of the dynamics nothing depends on them."""
     upper: Leaf = leaf("rad", sign="limit", default=np.inf)
     effort: Leaf = leaf("N m", sign="positive limit", default=np.inf)
-    """Largest torques (forces) of the actuators; of the dynamics nothing depends on them."""
     carried: Payload = None  # type: ignore[assignment]
-    """A load with an extent of its own, which may be picked up at a time; nothing if not given."""
     kinds: tuple[str, ...] = static(default=())
-    """ "revolute" or "prismatic", one a joint; all revolute if not given."""
     links: tuple[str, ...] = static(default=())
-    """Names of the links, from the first that moves; link1 ... if not given."""
     joints: tuple[str, ...] = static(default=())
-    """Names of the joints; joint1 ... if not given."""
     repaired: tuple[str, ...] = static(default=())
-    """What `load(..., repair=True)` changed, a line a link or joint."""
 
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),

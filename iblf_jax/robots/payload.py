@@ -23,17 +23,21 @@ from iblf_jax.robots.spatial import pseudo_inertia
 
 @component
 class Payload:
-    """A rigid body that is fixed to the tip's frame; nothing by default."""
+    """A rigid body that is fixed to the tip's frame; nothing by default.
+
+    Args:
+      mass: mass of the load, () [kg], >= 0; 0 if not given.
+      centre: its centre of mass in the tip's frame, (3,) [m]; the tip if not given.
+      inertia: about its centre, along the tip's axes, (6,): xx, yy, zz, xy, xz, yz [kg m^2]; 0 if not given.
+      start: when it is picked up, () [s]; it is there from the start if not given.
+      rise: how long its weight takes to come to rest on the gripper, () [s], > 0; 0.1 if not given.
+    """
 
     mass: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
     centre: Leaf = leaf("m", shape="any", default=(0.0, 0.0, 0.0))
-    """Its centre of mass in the tip's frame, (3,)."""
     inertia: Leaf = leaf("kg m^2", shape="any", default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    """About its centre, along the tip's axes, (6,): xx, yy, zz, xy, xz, yz."""
     start: Leaf = leaf("s", shape="scalar", default=None)
-    """When it is picked up; None if it is there from the start."""
     rise: Leaf = leaf("s", sign="positive", shape="scalar", default=0.1)
-    """How long its weight takes to come to rest on the gripper."""
 
     def check(self) -> None:
         """Raises ValueError if centre or inertia have another shape."""

@@ -35,18 +35,23 @@ class LumpedParameters(NamedTuple):
 class TwoLink:
     """Planar two-link arm; all its parameters are leaves.
 
+    Args:
+      mass: mass of each link, () or (n,), n = 2 links, [kg], > 0.
+      length: length of each link, () or (n,) [m], > 0.
+      centre: distance of each link's centre of mass from its joint, () or (n,) [m], >= 0.
+      inertia: moment of inertia of each link about its centre of mass, () or (n,) [kg m^2], >= 0.
+      g: acceleration of gravity, () [m/s^2]; 9.81 if not given.
+      payload: point mass at the tip, () [kg], >= 0; 0 if not given.
+
     Source: Zhang & Yan 2024, section 4, which refers to others for the matrices; see the head of this module.
     """
 
     mass: Leaf = leaf("kg", sign="positive")
     length: Leaf = leaf("m", sign="positive")
     centre: Leaf = leaf("m", sign="nonnegative")
-    """Distance of each link's centre of mass from its joint."""
     inertia: Leaf = leaf("kg m^2", sign="nonnegative")
-    """Moment of inertia of each link about its centre of mass."""
     g: Leaf = leaf("m/s^2", shape="scalar", default=9.81)
     payload: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
-    """Point mass at the tip."""
 
     def check(self) -> None:
         """Broadcasts scalars to the two links; raises ValueError for any other number of links."""

@@ -20,6 +20,7 @@ from iblf_jax.testing._contract import ContractError as ContractError
 from iblf_jax.testing.barriers import check_barrier as check_barrier
 from iblf_jax.testing.laws import check_law as check_law
 from iblf_jax.testing.metrics import check_fold as check_fold
+from iblf_jax.testing.objectives import check_objective as check_objective
 from iblf_jax.testing.observers import check_observer as check_observer
 from iblf_jax.testing.robots import check_robot as check_robot
 from iblf_jax.testing.world import check_disturbance as check_disturbance
@@ -32,6 +33,7 @@ __all__ = [
     "check_disturbance",
     "check_fold",
     "check_law",
+    "check_objective",
     "check_observer",
     "check_reference",
     "check_robot",

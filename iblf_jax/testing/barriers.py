@@ -97,7 +97,7 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     got = {name: np.asarray(value) for name, value in numbers.items()}
     xi = np.asarray(XI)[:, None] + 0 * got["xi"]
     words = {"V1": "value", "slope": "slope", "alpha": "virtual_velocity"}
-    mend = "Evaluate at barriers._base.guarded_error; mind removable singularities at e1 = 0 (double jnp.where)"
+    mend = "Evaluate at iblf_jax.barriers.guarded_error; mind removable singularities at e1 = 0 (double jnp.where)"
     for prefix, text in (("", ""), ("d", "the forward derivative of "), ("r", "the reverse derivative of ")):
         for name, word in words.items():
             bad = ~np.isfinite(got[prefix + name])

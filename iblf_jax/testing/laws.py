@@ -107,7 +107,7 @@ def _at_the_wall(findings: Findings, scenario: Scenario) -> None:
         return jax.vmap(at)(xis)
 
     values, forward, reverse = numbers(scenario, jnp.asarray(XI))
-    mend = "Near and past the wall hold the slope (barriers._base.guarded_error); a run that fails must stay finite"
+    mend = "Near and past the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay finite"
     for label, tree in (("the command", values), ("its forward derivative", forward), ("its reverse derivative", reverse)):
         finite = np.all([np.all(np.isfinite(np.asarray(x).reshape(len(XI), -1)), axis=1) for x in jax.tree.leaves(tree)], axis=0)
         where = ", ".join(f"{xi:g}" for xi, ok in zip(XI, finite, strict=True) if not ok)

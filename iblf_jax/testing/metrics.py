@@ -34,35 +34,41 @@ def check_fold(fold: Any) -> None:
         findings.stop_if_any()
 
         def outputs(fold, moving, flags):
-            return _folded(fold, samples_from(moving, flags))
+            return folded(fold, samples_from(moving, flags))
 
         some = samples(np.random.default_rng(4))
-        moving = {k: v for k, v in some._asdict().items() if jnp.issubdtype(v.dtype, jnp.floating)}
-        flags = {k: v for k, v in some._asdict().items() if k not in moving}
-        result = jax.jit(_folded)(fold, some)
+        moving, flags = parts(some)
+        result = jax.jit(folded)(fold, some)
         for name, value in result.items():
             findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
         finite = {name for name, value in result.items() if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)}
         probe(findings, lambda fold, moving: {k: v for k, v in outputs(fold, moving, flags).items() if k in finite}, fold, (moving,))
-        _at_rest(findings, fold, some)
+        at_rest(findings, fold, some)
 
 
-def samples(rng: np.random.Generator) -> Sample:
-    """A made-up run of two joints, (LENGTH, ...), all its numbers apart from each other."""
-    t = np.arange(LENGTH) * 0.01
-    dt = np.where(np.arange(LENGTH) < LENGTH - 1, 0.01, 0.0)
+def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
+    """A made-up run of n joints, (LENGTH, ...), at steps of so many seconds, all its numbers apart from each other."""
+    t = np.arange(LENGTH) * step
+    dt = np.where(np.arange(LENGTH) < LENGTH - 1, step, 0.0)
+    angle = 0.08 * np.arange(LENGTH)[:, None]
 
     def wave(size):
-        phase, speed = rng.uniform(0, 6, (2, 1, 2))
-        return size * np.sin(8 * (1 + speed) * t[:, None] + phase) + rng.uniform(-0.1, 0.1, (LENGTH, 2)) * size
+        phase, speed = rng.uniform(0, 6, (2, 1, n))
+        return size * np.sin((1 + speed) * angle + phase) + rng.uniform(-0.1, 0.1, (LENGTH, n)) * size
 
     q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
     numbers = {name: wave(1.0) for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")}
-    sides = {"lower": np.full((LENGTH, 2), 0.2), "upper": np.full((LENGTH, 2), 0.85)}
+    sides = {"lower": np.full((LENGTH, n), 0.2), "upper": np.full((LENGTH, n), 0.85)}
     k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
     numbers |= sides | {"q": q_d + e1, "e1": e1, "xi": e1 / k, "q_d": q_d, "tau": tau, "V": np.abs(wave(1.0))[:, 0], "t": t, "dt": dt}
-    flags = {name: rng.uniform(size=(LENGTH, 2)) < 0.3 for name in ("guard_active", "saturated")}
+    flags = {name: rng.uniform(size=(LENGTH, n)) < 0.3 for name in ("guard_active", "saturated")}
     return samples_from({k: jnp.asarray(v) for k, v in numbers.items()}, {k: jnp.asarray(v) for k, v in flags.items()})
+
+
+def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+    """The floating-point parts of a run, and its flags."""
+    moving = {k: v for k, v in samples._asdict().items() if jnp.issubdtype(v.dtype, jnp.floating)}
+    return moving, {k: v for k, v in samples._asdict().items() if k not in moving}
 
 
 def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> Sample:
@@ -70,7 +76,8 @@ def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> 
     return Sample(**numbers, **flags)
 
 
-def _folded(fold: Any, samples: Sample) -> dict[str, jax.Array]:
+def folded(fold: Any, samples: Sample) -> dict[str, jax.Array]:
+    """What a fold makes of a run."""
     first = jax.tree.map(lambda x: x[0], samples)
     acc, _ = jax.lax.scan(lambda acc, sample: (fold.update(acc, sample), None), fold.init(first), samples)
     return fold.finish(acc)
@@ -92,18 +99,17 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
         findings.require(set(result) == set(fold.units), f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}", mend)
 
 
-def _at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
+def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     """On a run without any error or torque, nothing is NaN, and nor is any derivative."""
     rest = jax.tree.map(lambda x: jnp.zeros_like(x), samples)._replace(
         t=samples.t, dt=samples.dt, lower=samples.lower, upper=samples.upper, q=samples.q_d, q_d=samples.q_d
     )
-    moving = {k: v for k, v in rest._asdict().items() if jnp.issubdtype(v.dtype, jnp.floating)}
-    flags = {k: v for k, v in rest._asdict().items() if k not in moving}
+    moving, flags = parts(rest)
 
     @jax.jit
     def both(fold, moving):
         def floats(fold, moving):
-            result = _folded(fold, samples_from(moving, flags))
+            result = folded(fold, samples_from(moving, flags))
             return {k: v for k, v in result.items() if jnp.issubdtype(v.dtype, jnp.floating)}
 
         values, pull = jax.vjp(floats, fold, moving)

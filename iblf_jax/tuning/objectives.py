@@ -25,13 +25,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.metrics import Fold
 from iblf_jax.pytree import component, leaf, static
-from iblf_jax.tuning.quantities import Integral, Peak, Quantity
+from iblf_jax.tuning.quantities import Integral, MetricResult, Peak, Quantity
 
 
 @component
 class Term:
-    """One weighted term of an objective."""
+    """One weighted term of an objective.
+
+    Args:
+      quantity: the number of a run, any `Quantity`.
+      weight: factor on the term, () [1], >= 0; 1 if not given.
+      scale: () in the quantity's unit, > 0; its size at the start if not given.
+      limit: for "above", () in the quantity's unit; its value at the start if not given.
+      sharpness: of the corner at the limit, () [1], > 0; 20 if not given.
+      shape: "plain" or "above"; "plain" if not given.
+      name: what reports call it; "term" if not given.
+    """
 
     quantity: Quantity
     weight: jax.Array = leaf("1", sign="nonnegative", shape="scalar", default=1.0)
@@ -56,15 +67,22 @@ class Term:
 
 @component
 class Requirement:
-    """A limit that every run, but for an allowed share of them, has to keep."""
+    """A limit that every run, but for an allowed share of them, has to keep.
+
+    Args:
+      quantity: the number of a run, any `Quantity`.
+      limit: what it must stay below, () in the quantity's unit.
+      scale: the size that matters, () in the quantity's unit, > 0.
+      allowed: share of perturbed runs that may break it, () [1], >= 0; 0.01 if not given.
+      event: "value": broken where g >= 0; "violated": broken where the run left its bounds or ran away; "value" if not given.
+      name: what reports call it; "requirement" if not given.
+    """
 
     quantity: Quantity
     limit: jax.Array = leaf("", shape="scalar")
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
     allowed: jax.Array = leaf("1", sign="nonnegative", shape="scalar", default=0.01)
-    """Share of perturbed runs that may break it."""
     event: str = static(default="value")
-    """"value": broken where g >= 0; "violated": broken where the run left its bounds or ran away."""
     name: str = static(default="requirement")
 
     def excess(self, x: jax.Array) -> jax.Array:
@@ -79,7 +97,12 @@ class Requirement:
 
 @component
 class Objective:
-    """A sum of terms and a set of requirements; made by the functions of this module and by + and *."""
+    """A sum of terms and a set of requirements; made by the functions of this module and by + and *.
+
+    Args:
+      terms: what is minimised, a tuple of `Term`; () if not given.
+      requirements: what must hold, a tuple of `Requirement`; () if not given.
+    """
 
     terms: tuple[Term, ...] = ()
     requirements: tuple[Requirement, ...] = ()
@@ -241,6 +264,31 @@ def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -
     """
     quantity = Peak(target, "deficit", smoothing=smoothing)
     return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="margin"),))
+
+
+def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Objective:
+    """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own, summed over the joints.
+
+        sum_i joints_i m_i / scale
+
+    It has to be differentiable: integrals, rms values and peaks are; a time at which something happens has no slope, and is infinite
+    where it does not happen (for the settling time there is `settle`).  `iblf_jax.testing.check_objective` looks at it.
+
+    Args:
+      fold: the metric, such as `iblf_jax.metrics.Tracking()`.
+      name: which of the fold's results; one of its `units`.
+      joints: weight of each of its numbers, one number or as many as the result has.
+      scale: in the result's unit; the value at the starting gains if not given.
+
+    Returns:
+      An `Objective`, to be weighted and added to others.
+
+    Raises:
+      ValueError: something that is not a fold, a name that it does not return, a scale that is not positive.
+
+    Source: design of this package.
+    """
+    return _plain(str(name), MetricResult(fold, name, joints), scale)
 
 
 def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:

@@ -10,7 +10,8 @@ y_u of their signal (`derivatives.Outer`):
 
     Integral   2 sum dt y_u . y_v             Peak   (sum_w y_u y_v - mean_u mean_v) / T,  w the weights of the smooth maximum
 
-A quantity of one's own needs `init`, `update`, `finish`, and for second-order methods `curvature` and `hessian`.
+`MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`, `finish`, and for second-order methods
+`curvature` and `hessian`; `iblf_jax.testing.check_objective` looks at it.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 from iblf_jax import checks
 from iblf_jax.closed_loop import Sample
 from iblf_jax.derivatives import Outer
+from iblf_jax.metrics import Fold
 from iblf_jax.pytree import component, leaf, static
 
 FAR = 1e6
@@ -72,11 +74,17 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax
 
 @component
 class Integral:
-    """sum_k dt |y(t_k)|^2 over the samples with t >= after."""
+    """sum_k dt |y(t_k)|^2 over the samples with t >= after.
+
+    Args:
+      signal: "error", "torque", "torque_rate" or "outside"; "error" if not given.
+      joints: weight of each joint, () or (n,) [1]; 1 if not given.
+      after: count from this time on, () [s]; 0 if not given.
+      tolerance: for "outside", on |e1|, () [rad], > 0; none if not given.
+    """
 
     signal: str = static(default="error")
     joints: jax.Array = leaf("1", shape="any", default=1.0)
-    """Weight of each joint."""
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     tolerance: jax.Array | None = leaf("rad", sign="positive", shape="scalar", default=None)
     units: ClassVar[dict[str, str]] = {"error": "rad^2 s", "torque": "N^2 m^2 s", "torque_rate": "N^2 m^2/s", "outside": "s"}
@@ -117,10 +125,16 @@ class Peak:
 
     In the loss T log sum exp(y / T) with T = smoothing scale: above the maximum by at most T times the logarithm of the number of
     samples that come within T of it.
+
+    Args:
+      scale: the size of y that matters, () in its unit, > 0.
+      signal: "error", "torque", "torque_rate" or "deficit"; "torque" if not given.
+      joints: weight of each joint, () or (n,) [1]; 1 if not given.
+      after: count from this time on, () [s]; 0 if not given.
+      smoothing: T as a part of the scale, () [1], > 0; 0.01 if not given.
     """
 
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
-    """The size of y that matters, in its unit."""
     signal: str = static(default="torque")
     joints: jax.Array = leaf("1", shape="any", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
@@ -170,13 +184,57 @@ class Peak:
         return self.scale * (products / weight - mean[:, None] * mean[None, :]) / self.smoothing
 
 
-MEMBERS = {"integral": Integral, "peak": Peak}
+@component
+class MetricResult:
+    """sum_i joints_i m_i of a named result m of a metric's fold; m is one number or one a joint.
+
+    It offers no matrix of second derivatives: `tune` learns that from the gradients along the way.
+
+    Args:
+      fold: the metric, any `iblf_jax.metrics.Fold`.
+      name: which of its results; one of `fold.units`.
+      joints: weight of each number of m, () or as m [1]; 1 if not given.
+    """
+
+    fold: Fold
+    name: str = static()
+    joints: jax.Array = leaf("1", shape="any", default=1.0)
+
+    def check(self) -> None:
+        """Raises ValueError for something that is not a fold, or a name that it does not return."""
+        checks.conforms("MetricResult.fold", self.fold, Fold, "iblf_jax.metrics has them; iblf_jax.testing.check_fold looks at your own.")
+        checks.one_of("MetricResult.name", self.name, tuple(self.fold.units))
+
+    def init(self, sample: Sample):
+        """The fold's accumulator."""
+        return self.fold.init(sample)
+
+    def update(self, acc, sample: Sample):
+        """Adds one sample."""
+        return self.fold.update(acc, sample)
+
+    def finish(self, acc):
+        """The weighted sum, twice, and 1."""
+        found = self.fold.finish(acc)[self.name]
+        if not jnp.issubdtype(found.dtype, jnp.floating):
+            raise checks.fail("MetricResult.name", self.name, "a result that can be differentiated", f"This one is {found.dtype}.")
+        if jnp.shape(self.joints) not in ((), found.shape):
+            raise checks.fail("MetricResult.joints", self.joints, f"one number, or shape {found.shape} as {self.name!r} has")
+        value = jnp.sum(self.joints * found)
+        return value, value, jnp.ones_like(value)
+
+
+MEMBERS = {"integral": Integral, "peak": Peak, "metric_result": MetricResult}
 """Every quantity by the name that a tuning file gives it."""
 
 
 @component
 class Quantities:
-    """All quantities of a problem as one fold; results (K,) each."""
+    """All quantities of a problem as one fold; results (K,) each.
+
+    Args:
+      parts: the quantities, a tuple.
+    """
 
     parts: tuple
     units: ClassVar[dict[str, str]] = {"tuning_smooth": "", "tuning_exact": "", "tuning_weight": "1"}

@@ -1,0 +1,167 @@
+"""The checker for objectives: the contract is `iblf_jax.tuning.quantities.Quantity`, which every term and requirement is made of."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.derivatives import Outer
+from iblf_jax.presets import zhang_yan_2024
+from iblf_jax.rollout import simulate
+from iblf_jax.scenario import Scenario
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, joints_of, probe, same_structure, shape_of
+from iblf_jax.testing.metrics import LENGTH, at_rest, folded, parts, samples, samples_from
+from iblf_jax.tuning.objectives import Objective, Requirement, complete
+from iblf_jax.tuning.quantities import Quantities, Quantity
+
+DIRECTIONS = 3
+"""Directions in which second derivatives are looked at."""
+
+
+def check_objective(objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0) -> None:
+    """Checks what gains are to be tuned for: accumulators, derivatives, float32, no NaN, and a short run that gives it its scales.
+
+        g = d(smooth value) / d(samples) by both modes and by finite differences,   N = N^T,   value at the start finite and not 0
+
+    Args:
+      objective: an objective as you composed it, a requirement, or a quantity of your own that they are made of.
+      scenario: what it is tried on; the paper's simulation if not given.
+      duration: of the run [s], as `tune` will have it.
+
+    Raises:
+      ContractError: lists what does not hold, with the mend.
+    """
+    if isinstance(objective, Requirement):
+        objective = Objective((), (objective,))
+    elif not isinstance(objective, Objective):
+        limit: Any = 1.0
+        with examine(objective, "Quantity", Quantity):
+            objective = Objective((), (Requirement(objective, limit, limit),))
+    for quantity in objective.quantities:
+        with examine(quantity, "Quantity", Quantity) as findings:
+            _quantity(findings, in_dtype(quantity, "float64"), duration)
+    with examine(objective, "Objective", Objective) as findings:
+        findings.require(objective.quantities, "it has neither terms nor requirements", "Such as ij.objectives.tracking()")
+        findings.stop_if_any()
+        _on_a_run(findings, in_dtype(objective, "float64"), zhang_yan_2024() if scenario is None else scenario, duration)
+
+
+def _quantity(findings: Findings, quantity: Any, duration: float) -> None:
+    step = duration / LENGTH
+    some = samples(np.random.default_rng(4), joints_of(quantity), step)
+    # Between whole steps, so that no sample stands where a quantity begins to count.
+    some = some._replace(t=some.t + 0.5 * step)
+    for dtype in ("float64", "float32"):
+        _structure(findings, *in_dtype((quantity, jax.tree.map(lambda x: x[0], some)), dtype))
+    findings.stop_if_any()
+    moving, flags = parts(some)
+    flags |= {name: moving.pop(name) for name in ("t", "dt")}  # the grid of the samples; nothing is differentiated by it
+    fold = Quantities((quantity,))
+
+    def outputs(fold, moving):
+        return {"the smooth value": folded(fold, samples_from(moving, in_dtype(flags, moving["q"].dtype)))["tuning_smooth"]}
+
+    exact = jax.jit(folded)(fold, some)["tuning_exact"]
+    findings.require(np.all(np.isfinite(exact)), f"the exact value is not finite on an ordinary run: {np.asarray(exact)}")
+    probe(findings, outputs, fold, (moving,))
+    at_rest(findings, fold, some)
+    if hasattr(quantity, "curvature"):
+        _second_order(findings, quantity, moving, flags)
+
+
+def _structure(findings: Findings, quantity: Any, first: Any) -> None:
+    kind = f" ({first.t.dtype})"
+    acc = shape_of(findings, "init(sample)" + kind, quantity.init, first)
+    if acc is None:
+        return
+    same_structure(
+        findings, "update(acc, sample)" + kind, shape_of(findings, "update(acc, sample)" + kind, quantity.update, acc, first), acc
+    )
+    result = shape_of(findings, "finish(acc)" + kind, quantity.finish, acc)
+    three = isinstance(result, tuple) and len(result) == 3
+    if result is not None and findings.require(
+        three, f"finish(acc) gives {type(result).__name__}", "It must be (smooth value, exact value, weight for `hessian`), () each"
+    ):
+        for name, value in zip(("smooth value", "exact value", "weight"), result, strict=True):
+            has_shape(findings, f"the {name} of finish(acc){kind}", value, ())
+    both = hasattr(quantity, "curvature") == hasattr(quantity, "hessian")
+    findings.require(both, "it has one of `curvature` and `hessian`", "Second-order methods need both; without, leave both out")
+    if not hasattr(quantity, "curvature"):
+        return
+    outer = shape_of(findings, "curvature(acc, sample)" + kind, quantity.curvature, acc, first)
+    if outer is not None and findings.require(
+        isinstance(outer, Outer), f"curvature(acc, sample) gives {type(outer).__name__}", "It must be an iblf_jax.derivatives.Outer"
+    ):
+        size = getattr(outer.vector, "shape", ())
+        findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
+        weight = jnp.shape(outer.weight) if not hasattr(outer.weight, "shape") else outer.weight.shape
+        findings.require(weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}")
+
+
+def _second_order(findings: Findings, quantity: Any, moving: dict[str, jax.Array], flags: dict[str, jax.Array]) -> None:
+    """The Gauss-Newton matrix along some directions of the samples is square, symmetric and finite."""
+    rng = np.random.default_rng(6)
+    ways = [jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), moving) for _ in range(DIRECTIONS)]
+    directions = jax.tree.map(lambda *x: jnp.stack(x), *ways)
+
+    @jax.jit
+    def matrix(quantity, moving, directions):
+        def run(moving):
+            def one(acc, sample):
+                outer = quantity.curvature(acc, sample)
+                kept = outer.vector, jnp.broadcast_to(outer.weight, outer.vector.shape), jnp.asarray(outer.decay, sample.t.dtype)
+                return quantity.update(acc, sample), kept
+
+            run = samples_from(moving, flags)
+            acc, kept = jax.lax.scan(one, quantity.init(jax.tree.map(lambda x: x[0], run)), run)
+            smooth, _, weight = quantity.finish(acc)
+            return (smooth, kept[0]), (kept[1], kept[2], weight)
+
+        def along(direction):
+            _, pushed, rest = jax.jvp(run, (moving,), (direction,), has_aux=True)
+            return pushed, rest
+
+        (gradient, vectors), (weights, decays, weight) = jax.vmap(along, out_axes=(0, None))(directions)
+        left = jnp.concatenate([jnp.cumprod(decays[::-1])[::-1][1:], jnp.ones(1)])  # of a sample's part at the end
+        products = jnp.einsum("utm,vtm,tm,t->uv", vectors, vectors, weights, left)
+        return quantity.hessian(products, gradient, weight)
+
+    try:
+        found = np.asarray(matrix(quantity, moving, directions))
+    except Exception as error:
+        findings.add(f"hessian(products, gradient, weight) raised {type(error).__name__}: {str(error).splitlines()[0]}")
+        return
+    if not findings.require(
+        found.shape == (DIRECTIONS, DIRECTIONS), f"hessian gives shape {found.shape}", "It must be (D, D) for products (D, D)"
+    ):
+        return
+    finite = findings.require(np.all(np.isfinite(found)), "the matrix of hessian is not finite on an ordinary run")
+    off = float(np.max(np.abs(found - found.T)))
+    symmetric = not finite or off <= 1e-9 * max(1.0, float(np.max(np.abs(found))))
+    findings.require(symmetric, f"the matrix of hessian is not symmetric (by {off:.2g})", "It is a matrix of second derivatives")
+
+
+def _on_a_run(findings: Findings, objective: Objective, scenario: Scenario, duration: float) -> None:
+    """A run gives finite numbers, and every term its scale."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            metrics = simulate(scenario, duration=duration, dt=1e-3, record_every=1000, metrics=(Quantities(objective.quantities),)).metrics
+    except (TypeError, ValueError) as error:
+        findings.add(f"it cannot be had from a run ({type(error).__name__}: {str(error).splitlines()[0]})")
+        return
+    for name, value in (("smooth", metrics["tuning_smooth"]), ("exact", metrics["tuning_exact"])):
+        findings.require(np.all(np.isfinite(value)), f"its {name} values on a run are {np.asarray(value)}", "They must be finite")
+    findings.stop_if_any()
+    try:
+        goal = complete(objective, np.asarray(metrics["tuning_exact"])[: len(objective.terms)])
+    except ValueError as error:
+        findings.add(str(error).rstrip("."), "Or give check_objective the scenario and the duration that `tune` will have")
+        return
+    smooth = jnp.asarray(metrics["tuning_smooth"])
+    numbers = [*(goal.values(smooth) if goal.terms else ()), *goal.excesses(smooth)]
+    findings.require(np.all(np.isfinite(numbers)), f"its terms and requirements on a run are {[float(x) for x in numbers]}")
