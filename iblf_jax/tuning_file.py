@@ -163,7 +163,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     setup = result.setup
     numbers = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
-    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence")
+    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits")
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
