@@ -22,7 +22,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.gridspec import GridSpec, GridSpecFromSubplotSpec, SubplotSpec
+from matplotlib.gridspec import SubplotSpec
 
 from iblf_jax.plotting._curves import Curve
 
@@ -109,18 +109,21 @@ class StyledFigure(Figure):
             super().draw(renderer)
 
     def _fit_labels(self, renderer: Any) -> None:
-        """Breaks every title and label that is longer than its panel, once the panels have their places."""
+        """Breaks every title and label that is longer than its panel, by the places that the panels have without them, then with them."""
         engine = self.get_layout_engine()
-        if engine is not None:
-            engine.execute(self)
-        for axes in self.axes:
-            box = axes.get_window_extent(renderer)
-            for text, room in ((axes.title, box.width), (axes.xaxis.label, box.width), (axes.yaxis.label, box.height)):
-                extent = text.get_window_extent(renderer)
-                length = extent.height if text is axes.yaxis.label else extent.width
+        labels = [(axes, text) for axes in self.axes for text in (axes.title, axes.xaxis.label, axes.yaxis.label) if text.get_text()]
+        words = [text.get_text() for _, text in labels]
+        for counted in (False, True, True):
+            for _, text in labels:
+                text.set_in_layout(counted)
+            if engine is not None:
+                engine.execute(self)
+            for (axes, text), whole in zip(labels, words, strict=True):
+                upright, box, extent = text is axes.yaxis.label, axes.get_window_extent(renderer), text.get_window_extent(renderer)
+                length, room = (extent.height, box.height) if upright else (extent.width, box.width)
                 if length > room > 0:
-                    longest = max(map(len, text.get_text().split("\n")))
-                    text.set_text("\n".join(wrapped(line, max(6, int(longest * room / length))) for line in text.get_text().split("\n")))
+                    most = int(max(map(len, text.get_text().split("\n"))) * room / length)
+                    text.set_text("\n".join(wrapped(line, max(6, most)) for line in whole.split("\n")))
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
         """As matplotlib's, in this package's style."""
@@ -277,13 +280,11 @@ def spread(figure: Figure, count: int, most: int, where: SubplotSpec | None = No
       The panels, row by row.
     """
     sizes = row_sizes(count, most)
-    columns = math.lcm(*sizes)
-    shape = (len(sizes), columns)
-    grid = GridSpec(*shape, figure=figure) if where is None else GridSpecFromSubplotSpec(*shape, subplot_spec=where)
+    grid = figure.add_gridspec(len(sizes), 1) if where is None else where.subgridspec(len(sizes), 1)
     rows = []
     for r, k in enumerate(sizes):
-        width = columns // k
-        rows.append([figure.add_subplot(grid[r, c * width : (c + 1) * width], **options) for c in range(k)])
+        places = grid[r].subgridspec(1, k)  # of its own: columns that all rows share would be too narrow for their labels
+        rows.append([figure.add_subplot(places[c], **options) for c in range(k)])
     return rows
 
 
