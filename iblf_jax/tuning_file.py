@@ -204,7 +204,7 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
         objective=codec.decode_fields(Objective, data["objective"], "objective"),
         perturbations={key: codec.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
         risk=Risk(*data["risk"]),
-        **data["setup"],
+        **data["setup"] | {"limits": tuple((low, high) for low, high in data["setup"].get("limits", ()))},
     )
     history = {name: np.asarray(x["values"], x["dtype"]).reshape(x["shape"]) for name, x in data["history"].items()}
     rest = {name: data[name] for name in ("best_start", "stopped", "optimiser", "mode", "seconds")}

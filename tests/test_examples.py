@@ -18,9 +18,9 @@ COMMANDS = {
     "arm.toml": ["simulate", "--out", "out"],
     "study.toml": ["montecarlo", "--quiet"],
     "sweep.toml": ["sweep", "--store", "sweep.zarr", "--quiet"],
-    "tune.toml": ["tune", "--out", "out", "--quiet"],
+    "tune.toml": ["tune", "--quiet"],
 }
-"""File -> the command that its first line names, and where it writes."""
+"""File -> the command that its first line names, and its options."""
 
 
 def test_every_example_is_run_and_names_its_command():

@@ -279,6 +279,7 @@ def test_no_row_has_a_panel_alone_and_no_labels_meet():
         axes.set_xlabel("plant.link[the_very_long_name_of_a_link_of_somebody].friction_width [rad/s]")
         axes.set_ylabel("worst xi margin of all joints together, as a part of the bound [1]")
     drawn(figure)
+    figure.draw_without_rendering()  # at the figure's own resolution, in which extents are given
     boxes = [axes.xaxis.label.get_window_extent() for axes in itertools.chain(*rows)]
     boxes += [axes.yaxis.label.get_window_extent() for axes in itertools.chain(*rows)]
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))

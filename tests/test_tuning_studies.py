@@ -108,7 +108,7 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     np.testing.assert_array_equal(tuned.controller.K2, loaded.scenario.controller.K2)
     assert loaded.values["controller.K2"].shape == (2,)
     assert loaded.names[-1] == "controller.K2"
-    assert loaded.setup.limits[-1] == (0.6, pytest.approx(30.0))
+    assert loaded.setup.limits[-1] == pytest.approx((0.6, 30.0))
     assert "peak torque of all runs, joint by joint" in text
     file.write_text(TUNING.replace("margin_above", "margin_abve"))
     assert main(["tune", str(file), "--quiet"]) == 2
