@@ -18,11 +18,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import matplotlib
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
+from matplotlib.rcsetup import cycler
 
 from iblf_jax.plotting._curves import Curve
 
