@@ -234,7 +234,7 @@ def main() -> None:
         speed = diffrax_vmap(lanes, duration) * share
         rows.append(["diffrax, vmap", lanes, speed, speed / reference, "-", said.replace(f"{count} runs", f"{lanes} runs")])
     except ImportError:
-        print("diffrax is not installed: pip install 'iblf_jax[bench]'")
+        print("diffrax is not installed: pip install '.[bench]' in a clone")
     if "runs" in args.parts:
         rows += ours(args, reference)
     if "devices" in args.parts and len(os.sched_getaffinity(0)) > 1:

@@ -164,7 +164,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     setup = result.setup
     numbers = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
-    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence")
+    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits")
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
@@ -205,7 +205,7 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
         objective=codec.decode_fields(Objective, data["objective"], "objective"),
         perturbations={key: codec.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
         risk=Risk(*data["risk"]),
-        **data["setup"],
+        **data["setup"] | {"limits": tuple((low, high) for low, high in data["setup"].get("limits", ()))},
     )
     history = {name: np.asarray(x["values"], x["dtype"]).reshape(x["shape"]) for name, x in data["history"].items()}
     rest = {name: data[name] for name in ("best_start", "stopped", "optimiser", "mode", "seconds")}

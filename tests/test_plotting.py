@@ -8,14 +8,20 @@ import warnings
 
 import jax
 import jax.numpy as jnp
+import matplotlib
+import matplotlib.style
 import numpy as np
 import pytest
 from conftest import SHORT
 from made_up_runs import Arm3D, chain, made_up, runaway
+from matplotlib.colors import to_hex
+from matplotlib.text import Text
 from PIL import Image
 
 import iblf_jax as ij
 from iblf_jax import plotting
+from iblf_jax.plotting import _style
+from iblf_jax.plotting._arm import Scene, motions_of
 from iblf_jax.plotting._curves import curves_of, thinned
 
 SIX = [f"figure_{k}" for k in range(1, 7)]
@@ -205,7 +211,6 @@ def test_save_writes_every_format(runs, tmp_path):
 
 
 def test_no_global_state_is_touched_and_no_figure_stays_open(runs):
-    import matplotlib
     from matplotlib import pyplot
 
     before = dict(matplotlib.rcParams)
@@ -213,6 +218,79 @@ def test_no_global_state_is_touched_and_no_figure_stays_open(runs):
     assert drawn(figure).startswith(b"\x89PNG"), "a notebook shows this"
     assert dict(matplotlib.rcParams) == before
     assert pyplot.get_fignums() == []
+
+
+def colours_of(figure):
+    """Colours of all text that is shown."""
+    texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    return {to_hex(text.get_color()) for text in texts}
+
+
+def test_figures_follow_the_user_s_style(runs):
+    with matplotlib.rc_context(matplotlib.style.library["dark_background"] | {"font.size": 16.0, "lines.linewidth": 3.0}):
+        cycle = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
+        figures = [plotting.joint(runs), runs["k1=2"].plot(), plotting.phase_portrait(runs)]
+    for figure in figures:
+        drawn(figure)  # outside of the user's context: the figure keeps the style that it was made in
+        assert to_hex(figure.get_facecolor()) == to_hex(figure.axes[0].get_facecolor()) == "#000000"
+        assert colours_of(figure) == {"#ffffff"}
+        assert figure.axes[0].xaxis.label.get_size() == pytest.approx(16.0)
+        assert figure.axes[0].get_yticklabels()[0].get_size() == pytest.approx(16.0 * 8 / 9)
+    (line,) = lines_of(figures[0].axes[0], "k1=4")
+    assert (to_hex(line.get_color()), line.get_linewidth()) == (cycle[1], 3.0)
+    with matplotlib.rc_context({"axes.grid": True, "grid.color": "red", "text.color": "blue", "axes.facecolor": "#eeeeee"}):
+        axes = plotting.joint(runs).axes[0]
+    assert to_hex(axes.get_xgridlines()[0].get_color()) == "#ff0000"
+    assert to_hex(axes.get_facecolor()) == "#eeeeee"
+    assert axes.xaxis.label.get_size() == 9.0
+    assert to_hex(lines_of(axes, "k1=4")[0].get_color()) == _style.COLOURS[1].lower()
+
+
+def test_joints_have_the_names_of_the_robot_s_file(tmp_path):
+    plant = Arm3D(3)
+    plant.joints = ("base_yaw", "_hidden", "cost$5$")
+    run = made_up(plant, duration=1.0)
+    figure = run.plot()
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["base_yaw", " _hidden", r"cost\$5\$"]
+    assert {"base_yaw", " _hidden", r"cost\$5\$"} <= set(texts_of(figure))
+    drawn(figure)
+    assert plotting.torques(run).axes[0].get_ylabel().startswith("base_yaw\n")
+    assert "of  _hidden" in plotting.joint(run, 1).get_suptitle()
+    curves = curves_of(run)
+    bars = Scene(curves, *motions_of(curves, np.linspace(0.0, 1.0, 3))).bars
+    assert [text.get_text() for text in bars.get_yticklabels()] == ["base_yaw", " _hidden", r"cost\$5\$"]
+
+
+def test_a_spike_is_cut_and_named():
+    calm = made_up(chain(2))
+    spiky = dataclasses.replace(calm, tau=calm.tau.at[3, 1].set(-4321.5))
+    for run, said in ((calm, []), (spiky, ["peak 4321.5 N m at t = 0.03 s"])):
+        (axes,) = [axes for axes in run.plot().axes if "torque" in axes.get_ylabel()]
+        assert [text.get_text() for text in axes.texts] == said
+        assert np.ptp(axes.get_ylim()) < 60
+
+
+def test_no_row_has_a_panel_alone_and_no_labels_meet():
+    assert [_style.row_sizes(n, 4) for n in (1, 4, 5, 9, 13)] == [[1], [4], [3, 2], [3, 3, 3], [4, 3, 3, 3]]
+    with _style.styled():
+        figure = _style.new_figure(10.0, 8.0)
+        rows = _style.spread(figure, 13, 4)
+    for axes in itertools.chain(*rows):
+        axes.set_xlabel("plant.link[the_very_long_name_of_a_link_of_somebody].friction_width [rad/s]")
+        axes.set_ylabel("worst xi margin of all joints together, as a part of the bound [1]")
+    drawn(figure)
+    figure.draw_without_rendering()  # at the figure's own resolution, in which extents are given
+    boxes = [axes.xaxis.label.get_window_extent() for axes in itertools.chain(*rows)]
+    boxes += [axes.yaxis.label.get_window_extent() for axes in itertools.chain(*rows)]
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
+@pytest.mark.parametrize("words", ["plant.link[forearm_2].mass [kg]", r"$f$ (broad), $\hat f$ [N m]", r"cost\$5\$ of 0.05", "x" * 50, ""])
+def test_a_wrapped_label_keeps_its_words_and_formulas(words):
+    lines = _style.wrapped(words, 9).split("\n")
+    assert "".join(lines).replace(" ", "") == words.replace(" ", "")
+    assert all(line.replace(r"\$", "").count("$") % 2 == 0 for line in lines)
+    assert all(len(line) <= 9 or "$" in line for line in lines)
 
 
 def test_the_package_loads_no_matplotlib_until_something_is_drawn():
@@ -267,7 +345,7 @@ def test_an_animation_of_a_failed_run(tmp_path):
 
 
 def test_joint_limits_are_drawn_where_the_robot_would_be_at_them():
-    from iblf_jax.plotting._arm import FAN_RADIUS, motions_of
+    from iblf_jax.plotting._arm import FAN_RADIUS
 
     plant, run = chain(3), made_up(chain(3))
     world, (motion,) = motions_of(curves_of(run), np.array([0.7]))

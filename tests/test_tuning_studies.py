@@ -1,12 +1,16 @@
 """Fronts, attacks on tuned gains, saved results, the command line and the figures of tuning."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pytest
 
 import iblf_jax as ij
 from iblf_jax.paths import get
-from iblf_jax.tuning._pareto import non_dominated
+from iblf_jax.tuning._pareto import Front, non_dominated
+from iblf_jax.tuning.result import TuneResult
 
 jax.config.update("jax_enable_x64", True)
 
@@ -104,16 +108,57 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     np.testing.assert_array_equal(tuned.controller.K2, loaded.scenario.controller.K2)
     assert loaded.values["controller.K2"].shape == (2,)
     assert loaded.names[-1] == "controller.K2"
+    assert loaded.setup.limits[-1] == pytest.approx((0.6, 30.0))
+    assert "peak torque of all runs, joint by joint" in text
     file.write_text(TUNING.replace("margin_above", "margin_abve"))
     assert main(["tune", str(file), "--quiet"]) == 2
     assert "requirement[0].kind" in capsys.readouterr().err
 
 
+def _check_torque_and_ends(paper, best, figure):
+    """Report, repr and figure show both, although the objective asked for neither; the legend covers no curve."""
+    peaks = [np.asarray(ij.simulate(scenario, **SHORT).metrics.peak_torque) for scenario in (paper, best.scenario)]
+    assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5)
+    for text in (repr(best), str(best.report)):
+        assert "controller.k1[0] = 2.5 is at the upper end of its range, 2.5" in text
+    assert f"peak torque of the nominal run: {peaks[0].max():.5g} -> {peaks[1].max():.5g} N m" in repr(best)
+    before, after = (", ".join(f"{x:.5g}" for x in peak) for peak in peaks)
+    assert f"peak torque, joint by joint: {before} -> {after} N m" in str(best.report)
+    figure._repr_png_()
+    assert "at the end of their range: controller.k1[0]" in figure.get_suptitle().replace("\n", " ")
+    panels = {axes.get_ylabel(): axes for axes in figure.axes}
+    assert [text.get_text() for text in panels["peak torque [N m]"].texts] == [f"{x:.5g}" for x in np.concatenate(peaks)]
+    gains = panels["gain, relative to start"]
+    assert not gains.get_legend().get_window_extent().overlaps(gains.get_window_extent())
+    assert "controller.k1[0] (at its upper limit 2.5)" in [text.get_text() for text in gains.get_legend().get_texts()]
+
+
+def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
+    """1 % of the limit, or of the range where the limit is 0; an infinite limit is never reached."""
+    limits = ((0.0, 100.0), (1.01, np.inf), (-np.inf, 50.0), (1.0, 9.0))
+    values = {"a": np.array(0.5), "b": np.array(1.011), "c": np.array(49.8), "d": np.array(5.0)}
+    result = TuneResult(None, None, values, ("a", "b", "c", "d"), {}, 0, "", "newton", "forward", 0.0, SimpleNamespace(limits=limits))
+    assert {name: end.side for name, end in result.at_limits.items()} == {"a": "lower", "b": "lower", "c": "upper"}
+    assert dataclasses.replace(result, setup=SimpleNamespace(limits=())).at_limits == {}
+
+
+@pytest.mark.parametrize(("b", "scale"), [([1.0, 30.0, 2000.0], "log"), ([1.0, 1.5, 2.0], "linear"), ([-1.0, 0.0, 2000.0], "linear")])
+def test_a_front_over_decades_has_logarithmic_axes(b, scale):
+    points = np.stack([np.linspace(0.5, 1.0, 3), b], axis=1)
+    front = Front(("a", "b"), points, points, (), points, points[0], None, (), points, 0.0)
+    (axes,) = front.plot().axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("linear", scale)
+    low, high = axes.get_ylim()
+    assert low < min(b) < max(b) < high
+
+
 @pytest.mark.slow
 def test_figures(paper):
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT)
+    narrow = ij.tunable("controller.k1", low=1.0, high=2.5)
+    best = ij.tune(paper, [narrow, "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT)
     figure = best.plot(points=3)
-    assert len(figure.axes) == 6
+    assert len(figure.axes) == 8
+    _check_torque_and_ends(paper, best, figure)
     a, b, loss = best.landscape("controller.k1[0]", "controller.K2[1]", points=3, span=0.2)
     assert loss[1, 1] == pytest.approx(best.report.changes[0].after, rel=1e-9)
     assert a[1] == best.tuned[0]

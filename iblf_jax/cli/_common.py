@@ -154,8 +154,10 @@ def number(value: Any) -> str:
 
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
     """Metrics of runs side by side, one column a joint, with units."""
+    from iblf_jax.robots import joint_names
+
     first = next(iter(runs.values()))
-    joints = [f"joint {i}" for i in range(first.n)]
+    joints = joint_names(first.scenario.plant, first.n)
     rows = [["metric", "unit", *(cell for _ in runs for cell in joints)]]
     for name, unit in first.metrics.units.items():
         row = [name, unit]

@@ -10,7 +10,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "tune",
         help="tune gains by gradient",
-        description="Tune the parameters of a tuning file (its format: iblf_jax.tuning_file); print the report on fresh runs.",
+        description="Tune the parameters of a tuning file (its format: iblf_jax.tuning_file); print the report, "
+        "on fresh runs where something is perturbed.",
         epilog="Exit code 1 if a requirement failed or the objective did not go down.",
     )
     parser.add_argument("file", metavar="TUNE.toml", help="a tuning file")

@@ -18,9 +18,8 @@ from matplotlib.artist import Artist
 
 from iblf_jax import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve
+from iblf_jax.plotting._curves import Curve, called
 
-FAN_FILL = "#e4ecf4"
 FAN_POINTS = 13
 FAN_RADIUS = 0.42
 """Radius of a fan as a part of its link's length."""
@@ -135,17 +134,18 @@ class Scene:
 
     def _add_fans(self) -> None:
         n, planar = self.world.q_d.shape[1], self.world.ghost.shape[-1] == 2
-        look: dict[str, Any] = {"edgecolor": _style.BOUND, "facecolor": FAN_FILL, "linewidth": 0.7}
+        look: dict[str, Any] = {"edgecolor": _style.bound(), "facecolor": _style.shade(0.11, _style.colour(0)), "linewidth": 0.7}
         for joint in range(n):
             text = "joint limits" if joint == 0 else None
             if planar:
                 self.fans.append(self._keep(self.arm.fill([0.0], [0.0], label=text, **look)[0]))
             else:
-                self.fans.append(self._line(self.arm, color=_style.BOUND, linewidth=0.8, label=text))
+                self.fans.append(self._line(self.arm, color=_style.bound(), linewidth=0.8, label=text))
 
     def _add_arms(self, curves: Sequence[Curve]) -> None:
-        self.arm.plot(*self.world.ghost[:, -1].T, **(_style.REFERENCE | {"linewidth": 0.8, "color": "#777777"}))
-        look: dict[str, Any] = {"color": "#999999", "linewidth": 1.6, "marker": "o", "markersize": 4, "markerfacecolor": "white"}
+        self.arm.plot(*self.world.ghost[:, -1].T, **(_style.reference() | {"linewidth": 0.8, "color": _style.shade(0.533)}))
+        look: dict[str, Any] = {"color": _style.shade(0.4), "linewidth": 1.6, "marker": "o", "markersize": 4}
+        look["markerfacecolor"] = _style.paper()
         self.ghost = self._line(self.arm, label="reference", **look)
         self.trails = [self._line(self.arm, color=_style.series(i)["color"], linewidth=0.9) for i in range(len(curves))]
         look = {"linewidth": 2.6, "marker": "o", "markersize": 5}
@@ -158,13 +158,13 @@ class Scene:
         self.bars.set(
             xlim=(shown.min() - room, shown.max() + room), ylim=(len(rows) - 0.4, -0.6), xlabel=_style.label("position $q$", "rad")
         )
-        self.bars.set_yticks(rows, [f"joint {joint}" for joint in rows])
+        self.bars.set_yticks(rows, called(curves[0].run.scenario.plant, len(rows)))
         self.bars.spines["left"].set_visible(False)
         self.bars.tick_params(axis="y", length=0)
         width = max(4.0, min(18.0, 90.0 / len(rows)))
-        self.ranges = [self._line(self.bars, color="#d9d9d9", linewidth=width, solid_capstyle="butt") for _ in rows]
+        self.ranges = [self._line(self.bars, color=_style.shade(0.149), linewidth=width, solid_capstyle="butt") for _ in rows]
         look: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": width + 3, "markeredgewidth": 1.6}
-        self.wanted = self._line(self.bars, color="black", **look)
+        self.wanted = self._line(self.bars, color=_style.ink(), **look)
         for i in range(len(curves)):
             look = {"linestyle": "none", "marker": "oDs^v"[i % 5], "markersize": max(3.0, min(5.5, width / len(curves)))}
             self.dots.append(self._line(self.bars, color=_style.series(i)["color"], **look))

@@ -14,6 +14,7 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.results import Rollout
+from iblf_jax.robots import joint_names
 from iblf_jax.status import FAILED, Status, describe
 
 POINTS = 2400
@@ -74,6 +75,10 @@ class Curve:
         """The run's flags in words."""
         return describe(int(self.run.status))
 
+    def called(self, joint: int) -> str:
+        """What a joint is called in a figure."""
+        return called(getattr(self.run.scenario, "plant", None), self.run.n)[joint]
+
     def break_index(self) -> int | None:
         """The first sample at which the run was outside its bounds, or its last one if it ran away; None if neither."""
         lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
@@ -82,6 +87,16 @@ class Curve:
         if outside.size:
             return int(outside[0])
         return self.samples - 1 if int(self.run.status) & Status.NOT_FINITE else None
+
+
+def called(robot: Any, n: int) -> list[str]:
+    """What the joints of a robot are called in a figure: as in the robot's file, if it has names."""
+    return [plain(name) for name in joint_names(robot, n)]
+
+
+def plain(name: str) -> str:
+    """A name from a file as it is: matplotlib takes $ for mathematics, and leaves what begins with _ out of legends."""
+    return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
 
 def _sound_samples(run: Rollout) -> int:

@@ -72,17 +72,17 @@ def _outline(main: Axes, inset: Axes) -> None:
     (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
     floor, ceiling = main.get_ylim()
     low, high = max(low, floor), min(high, ceiling)
-    main.indicate_inset((left, low, right - left, high - low), edgecolor="#555555", alpha=1.0, linewidth=0.7)
+    main.indicate_inset((left, low, right - left, high - low), edgecolor=_style.shade(0.667), alpha=1.0, linewidth=0.7)
     inset.spines[["top", "right"]].set_visible(True)
     for spine in inset.spines.values():
-        spine.set_color("#555555")
+        spine.set_color(_style.shade(0.667))
 
 
 def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figure:
     """A figure with one row a joint."""
     curves = curves_of(runs)
     n, quantity = curves[0].run.n, QUANTITIES[field]
-    rows = [Row(quantity, joint, f"joint {joint}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
+    rows = [Row(quantity, joint, f"{curves[0].called(joint)}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
     return _rows_with_zoom(title, curves, rows, zoom, 1.75 if n <= 3 else 1.25)
 
 
@@ -103,7 +103,7 @@ def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
     curves = curves_of(runs)
     joint = check_joint(curves, joint)
     rows = [Row(quantity, joint, quantity.label) for quantity in (QUANTITIES["q"], QUANTITIES["e1"])]
-    return _rows_with_zoom(f"Position and tracking error of joint {joint}", curves, rows, zoom, 2.1)
+    return _rows_with_zoom(f"Position and tracking error of {curves[0].called(joint)}", curves, rows, zoom, 2.1)
 
 
 def positions(runs: Runs, *, zoom: float | None = None) -> Figure:
@@ -192,10 +192,12 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     for i, curve in enumerate(distinct(curves, ["q_d"], joints)):
         path = curve["q_d"][:, joints]
         own = {"color": _style.series(curves.index(curve))["color"], "alpha": 0.6} if i else {}
-        axes.plot(*path.T, **(_style.REFERENCE | {"zorder": 3, "label": "reference $q_d$"} | own))
+        axes.plot(*path.T, **(_style.reference() | {"zorder": 3, "label": "reference $q_d$"} | own))
         frame.append(path)
     starts = np.stack([curve["q"][0, joints] for curve in curves])
-    axes.plot(*starts.T, marker="o", color="black", markerfacecolor="white", markersize=6, linestyle="none", zorder=4, label="start")
+    axes.plot(
+        *starts.T, marker="o", color=_style.ink(), markerfacecolor=_style.paper(), markersize=6, linestyle="none", zorder=4, label="start"
+    )
     for i, curve in enumerate(curves):
         path = curve["q"][:, joints]
         look = _style.series(i) | (_style.FAINT if curve.failed and len(curves) > 1 else {})
@@ -208,8 +210,8 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     middle = 0.5 * (low + high)
     axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
     axes.set_aspect("equal")
-    axes.set_xlabel(_style.label(f"position of joint {joints[0]}", "rad"))
-    axes.set_ylabel(_style.label(f"position of joint {joints[1]}", "rad"))
+    axes.set_xlabel(_style.label(f"position of {curves[0].called(joints[0])}", "rad"))
+    axes.set_ylabel(_style.label(f"position of {curves[0].called(joints[1])}", "rad"))
 
 
 @_style.styled()

@@ -13,7 +13,7 @@ from iblf_jax import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
-from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, draw, draw_frame, set_limits, show
+from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, draw, draw_frame, say_what_is_cut, set_limits, show
 from iblf_jax.results import Rollout
 
 WIDTH = 10.0
@@ -41,31 +41,28 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     if not isinstance(run, Rollout):
         raise checks.fail("run", type(run).__name__, "a Rollout", "To compare several, use plotting.joint and the other figures.")
     (curve,) = curves_of(run)
-    rows = int(np.ceil(run.n / COLUMNS))
+    rows = len(_style.row_sizes(run.n, COLUMNS))
     figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows + 4.4)
     halves = figure.add_gridspec(2, 1, height_ratios=(2.0 * rows, 4.4))
     whole = (0.0, float(np.asarray(run.t)[-1]) or 1e-3)
-    _tubes(figure, halves[0], curve, whole, rows)
+    _tubes(figure, halves[0], curve, whole)
     _together(figure, halves[1], curve, whole)
     _style.entitle(figure, title, [curve], always=True)
     _style.legend_below(figure, 8)
     return figure
 
 
-def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window, rows: int) -> None:
+def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
     """Position of every joint in its tube."""
-    n = curve.run.n
-    columns = int(np.ceil(n / rows))
-    grid = where.subgridspec(rows, columns)
-    for joint in range(n):
-        axes = figure.add_subplot(grid[joint // columns, joint % columns])
+    rows = _style.spread(figure, curve.run.n, COLUMNS, where)
+    for joint, axes in enumerate(axes for row in rows for axes in row):
         show(axes, [curve], QUANTITIES["q"], joint, whole)
         for line in axes.get_lines():
             if line.get_label() == "$q$":
                 line.set(**_style.series(joint), label="_")
-        axes.set_title(f"joint {joint}")
-        axes.set_ylabel(QUANTITIES["q"].label if joint % columns == 0 else "")
-        axes.set_xlabel(_style.label("time $t$", "s") if joint + columns >= n else "")
+        axes.set_title(curve.called(joint))
+        axes.set_ylabel(QUANTITIES["q"].label if any(axes is row[0] for row in rows) else "")
+        axes.set_xlabel(_style.label("time $t$", "s") if axes in rows[-1] else "")
 
 
 def _together(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
@@ -79,7 +76,7 @@ def _together(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -
         draw_phase_portrait(axes, [curve], (0, 1))
         for line in axes.get_lines():
             if line.get_label() == "$q$":
-                line.set(color="#9a9a9a", linewidth=2.4)
+                line.set(color=_style.shade(0.396), linewidth=2.4)
             line.set_label("_")
     _lyapunov(figure.add_subplot(grid[1, 2]), curve, whole)
 
@@ -93,9 +90,10 @@ def _joints(axes: Axes, curve: Curve, quantity: Quantity, whole: Window) -> None
         look = _style.series(joint)
         if quantity.truth:
             drawn.append(draw(axes, curve, quantity.truth, joint, whole, color=look["color"], linewidth=4.0, alpha=0.3, label="_"))
-        drawn.append(draw(axes, curve, quantity.field, joint, whole, label=f"joint {joint}", **look))
+        drawn.append(draw(axes, curve, quantity.field, joint, whole, label=curve.called(joint), **look))
     axes.set_xlim(*whole)
-    set_limits(axes, [curve] * len(drawn), drawn, frame)
+    set_limits(axes, [curve] * len(drawn), drawn, frame, spikes=quantity.unit == "N m")
+    say_what_is_cut(axes, [curve] * len(drawn), drawn, quantity.unit)
     axes.set_ylabel(r"$f$ (broad), $\hat f$ [N m]" if quantity.truth else quantity.label)
     axes.set_xlabel(_style.label("time $t$", "s"))
 
@@ -104,7 +102,7 @@ def _lyapunov(axes: Axes, curve: Curve, whole: Window) -> None:
     """The Lyapunov function on a logarithmic axis."""
     V = curve["V"]
     positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
-    axes.plot(*thinned(curve.t[: len(V)], positive), color="#444444")
+    axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.shade(0.733))
     if np.isfinite(positive).any():
         axes.set_yscale("log")
     axes.set_xlim(*whole)

@@ -2,7 +2,7 @@
 
 `QUANTITIES` describes each panel as data; `show` draws one.  Limits follow the bounds where a quantity has bounds, so that a run
 that leaves them is cut at the edge instead of flattening all others; elsewhere they follow the runs, without the
-outliers of runs that failed.
+outliers of runs that failed.  Where a signal is cut, the panel says its peak.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, distinct, thinned
-from iblf_jax.plotting._style import ALARM, BOUND, FAINT, PALE, REFERENCE, TUBE, label, series
+from iblf_jax.plotting._style import FAINT, label, series
 
 Window = tuple[float, float]
 
@@ -24,6 +25,9 @@ FAR = 20.0
 
 OUT_OF_PROPORTION = 40.0
 """A failed run's range is cut where it is wider than this many times its median deviation."""
+
+SPIKES, RULING = 0.98, 5.0
+"""A sound run's peaks rule an axis where its whole range is wider than RULING times the one that holds it for this part of the time."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +85,10 @@ def draw_frame(axes: Axes, curve: Curve, quantity: Quantity, joint: int, window:
     """Draws the bounds of a quantity as grey lines with a pale tube between them; returns them."""
     if quantity.frame is None:
         return []
-    look = {"color": BOUND, "linewidth": 1.0, "zorder": 1.8, "label": quantity.frame_words} | options
+    look = {"color": _style.bound(), "linewidth": 1.0, "zorder": 1.8, "label": quantity.frame_words} | options
     lower, upper = (curve[field][:, joint] for field in quantity.frame)
     step = max(1, len(curve.t) // 500)
-    axes.fill_between(curve.t[::step], lower[::step], upper[::step], color=TUBE, linewidth=0, zorder=0)
+    axes.fill_between(curve.t[::step], lower[::step], upper[::step], color=_style.tube(), linewidth=0, zorder=0)
     drawn = [draw(axes, curve, quantity.frame[0], joint, window, **look)]
     return [*drawn, draw(axes, curve, quantity.frame[1], joint, window, **(look | {"label": "_"}))]
 
@@ -110,7 +114,19 @@ def _in_proportion(y: np.ndarray) -> np.ndarray:
     return finite[np.abs(finite - middle) <= max(0.25 * OUT_OF_PROPORTION * deviation, 1e-12)]
 
 
-def set_limits(axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray], frame: Sequence[np.ndarray]) -> None:
+def _without_spikes(y: np.ndarray) -> np.ndarray:
+    """The range in which a signal is for SPIKES of the time, if the whole one is out of proportion to it."""
+    finite = y[np.isfinite(y)]
+    if finite.size < 10:
+        return finite
+    usual = np.quantile(finite, [0.5 - 0.5 * SPIKES, 0.5 + 0.5 * SPIKES])
+    width = float(np.ptp(usual))
+    return usual + 0.5 * width * np.array([-1.0, 1.0]) if 0.0 < RULING * width < np.ptp(finite) else finite
+
+
+def set_limits(
+    axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray], frame: Sequence[np.ndarray], *, spikes: bool = False
+) -> None:
     """Sets the limits of the vertical axis: the frame, or the sound runs where there is none, and the rest up to 40 % beyond.
 
     Args:
@@ -118,7 +134,10 @@ def set_limits(axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray],
       curves: the runs, in the order of `drawn`.
       drawn: what was drawn of each run.
       frame: bounds and reference; empty if there are none.
+      spikes: cut short peaks that would rule the axis.
     """
+    if spikes:
+        drawn = [_without_spikes(y) for y in drawn]
     spans = [_span([_in_proportion(y) if curve.failed else y]) for curve, y in zip(curves, drawn, strict=True)]
     low, high = _span([np.array([span for span in spans if span])]) or (-1.0, 1.0)
     near = [y[(y > low - FAR) & (y < high + FAR)] for y in frame]
@@ -131,12 +150,35 @@ def set_limits(axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray],
     axes.set_ylim(low - margin, high + margin)
 
 
+def say_what_is_cut(axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray], unit: str) -> None:
+    """Writes the largest value and its time into a panel whose limits leave it out.
+
+    Args:
+      axes: the panel, its limits set.
+      curves: the runs, in the order of `drawn`.
+      drawn: what was drawn of each run, from its first sample on.
+      unit: of the values.
+    """
+    low, high = axes.get_ylim()
+    found = []
+    for curve, y in zip(curves, drawn, strict=True):
+        outside = np.flatnonzero(np.isfinite(y) & ((y < low) | (y > high)))
+        if outside.size:
+            i = outside[np.argmax(np.abs(y[outside]))]
+            found.append((abs(float(y[i])), float(curve.t[i])))
+    if found:
+        value, t = max(found)
+        back = {"facecolor": _style.paper(), "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
+        where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": _style.size(7.5), "zorder": 6}
+        axes.text(0.98, 0.97, f"peak {value:.5g} {unit} at t = {t:.4g} s", bbox=back, **where)
+
+
 def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None:
     """A cross where a run broke, at the edge of the panel if that is outside of it."""
     index = curve.break_index()
     if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
         look: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2, "linestyle": "none"}
-        axes.plot(curve.t[index], np.clip(y[index], *axes.get_ylim()), color=ALARM, zorder=5, clip_on=False, **look)
+        axes.plot(curve.t[index], np.clip(y[index], *axes.get_ylim()), color=_style.alarm(), zorder=5, clip_on=False, **look)
 
 
 def _draw_surroundings(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: int, window: Window) -> tuple[list, list]:
@@ -147,7 +189,7 @@ def _draw_surroundings(axes: Axes, curves: Sequence[Curve], quantity: Quantity, 
         own = {"color": series(curves.index(curve))["color"], "alpha": 0.6} if i else {}
         bounds += draw_frame(axes, curve, quantity, joint, window, **own)
         if quantity.guide:
-            look = REFERENCE | {"zorder": 3, "label": quantity.guide_words} | own
+            look = _style.reference() | {"zorder": 3, "label": quantity.guide_words} | own
             guides.append(draw(axes, curve, quantity.guide, joint, window, **look))
     return bounds, guides
 
@@ -160,7 +202,7 @@ def _draw_truth(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: 
     drawn = []
     for curve in several:
         shared = len(several) == 1
-        look = PALE | ({} if shared else {"color": series(curves.index(curve))["color"], "alpha": 0.3})
+        look = _style.pale() | ({} if shared else {"color": series(curves.index(curve))["color"], "alpha": 0.3})
         look["label"] = quantity.symbol if shared else f"{curve.name} {quantity.symbol}"
         drawn.append((curve, draw(axes, curve, quantity.truth, joint, window, **look)))
     return drawn
@@ -198,6 +240,8 @@ def show(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: int, wi
     axes.set_xlim(*window)
     frame = guides + ([y for curve, y in drawn if not curve.failed] if tight else bounds)
     set_limits(axes, [c for c, _ in drawn], [y for _, y in drawn], frame if bounds else [])
+    if not tight:
+        say_what_is_cut(axes, [c for c, _ in drawn], [y for _, y in drawn], quantity.unit)
     for curve in curves:
         if curve.failed:
             _mark_break(axes, curve, curve[quantity.field][:, joint], window)

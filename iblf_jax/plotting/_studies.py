@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from iblf_jax import checks
 from iblf_jax.plotting import _style
+from iblf_jax.plotting._curves import called, plain
 from iblf_jax.studies import statistics
 from iblf_jax.studies.study import Study
 
@@ -22,9 +23,6 @@ COLUMNS = 4
 """Panels side by side at most."""
 MOST_POINTS = 5000
 """Runs in a scatter at most: all failed ones first, then others evenly."""
-BAND = _style.COLOURS[0]
-GOOD: dict[str, Any] = {"color": _style.COLOURS[0]}
-BAD: dict[str, Any] = {"color": _style.COLOURS[1]}
 
 
 def _check(study: Study) -> None:
@@ -33,17 +31,15 @@ def _check(study: Study) -> None:
 
 
 def _verdict(study: Study) -> str:
-    return f"{study.runs} runs, {len(study.failed)} failed; bound violated or run away: {study.violation_probability}"
+    outside = study.status_counts["STARTED_OUTSIDE"]
+    apart = f", {outside} of them because they started outside" if outside else ""
+    return f"{study.runs} runs, {len(study.failed)} failed; bound violated or run away: {study.violation_probability}{apart}"
 
 
 def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    columns = min(count, COLUMNS)
-    rows = -(-count // columns)
-    figure = _style.new_figure(max(4.0, WIDTH * columns / COLUMNS), 0.8 + height * rows)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels[count:]:
-        axes.remove()
-    return figure, list(panels[:count])
+    sizes = _style.row_sizes(count, COLUMNS)
+    figure = _style.new_figure(max(4.0, WIDTH * sizes[0] / COLUMNS), 0.8 + height * len(sizes))
+    return figure, [axes for row in _style.spread(figure, count, COLUMNS) for axes in row]
 
 
 # ------------------------------------------------------------------------------------------------------------------- bands
@@ -69,35 +65,36 @@ def bands(study: Study, *, quantiles: Sequence[float] = (0.05, 0.5, 0.95), runs:
     data = study.bands(quantiles, runs=runs, exclude_failed=exclude_failed)
     figure, panels = _grid(study.scenario.n, 2.4)
     for joint, axes in enumerate(panels):
-        _draw_bands(axes, data, joint)
-    figure.suptitle(_bands_title(data))
+        _draw_bands(axes, data, joint, study)
+    _style.head(figure, [_bands_title(data)])
     _style.legend_below(figure)
     return figure
 
 
 def _bands_title(data: xarray.Dataset) -> str:
     left_out = f", {data.attrs['excluded']} left out" if data.attrs["excluded"] else ""
-    return f"Quantiles of {data.attrs['runs']} runs{left_out}"
+    failed = f", {data.attrs['failed_included']} failed ones among them" if data.attrs["failed_included"] else ""
+    return f"Quantiles of {data.attrs['runs']} runs{failed}{left_out}"
 
 
-def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int) -> None:
+def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> None:
     t, q, levels = data.time.values, data.q.values[:, :, joint], data["quantile"].values
     lower, upper = data.lower.values[:, joint], data.upper.values[:, joint]
-    axes.fill_between(t, lower, upper, color=_style.TUBE, linewidth=0, zorder=0)
+    axes.fill_between(t, lower, upper, color=_style.tube(), linewidth=0, zorder=0)
     for edge, text in ((lower, "tightest bounds"), (upper, "_")):
-        axes.plot(t, edge, color=_style.BOUND, linewidth=1.0, label=text)
+        axes.plot(t, edge, color=_style.bound(), linewidth=1.0, label=text)
     order = np.argsort(levels)
     for k in range(len(levels) // 2):
         low, high = order[k], order[-1 - k]
         words = f"{100 * levels[low]:g} to {100 * levels[high]:g} %"
-        axes.fill_between(t, q[low], q[high], color=BAND, alpha=0.25, linewidth=0, label=words)
-        axes.plot(t, q[low], color=BAND, linewidth=0.6, label="_")
-        axes.plot(t, q[high], color=BAND, linewidth=0.6, label="_")
+        axes.fill_between(t, q[low], q[high], color=_style.colour(0), alpha=0.25, linewidth=0, label=words)
+        axes.plot(t, q[low], color=_style.colour(0), linewidth=0.6, label="_")
+        axes.plot(t, q[high], color=_style.colour(0), linewidth=0.6, label="_")
     if len(levels) % 2:
         middle = order[len(levels) // 2]
-        axes.plot(t, q[middle], color=BAND, label=f"{100 * levels[middle]:g} %")
-    axes.plot(t, data.q_d.values[:, joint], label="reference $q_d$", **_style.REFERENCE)
-    axes.set_title(f"joint {joint}")
+        axes.plot(t, q[middle], color=_style.colour(0), label=f"{100 * levels[middle]:g} %")
+    axes.plot(t, data.q_d.values[:, joint], label="reference $q_d$", **_style.reference())
+    axes.set_title(called(study.scenario.plant, study.scenario.n)[joint])
     axes.set_xlabel(_style.label("time $t$", "s"))
     axes.set_ylabel(_style.label("position $q$", "rad"))
 
@@ -130,7 +127,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
     figure, panels = _grid(len(values), 2.0)
     for axes, (name, x) in zip(panels, values.items(), strict=True):
         _draw_histogram(axes, study, name, x, checks.positive_integer("bins", bins))
-    figure.suptitle(_verdict(study))
+    _style.head(figure, [_verdict(study)])
     _style.legend_below(figure)
     return figure
 
@@ -141,8 +138,17 @@ def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: in
     finite = np.isfinite(x)
     if finite.any():
         edges = np.histogram_bin_edges(x[finite].astype(float), bins).tolist()
-        axes.hist(x[finite & ~failed], edges, label="not failed", alpha=0.8, **GOOD)
-        axes.hist(x[finite & failed], edges, label="failed", alpha=0.8, hatch="////", edgecolor="white", linewidth=0, **BAD)
+        axes.hist(x[finite & ~failed], edges, label="not failed", alpha=0.8, color=_style.colour(0))
+        axes.hist(
+            x[finite & failed],
+            edges,
+            label="failed",
+            alpha=0.8,
+            hatch="////",
+            edgecolor=_style.paper(),
+            linewidth=0,
+            color=_style.colour(1),
+        )
     if not finite.all():
         axes.set_title(f"{int((~finite).sum())} runs without a value")
     axes.set_xlabel(_style.label(name.replace("_", " "), study.metrics.units.get(name, "1")))
@@ -168,7 +174,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
     figure, panels = _grid(len(drawn), 2.2)
     for axes, (path, x) in zip(panels, drawn.items(), strict=True):
         _draw_scatter(axes, study, metric, path, x)
-    figure.suptitle(_verdict(study))
+    _style.head(figure, [_verdict(study)])
     _style.legend_below(figure)
     return figure
 
@@ -181,14 +187,14 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
     good = np.flatnonzero(some & ~failed)
     good = good[:: max(1, len(good) // MOST_POINTS)]
     bad = np.flatnonzero(some & failed)[:MOST_POINTS]
-    axes.scatter(x[good], y[good], s=4, alpha=0.5, linewidths=0, label="not failed", **GOOD)
-    axes.scatter(x[bad], y[bad], s=9, marker="x", linewidths=0.8, label="failed", **BAD)
+    axes.scatter(x[good], y[good], s=4, alpha=0.5, linewidths=0, label="not failed", color=_style.colour(0))
+    axes.scatter(x[bad], y[bad], s=9, marker="x", linewidths=0.8, label="failed", color=_style.colour(1))
     if metric in ("margin", "xi_margin"):
-        axes.axhline(0.0, color=_style.BOUND, linewidth=1.0)
+        axes.axhline(0.0, color=_style.bound(), linewidth=1.0)
     rho, _ = statistics.rank_correlation(x[some], y[some])
     axes.set_title("" if np.isnan(rho) else f"rank correlation {rho:.2f}")
     axes.locator_params(axis="x", nbins=4)
-    axes.set_xlabel(_style.label(path, study.parameter_unit(path)))
+    axes.set_xlabel(_style.label(plain(path), study.parameter_unit(path)))
     axes.set_ylabel(_style.label(f"worst {metric.replace('_', ' ')}", study.metrics.units.get(metric, "1")))
 
 
@@ -212,10 +218,10 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
     count = study.scenario.n + 1 + len(drawn)
     figure, panels = _grid(count, 2.3)
     for joint in range(study.scenario.n):
-        _draw_bands(panels[joint], data, joint)
+        _draw_bands(panels[joint], data, joint, study)
     _draw_histogram(panels[study.scenario.n], study, "margin", margins, 40)
     for axes, (path, x) in zip(panels[study.scenario.n + 1 :], drawn.items(), strict=True):
         _draw_scatter(axes, study, "margin", path, x)
-    figure.suptitle(f"{_verdict(study)}\nbands: {_bands_title(data).lower()}")
+    _style.head(figure, [_verdict(study), f"bands: {_bands_title(data).lower()}"])
     _style.legend_below(figure, 6)
     return figure

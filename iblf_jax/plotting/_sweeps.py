@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from iblf_jax import checks
 from iblf_jax.plotting import _style
+from iblf_jax.plotting._curves import plain
 from iblf_jax.status import FAILED
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
@@ -43,7 +44,7 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
 
 def _axis_label(data: xarray.Dataset, name: str) -> str:
     unit = data[name].attrs.get("units", "") if name in data.coords else ""
-    return _style.label(name, unit) if unit else name
+    return _style.label(plain(name), unit) if unit else plain(name)
 
 
 @_style.styled()
@@ -75,7 +76,7 @@ def heat_map(data: xarray.Dataset, metric: str = FAILED_SHARE, *, x: str | None 
     picture = values.transpose(y, x).values
     figure = _style.new_figure(_style.WIDTH, 4.2)
     axes = figure.subplots()
-    image = axes.imshow(picture, origin="lower", aspect="auto", cmap=COLOURS)
+    image = axes.imshow(picture, origin="lower", aspect="auto", cmap=_style.colour_map(COLOURS))
     axes.grid(visible=False)
     for axis, name in ((axes.xaxis, x), (axes.yaxis, y)):
         _ticks(axis, np.asarray(data[name].values))
@@ -83,7 +84,7 @@ def heat_map(data: xarray.Dataset, metric: str = FAILED_SHARE, *, x: str | None 
     axes.set_ylabel(_axis_label(data, y))
     figure.colorbar(image, ax=axes, label=words)
     if picture.size <= 150:
-        _write_numbers(axes, picture)
+        _write_numbers(axes, picture, image)
     return figure
 
 
@@ -92,12 +93,11 @@ def _ticks(axis: Any, values: np.ndarray) -> None:
     axis.set_ticks(places, labels=[f"{values[i]:.4g}" for i in places])
 
 
-def _write_numbers(axes: Any, picture: np.ndarray) -> None:
-    finite = picture[np.isfinite(picture)]
-    middle = 0.5 * (finite.min() + finite.max()) if finite.size else 0.0
+def _write_numbers(axes: Any, picture: np.ndarray, image: Any) -> None:
     for (row, column), value in np.ndenumerate(picture):
-        colour = "black" if np.isfinite(value) and value > middle else "white"
-        axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=colour, fontsize=7.5)
+        behind = image.cmap(image.norm(value))[:3] if np.isfinite(value) else _style.paper()
+        colour = "black" if _style.is_light(behind) else "white"
+        axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=colour, fontsize=_style.size(7.5))
 
 
 @_style.styled()
@@ -126,14 +126,14 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     figure = _style.new_figure(max(_style.WIDTH, 1.6 * len(columns)), 4.2)
     axes = figure.subplots()
     norm = matplotlib.colors.Normalize(low[-1], high[-1] if high[-1] > low[-1] else low[-1] + 1.0)
-    mapper = matplotlib.cm.ScalarMappable(norm, COLOURS)
+    mapper = matplotlib.cm.ScalarMappable(norm, _style.colour_map(COLOURS))
     for line, y in sorted(zip(scaled, raw[:, -1], strict=True), key=lambda pair: pair[1]):
         axes.plot(np.arange(len(columns)), line, color=mapper.to_rgba(y), linewidth=0.9, alpha=0.8)
-    axes.set_xticks(np.arange(len(columns)), [name.replace(" [", "\n[") for name in columns])
+    axes.set_xticks(np.arange(len(columns)), [_style.wrapped(plain(name), 18) for name in columns])
     axes.set_yticks([])
     for place, (bottom, top) in enumerate(zip(low, high, strict=True)):
         for value, height, side in ((bottom, -0.02, "top"), (top, 1.02, "bottom")):
-            axes.text(place, height, f"{value:.4g}", ha="center", va=side, fontsize=7.5)
+            axes.text(place, height, f"{value:.4g}", ha="center", va=side, fontsize=_style.size(7.5))
     axes.set_ylim(-0.1, 1.1)
     figure.colorbar(mapper, ax=axes, label=words)
     return figure

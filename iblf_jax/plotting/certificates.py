@@ -15,10 +15,7 @@ from iblf_jax.plotting._curves import thinned
 
 WIDTH = 10.0
 HEIGHT = 5.4
-BROKEN = "#fbe3e0"
-"""Where the inequality would be broken."""
 LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none"}
-LIMIT: dict[str, Any] = {"color": _style.BOUND, "linewidth": 1.6, "linestyle": "-"}
 
 
 @_style.styled()
@@ -53,8 +50,8 @@ def certificate(shown: Certificate, *, title: str = "Theorem 2 along the run", u
     _verdicts(panels[1, 2], shown)
     _mark_held(panels.flat[:5], traces)
     run = "" if shown.worst_run is None else f", worst run {shown.worst_run}"
-    colour = _style.ALARM if shown.verdict == "fails" else "black"
-    figure.suptitle(f"{title}{run}: {shown.verdict}\n{shown.heading}", color=colour)
+    colour = _style.alarm() if shown.verdict == "fails" else _style.ink()
+    _style.head(figure, [f"{title}{run}: {shown.verdict}", shown.heading], color=colour)
     return figure
 
 
@@ -68,6 +65,10 @@ def _until(traces: Traces, until: float | None) -> Traces:
     return Traces(*(x[keep] for x in traces))
 
 
+def _limit() -> dict[str, Any]:
+    return {"color": _style.bound(), "linewidth": 1.6, "linestyle": "-"}
+
+
 def _frame(axes: Axes, t: np.ndarray, words: str, unit: str) -> None:
     axes.set_xlim(float(t[0]), float(t[-1]))
     axes.set_xlabel(_style.label("time $t$", "s"))
@@ -77,7 +78,7 @@ def _frame(axes: Axes, t: np.ndarray, words: str, unit: str) -> None:
 def _against_bound(axes: Axes, t: np.ndarray, curves: dict[str, np.ndarray], bound: np.ndarray, words: str, unit: str) -> None:
     """Sizes on a logarithmic axis, and the bound above them."""
     if np.isfinite(bound).any():
-        axes.plot(*thinned(t, bound), label="bound", **LIMIT)
+        axes.plot(*thinned(t, bound), label="bound", **_limit())
     for i, (name, values) in enumerate(curves.items()):
         axes.plot(*thinned(t, np.where(values > 0, values, np.nan)), label=name, **_style.series(i))
     axes.set_yscale("log")
@@ -98,10 +99,10 @@ def _inequality(axes: Axes, traces: Traces) -> None:
     axes.plot(*thinned(traces.t, left), label="left side", **_style.series(0))
     if np.any(traces.dropped != 0):
         axes.plot(*thinned(traces.t, traces.dropped), label="dropped terms", **(_style.series(1) | {"linewidth": 0.9}))
-    axes.axhline(0.0, color="black", linewidth=0.9)
+    axes.axhline(0.0, color=_style.ink(), linewidth=0.9)
     low, high = axes.get_ylim()
     axes.set_ylim(low, max(high, -0.02 * low))
-    axes.axhspan(0.0, axes.get_ylim()[1], color=BROKEN, linewidth=0, zorder=0)
+    axes.axhspan(0.0, axes.get_ylim()[1], color=_style.broken(), linewidth=0, zorder=0)
     axes.legend(loc="best", **LEGEND)
 
 
@@ -111,15 +112,15 @@ def _relative_error(axes: Axes, traces: Traces) -> None:
     for joint in range(n):
         look = _style.series(joint)
         axes.plot(*thinned(traces.t, traces.xi[:, joint]), label=f"joint {joint}", **look)
-        own = LIMIT | ({"color": look["color"], "alpha": 0.45} if np.ptp(traces.xi_bound, axis=1).max(initial=0.0) > 1e-3 else {})
+        own = _limit() | ({"color": look["color"], "alpha": 0.45} if np.ptp(traces.xi_bound, axis=1).max(initial=0.0) > 1e-3 else {})
         for sign in (1, -1):
             text = "bound" if joint == 0 and sign == 1 else "_"
             axes.plot(*thinned(traces.t, sign * traces.xi_bound[:, joint]), label=text, **own)
-    axes.axhspan(1.0, 1.6, color=BROKEN, linewidth=0, zorder=0)
-    axes.axhspan(-1.08, -1.0, color=BROKEN, linewidth=0, zorder=0)
+    axes.axhspan(1.0, 1.6, color=_style.broken(), linewidth=0, zorder=0)
+    axes.axhspan(-1.08, -1.0, color=_style.broken(), linewidth=0, zorder=0)
     axes.set_ylim(-1.08, 1.6)
     _frame(axes, traces.t, r"relative error $\xi$", "1")
-    small = {"fontsize": 6.5, "handlelength": 1.8, "columnspacing": 0.8}
+    small = {"fontsize": _style.size(6.5), "handlelength": 1.8, "columnspacing": 0.8}
     axes.legend(loc="upper center", ncols=4 if n > 5 else 3, **LEGEND, **small)
 
 
@@ -128,19 +129,22 @@ def _mark_held(panels: Any, traces: Traces) -> None:
     if not traces.held.any():
         return
     for axes in panels:
-        axes.fill_between(traces.t, 0, 1, where=traces.held, transform=axes.get_xaxis_transform(), color="#d9d9d9", step="mid", zorder=0.5)
+        axes.fill_between(
+            traces.t, 0, 1, where=traces.held, transform=axes.get_xaxis_transform(), color=_style.shade(0.149), step="mid", zorder=0.5
+        )
 
 
 def _verdicts(axes: Axes, shown: Certificate) -> None:
     """The lines that were checked along the run, with their verdicts."""
     axes.set_axis_off()
     named = ("K2", "kf", "inequality", "envelope", "xi", "e2", "f_tilde", "joints")
+    growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]
     lines = [line for line in shown.lines if line.name.startswith(named) and line.verdict != "not applicable" and line.counts]
     for row, line in enumerate(lines):
         height = 1.0 - (row + 0.5) / max(len(lines), 12)
-        colour = _style.ALARM if line.verdict == "fails" else "black"
+        colour = _style.alarm() if line.verdict == "fails" else _style.ink()
         margin = "" if line.margin is None else f"{line.margin:.3g}" + ("" if line.unit == "1" else f" {line.unit}")
         for x, text in ((0.0, line.name), (0.42, line.equation), (0.6, line.verdict), (0.76, margin)):
-            axes.text(x, height, text, transform=axes.transAxes, color=colour, va="center", fontsize=8)
+            axes.text(x, height, text, transform=axes.transAxes, color=colour, va="center", fontsize=8 * growth)
     if not lines:
         axes.text(0.5, 0.5, "no claim applies", transform=axes.transAxes, ha="center", va="center")

@@ -18,7 +18,6 @@ from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, check_joint, curves_of, thinned
 from iblf_jax.plotting._figures import Row, windows
 from iblf_jax.plotting._panels import QUANTITIES, Window, draw, set_limits
-from iblf_jax.plotting._style import BOUND
 
 if TYPE_CHECKING:
     from iblf_jax.studies.comparison import Comparison
@@ -68,7 +67,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     table[1, 0].set_ylabel(torque.label)
     table[2, 0].set_ylabel(_style.label("settling", "s"))
     figure.align_ylabels(table[:, 0])
-    _style.entitle(figure, f"Laws compared: joint {joint}", given)
+    _style.entitle(figure, f"Laws compared: {given[0].called(joint)}", given)
     _style.legend_below(figure, columns=4)
     return figure
 
@@ -86,7 +85,7 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
         t, shown = thinned(curve.t[: len(size)][near], np.maximum(size[near], SMALLEST))
         axes.semilogy(t, shown, **_look(curve, order))
         start = max(start, size[0])
-    axes.axhline(float(Settling().tolerance), color=BOUND, linewidth=0.8, zorder=1, label="settled")
+    axes.axhline(float(Settling().tolerance), color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
     axes.set_xlim(*window)
     axes.set_ylim(SMALLEST, 3.0 * max(start, 10.0 * SMALLEST))
     axes.set_xlabel(_style.label("time $t$", "s"))
@@ -107,7 +106,9 @@ def _settling(axes: Axes, curves: list[Curve], order: list[str]) -> None:
             axes.bar(i, found[name], color=_style.series(i)["color"], width=0.7)
         else:
             words = "never" if name in found else "no factor"
-            axes.annotate(words, (i, 0.0), xytext=(0, 3), textcoords="offset points", rotation=90, ha="center", va="bottom", fontsize=7)
+            axes.annotate(
+                words, (i, 0.0), xytext=(0, 3), textcoords="offset points", rotation=90, ha="center", va="bottom", fontsize=_style.size(7)
+            )
     axes.set_xlim(-0.6, len(order) - 0.4)
-    axes.set_xticks(range(len(order)), [name.replace("_", " ") for name in order], rotation=40, ha="right", fontsize=7)
+    axes.set_xticks(range(len(order)), [name.replace("_", " ") for name in order], rotation=40, ha="right", fontsize=_style.size(7))
     axes.grid(axis="x", visible=False)

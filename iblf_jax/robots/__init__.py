@@ -6,6 +6,7 @@ from iblf_jax.robots._base import coriolis_from_mass_matrix as coriolis_from_mas
 from iblf_jax.robots._base import energy_gradient as energy_gradient
 from iblf_jax.robots._base import friction_torque as friction_torque
 from iblf_jax.robots._base import from_energy as from_energy
+from iblf_jax.robots._base import joint_names as joint_names
 from iblf_jax.robots._base import mass_matrix_rate as mass_matrix_rate
 from iblf_jax.robots.arm import Arm as Arm
 from iblf_jax.robots.arm import Limits as Limits
@@ -32,6 +33,7 @@ __all__ = [
     "energy_gradient",
     "friction_torque",
     "from_energy",
+    "joint_names",
     "load",
     "mass_matrix_rate",
 ]

@@ -12,7 +12,7 @@ methods to a class that has the energies; a class with closed forms (`TwoLink`) 
 
 from __future__ import annotations
 
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -92,6 +92,12 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
     _, M_along_u = jax.jvp(mass_matrix, (q,), (u,))
     energy_gradient = jax.grad(lambda x: inner(u, matvec(mass_matrix(x), v)))(q)
     return 0.5 * (matvec(M_along_v, u) + matvec(M_along_u, v) - energy_gradient)
+
+
+def joint_names(robot: Any, n: int) -> tuple[str, ...]:
+    """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint 0", "joint 1", ..."""
+    names = tuple(map(str, getattr(robot, "joints", ())))
+    return names if len(names) == n else tuple(f"joint {i}" for i in range(n))
 
 
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:

@@ -27,9 +27,7 @@ def _mujoco() -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise ImportError(
-            'Robots are loaded from files with the mujoco package: pip install "iblf_jax[robots]" (or pip install mujoco).'
-        ) from error
+        raise ImportError('Robots are loaded from files with the mujoco package: pip install mujoco, or ".[robots]" in a clone.') from error
     return mujoco
 
 

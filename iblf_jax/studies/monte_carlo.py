@@ -91,10 +91,11 @@ def monte_carlo(
     results, blocks = None, range(-(-runs // block_size()))
     mine = distributed.share(blocks) or [0]
     begin = time.monotonic()
-    with bar(progress, min(runs, len(mine) * block_size())) as shown:
+    sizes = {block: min(block_size(), runs - block * block_size()) for block in mine}
+    with bar(progress, sum(sizes.values())) as shown:
         for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, chunk=chunk, memory=memory, devices=devices):
             results = _stored(results, part, block, runs)
-            shown.update(min(block_size(), runs - block * block_size()))
+            shown.update(sizes[block])
     results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))
     tell_of_step(results.status, results.fastest_mode, results.metrics[RELATIVE], float(dt), method)
     return Study.of(setup, results)

@@ -19,17 +19,18 @@ def _has_reader() -> bool:
     return sys.stderr is not None and sys.stderr.isatty()
 
 
-def bar(progress: bool | None, total: int, done: int = 0) -> Any:
-    """A tqdm bar over runs, a context manager with `update(runs)`.
+def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") -> Any:
+    """A tqdm bar over runs, or over something else, a context manager with `update(runs)`.
 
     Args:
       progress: True or False, or None: shown where somebody watches and it takes more than DELAY seconds.
       total: number of runs.
       done: runs that were there before.
+      unit: what is counted.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # tqdm warns where a notebook lacks ipywidgets and then falls back to text by itself
         from tqdm.auto import tqdm
     shown = _has_reader() if progress is None else bool(progress)
     delay = DELAY if progress is None else 0.0
-    return tqdm(total=total, initial=done, unit="runs", unit_scale=True, disable=not shown, delay=delay, dynamic_ncols=True)
+    return tqdm(total=total, initial=done, unit=f" {unit}", unit_scale=True, disable=not shown, delay=delay, dynamic_ncols=True)

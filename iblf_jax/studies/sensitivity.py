@@ -161,10 +161,10 @@ def _evaluate(setup: Setup, u: np.ndarray, shapes: dict, output: Any, options: d
     """The output of every row of the unit cube, and how many of these runs failed."""
     dtype = setup.shared.cases.scenario.initial.q.dtype
     designed = dataclasses.replace(setup, runs=len(u), designed=split(u, shapes, dtype))
-    parts = []
+    parts: list[Any] = []
     for _, part in run_blocks(setup.program, setup.shared, designed.lanes, range(-(-len(u) // block_size())), **options):
+        shown.update(min(block_size(), len(u) - len(parts) * block_size()))
         parts.append(part)
-        shown.update(block_size())
     metrics: dict[str, Any] = {name: np.concatenate([p.metrics[name] for p in parts])[: len(u)] for name in parts[0].metrics}
     status = np.concatenate([p.status for p in parts])[: len(u)]
     if isinstance(output, str):

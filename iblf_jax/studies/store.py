@@ -59,7 +59,7 @@ def _zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise StoreError("A store needs zarr, which is not installed: pip install 'iblf_jax[sweep]'.") from None
+        raise StoreError("A store needs zarr, which is not installed: pip install zarr, or '.[sweep]' in a clone.") from None
     return zarr
 
 

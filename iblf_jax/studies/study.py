@@ -5,6 +5,9 @@ Per run it holds the metrics, the status and what was drawn; never a trajectory.
 Failed runs are part of every count and of every statistic, unless they are left out on request, and then the answer says how many
 were.  Runs that could not be made (an inadmissible draw, `Status.INADMISSIBLE_DRAW`) have no numbers; they are left out of
 statistics always, are counted, and the answer says so.
+
+A run whose start was drawn on or outside its bounds has violated them at t = 0, before any law could act.  Its flag is the same; counts,
+`started_outside` and `replay` tell it apart.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -21,7 +25,8 @@ from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import metric_units
 from iblf_jax.results import Metrics, Rollout
-from iblf_jax.rollout import trajectory
+from iblf_jax.robots import joint_names
+from iblf_jax.rollout import SimulationWarning, trajectory
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED, Status, describe
 from iblf_jax.studies import statistics, summaries
@@ -125,15 +130,31 @@ class Study:
         """Whether each run was made, (N,) bool; False where a draw was inadmissible."""
         return self.status & int(Status.INADMISSIBLE_DRAW) == 0
 
+    @cached_property
+    def started_outside(self) -> np.ndarray:
+        """Whether each run violated a bound at t = 0 already, (N,) bool: its start was drawn there, so that no law could keep it."""
+        return self.made & (self.status & int(Status.BOUND_VIOLATED) != 0) & ~(np.min(summaries.first_margins(self), axis=1) > 0)
+
     @property
     def status_counts(self) -> dict[str, int]:
-        """Runs that are ok, that failed, and with each flag; a run may have several."""
-        counts = {"OK": int(np.sum(self.status == 0)), "FAILED": len(self.failed)}
-        return counts | {flag.name or "": int(np.sum(self.status & int(flag) != 0)) for flag in Status}
+        """How many runs there are of each kind.
+
+        OK, FLAGGED and FAILED add up to all runs: no flag, flags that are no failure, and a flag of `status.FAILED`.  Then how many have
+        each flag, of which a run may have several, and how many of those that violated a bound did so at t = 0 (`started_outside`).
+        """
+        failed, flagged = self.status & int(FAILED) != 0, self.status != 0
+        counts = {"OK": int(np.sum(~flagged)), "FLAGGED": int(np.sum(flagged & ~failed)), "FAILED": int(np.sum(failed))}
+        counts |= {flag.name or "": int(np.sum(self.status & int(flag) != 0)) for flag in Status}
+        return counts | {"STARTED_OUTSIDE": int(np.sum(self.started_outside))}
 
     @property
     def violation_probability(self) -> Probability:
-        """How probable it is that a run leaves its bounds or runs away, with the 95 % Clopper-Pearson interval."""
+        """How probable it is that a run leaves its bounds or runs away, with the 95 % Clopper-Pearson interval.
+
+        Runs that started outside their bounds count, for they have violated them; `started_outside` says which they are.  That a law
+        violates them has the probability `probability((study.status & VIOLATED != 0) & ~study.started_outside)`, with
+        `VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE`.
+        """
         return self.probability(VIOLATED)
 
     def probability(self, event: Status | np.ndarray = VIOLATED, confidence: float = 0.95) -> Probability:
@@ -186,7 +207,16 @@ class Study:
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
         """Which runs a statistic is over, (N,) bool, and what to say about it."""
         used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
-        return used, {"runs": int(used.sum()), "excluded": int(self.runs - used.sum()), "failed_excluded": str(bool(exclude_failed))}
+        said = {"runs": int(used.sum()), "excluded": int(self.runs - used.sum()), "failed_excluded": str(bool(exclude_failed))}
+        return used, said | {"failed_included": int(np.sum(used & (self.status & int(FAILED) != 0)))}
+
+    @property
+    def included(self) -> str:
+        """In words: which runs statistics are over, unless failed ones are left out."""
+        said = self.chosen()[1]
+        failed = f"{said['failed_included']} failed ones included (exclude_failed=True leaves them out)"
+        unmade = f"; {said['excluded']} were not made" if said["excluded"] else ""
+        return f"statistics are over {said['runs']} runs, {failed if said['failed_included'] else 'none of them failed'}{unmade}"
 
     def quantiles(self, quantiles: Sequence[float] = (0.05, 0.5, 0.95), *, exclude_failed: bool = False) -> xarray.Dataset:
         """Quantiles of every metric over the runs, an `xarray.Dataset` with the dimensions `quantile` and `joint`.
@@ -250,7 +280,7 @@ class Study:
 
         Metrics, status and fastest mode are bit-identical to those of run `index`: its block is run again by the same compiled
         program.  The trajectory comes from the program for a single run, where XLA rounds differently: it agrees with the metrics
-        to rounding, until a run that has left its bounds amplifies that.
+        to rounding, until a run that has left its bounds amplifies that.  A warning says if the run started outside its bounds.
 
         Args:
           index: run number.
@@ -284,14 +314,34 @@ class Study:
             method=program.method,
             record_every=record_every,
         )
+        self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)
         return dataclasses.replace(run, metrics=metrics, status=again.status, fastest_mode=again.fastest_mode)
+
+    def _warn_of_start(self, i: int) -> None:
+        if not self.started_outside[i]:
+            return
+        margins = summaries.first_margins(self)[i]
+        joint = int(np.argmin(margins))
+        name = joint_names(self.scenario.plant, self.scenario.n)[joint]
+        warnings.warn(
+            f"Run {i} started outside its bounds: {name} was drawn {-margins[joint]:.3g} rad beyond one at t = 0. "
+            "That violation is the draw's, not the law's: narrow the perturbations of the start, or leave such runs out "
+            "(study.started_outside).",
+            SimulationWarning,
+            stacklevel=3,
+        )
 
     def __repr__(self) -> str:
         if not checks.is_concrete(self):
             return "Study(being traced)"
+        counts = self.status_counts
         lines = [f"Study({self.runs} runs of {self.duration:g} s, dt = {self.dt:g} s, seed {self.seed}, {self.setup.sampler})"]
         lines += [f"  bound violated or run away: {self.violation_probability}"]
-        flags = [f"{count} {describe(flag)}" for flag in Status if (count := self.status_counts[flag.name or ""])]
-        lines += [f"  failed: {len(self.failed)}; ok: {self.status_counts['OK']}" + (" (" + "; ".join(flags) + ")" if flags else "")]
+        if counts["STARTED_OUTSIDE"]:
+            lines += [f"    {counts['STARTED_OUTSIDE']} of them at t = 0, because they started outside: the draw's doing, not the law's"]
+        lines += [f"  failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok: {counts['OK']}"]
+        flags = [f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])]
+        lines += [f"  flags, of which a run may have several: {'; '.join(flags)}"] if flags else []
+        lines += [f"  {self.included}"]
         return "\n".join(lines)

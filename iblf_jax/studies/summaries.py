@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.paths import get, parameters
+from iblf_jax.bounds import tube_at
+from iblf_jax.paths import get, parameters, with_parameters
+from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED, Status
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import block_size, run_blocks
@@ -31,6 +35,21 @@ def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
     if values.ndim != 1 or values.size == 0 or not np.all((values >= 0) & (values <= 1)):
         raise checks.fail("quantiles", quantiles, "numbers from 0 to 1", "(0.05, 0.5, 0.95), for example.")
     return values
+
+
+def first_margins(study: Study) -> np.ndarray:
+    """How far every joint of each run is inside its bounds at t = 0, (N, n) [rad]; not above zero where it starts on or outside them."""
+    return np.asarray(_first_margins(study.scenario, study.samples))
+
+
+@jax.jit
+def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> jax.Array:
+    def one(drawn: Mapping[str, Any]) -> jax.Array:
+        made = with_parameters(scenario, drawn)
+        tube = tube_at(made.reference, made.bounds, jnp.zeros((), made.initial.q.dtype))
+        return jnp.minimum(made.initial.q - tube.lower, tube.upper - made.initial.q)
+
+    return jax.vmap(one)(samples)
 
 
 def metric_quantiles(study: Study, quantiles: Sequence[float], exclude_failed: bool) -> xarray.Dataset:
@@ -96,7 +115,8 @@ def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exc
     for name, edge in edges.items():
         words = {"lower": "tightest lower bound", "upper": "tightest upper bound", "q_d": "median reference"}[name]
         variables[name] = (dims[1:], edge(whole[name][used], axis=0), {"units": "rad", "description": f"{words} of the runs"})
-    said = {"runs": int(used.sum()), "excluded": int(count - used.sum()), "of_runs": study.runs}
+    failed = int(np.sum(used & (study.status[:count] & int(FAILED) != 0)))
+    said = {"runs": int(used.sum()), "excluded": int(count - used.sum()), "failed_included": failed, "of_runs": study.runs}
     return xarray.Dataset(variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, said)
 
 

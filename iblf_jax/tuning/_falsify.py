@@ -149,7 +149,7 @@ def falsify(
     sizes = _Sizes(tuple(sample_size(targets, by_path).items()))
     push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method, backend=backend)
     u, best, history = np.random.default_rng([check_seed(seed), 3]).uniform(size=(starts, sizes.total)), None, []
-    with bar(progress, iterations + 1) as shown:
+    with bar(progress, iterations + 1, unit="steps") as shown:
         for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
             margin, slope, status = (np.asarray(x) for x in push(cases, step, jnp.asarray(u, dtype)))
             history.append(margin)

@@ -130,7 +130,7 @@ def pareto(
         Evaluator(problem.plan, problem.shared, lanes, "forward"), make_method("newton", problem.box, iterations, tolerance, 0.1), z
     )
     loop.rescue = partial(way_in, problem, seed)
-    with bar(progress, iterations) as shown:
+    with bar(progress, iterations, unit="steps") as shown:
         loop.run(iterations, tolerance=tolerance, patience=iterations, on_step=lambda _: shown.update(1))
     return _front(problem, loop, time.perf_counter() - began)
 

@@ -26,7 +26,7 @@ from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.parameters import Box, Tunable, layout, names_of, values_at
+from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, names_of, values_at
 from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, Slope, gradient, slope, value
 from iblf_jax.tuning.result import Setup, TuneResult
 from iblf_jax.tuning.robust import Risk, as_risk
@@ -95,7 +95,8 @@ def tune(
       tolerance: relative change of the loss below which a start has settled.
       patience: stop (before the last sharpening: sharpen) after so many steps without a better result.
       learning_rate: of adam, in squashed coordinates.
-      report_runs, report_seed: fresh runs for the report, and their seed (seed + 1 if not given).
+      report_runs, report_seed: fresh runs for the report, and their seed (seed + 1 if not given); without perturbations it is on the one
+        nominal run.
       confidence: of the report's intervals.
       checkpoint: a file that holds the state after each step; if it exists, tuning goes on from there.
       progress: a progress bar; shown where somebody watches if not given.
@@ -125,7 +126,7 @@ def tune(
     mark = fingerprint(problem.plan, problem.shared, options)
     if checkpoint is not None and Path(checkpoint).exists():
         load_checkpoint(checkpoint, loop, mark)
-    with bar(progress, iterations, int(loop.state["iteration"])) as shown:
+    with bar(progress, iterations, int(loop.state["iteration"]), unit="steps") as shown:
 
         def on_step(loop: Loop) -> None:
             if checkpoint is not None:
@@ -149,6 +150,7 @@ def tune(
         checks.positive_integer("report_runs", report_runs),
         (seed + 1) % 2**32 if report_seed is None else check_seed(report_seed),
         confidence,
+        tuple(zip(*(_in_units(problem.plan.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
     )
     return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began)
 
@@ -260,13 +262,18 @@ def _check_found(loop: Loop, problem: Problem) -> None:
         )
 
 
+def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
+    """Coordinates z, (..., p), as numbers in the units of their leaves."""
+    log = np.concatenate([np.full(b.size, b.log) for b in blocks])
+    return np.where(log, np.exp(np.where(log, z, 0.0)), z)
+
+
 def _result(problem: Problem, loop: Loop, setup: Setup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
     state, blocks = loop.state, problem.plan.blocks
     best = min(range(len(state["best_key"])), key=lambda s: tuple(state["best_key"][s]))
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
     history = {name: np.stack(x) for name, x in loop.history.items()}
-    log = np.concatenate([np.full(b.size, b.log) for b in blocks])
-    history["x"] = np.where(log, np.exp(np.where(log, history["z"], 0.0)), history["z"])
+    history["x"] = _in_units(blocks, history["z"])
     start = problem.shared.cases.scenario
     return TuneResult(
         scenario=with_parameters(start, values),

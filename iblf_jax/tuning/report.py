@@ -1,4 +1,7 @@
-"""The verdict on a tuning: before and after, on runs that it never saw.
+"""The verdict on a tuning: before and after, on runs that it never saw; on the one nominal run where nothing is perturbed.
+
+Torque, and gains at the end of their range, are in it whatever the objective asked for: what tracks best without a price on torque asks
+for more than any actuator has.
 
 Both gains are run on the same fresh draws, so that the change of every number is a mean of paired differences D_i with the interval
 
@@ -18,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from iblf_jax.metrics import Margin
+from iblf_jax.metrics import Margin, Torque
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status
@@ -79,7 +82,7 @@ class Verdict:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Changes and verdicts on fresh runs; prints as text."""
+    """Changes and verdicts, on fresh runs or on the nominal one; prints as text."""
 
     runs: int
     seed: int | None
@@ -92,6 +95,10 @@ class Report:
     """How often a run left its bounds or ran away, before and after."""
     margin: tuple[float, float]
     """The smallest margin of all runs, before and after [rad]."""
+    peak_torque: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    """The largest torque of all runs, joint by joint, before and after [N m]."""
+    at_limits: tuple[str, ...] | None = None
+    """The tuned numbers that sit at an end of their range, in words; None where the ranges are not known."""
 
     @property
     def passed(self) -> bool:
@@ -112,6 +119,10 @@ class Report:
         lines += [f"  {change}" for change in self.changes]
         lines += [f"  requirement {verdict}" for verdict in self.verdicts]
         lines += [f"  smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad"]
+        torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
+        lines += [f"  peak torque{'' if self.seed is None else ' of all runs'}, joint by joint: {torques[0]} -> {torques[1]} N m"]
+        if self.at_limits is not None:
+            lines += [f"  {words}" for words in self.at_limits] or ["  gains at an end of their range: none"]
         before, after = (p.count if self.seed is None else p for p in self.violation)
         lines += [f"  bounds violated: {before} -> {after}"]
         if self.changes[0].significant is False:
@@ -132,19 +143,20 @@ class Report:
 class _Sample:
     """What a report needs of N runs with one set of gains."""
 
-    def __init__(self, exact: np.ndarray, status: np.ndarray, margin: np.ndarray, made: np.ndarray):
-        self.exact, self.status, self.margin, self.made = exact, status, margin, made
+    def __init__(self, exact: np.ndarray, status: np.ndarray, margin: np.ndarray, torque: np.ndarray, made: np.ndarray):
+        self.exact, self.status, self.margin, self.torque, self.made = exact, status, margin, torque, made
 
 
 def _run(scenario: Scenario, objective: Objective, perturbations, runs: int, seed: int, timing: dict[str, Any], backend: str) -> _Sample:
-    folds = (Quantities(objective.quantities), Margin())
+    folds = (Quantities(objective.quantities), Margin(), Torque())
     if not perturbations:
         run = simulate(scenario, metrics=folds, record_every=10**9, **timing)
         exact, margin = np.asarray(run.metrics["tuning_exact"])[None], np.min(np.asarray(run.metrics["margin"]))[None]
-        return _Sample(exact, np.asarray(run.status)[None], margin, np.ones(1, bool))
+        return _Sample(exact, np.asarray(run.status)[None], margin, np.asarray(run.metrics["peak_torque"])[None], np.ones(1, bool))
     study = monte_carlo(scenario, perturbations, runs=runs, seed=seed, metrics=folds, progress=False, backend=backend, **timing)
     margin = np.asarray(study.metrics["margin"]).min(axis=1)
-    return _Sample(np.asarray(study.metrics["tuning_exact"]), np.asarray(study.status), margin, np.asarray(study.made))
+    torque = np.asarray(study.metrics["peak_torque"])
+    return _Sample(np.asarray(study.metrics["tuning_exact"]), np.asarray(study.status), margin, torque, np.asarray(study.made))
 
 
 def influence(risk: Risk, losses: np.ndarray) -> np.ndarray:
@@ -192,6 +204,7 @@ def make_report(
     confidence: float,
     timing: dict[str, Any],
     backend: str = "auto",
+    at_limits: tuple[str, ...] | None = None,
 ) -> Report:
     """Runs both scenarios on the same fresh draws and compares them.
 
@@ -204,6 +217,7 @@ def make_report(
       confidence: of the intervals.
       timing: duration, dt, method.
       backend: what the fresh runs run on.
+      at_limits: the tuned numbers at an end of their range, in words.
     """
     samples = [_run(scenario, objective, perturbations, runs, seed, timing, backend) for scenario in (before, after)]
     both = samples[0].made & samples[1].made
@@ -221,7 +235,9 @@ def make_report(
         verdicts.append(Verdict(requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed)))
     left = tuple(probability(s.status & int(VIOLATED) != 0, s.made, confidence, "independent", 1) for s in samples)
     margins = tuple(float(s.margin[s.made].min()) for s in samples)
-    return Report(len(both), seed if perturbations else None, confidence, tuple(changes), tuple(verdicts), left, margins)  # type: ignore[arg-type]
+    torques = tuple(tuple(s.torque[s.made].max(axis=0).tolist()) for s in samples)
+    drawn = seed if perturbations else None
+    return Report(len(both), drawn, confidence, tuple(changes), tuple(verdicts), left, margins, torques, at_limits)  # type: ignore[arg-type]
 
 
 def _objective_change(risk: Risk, name: str, terms: list[np.ndarray], confidence: float) -> Change:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation
 from iblf_jax.lowering import run_batch
 from iblf_jax.metrics import as_folds
+from iblf_jax.results import Rollout
+from iblf_jax.rollout import trajectory
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.tuning.objectives import Objective
@@ -21,6 +24,21 @@ from iblf_jax.tuning.problem import UNSOUND
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
+
+NEAR = 0.01
+"""A number is at a limit if it differs from it by no more than this part of it (of the range, where the limit is 0)."""
+
+
+class AtLimit(NamedTuple):
+    """A tuned number at an end of its range; prints as words."""
+
+    value: float
+    side: str
+    """"lower" or "upper"."""
+    limit: float
+
+    def __str__(self) -> str:
+        return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}"
 
 
 @partial(jax.jit, static_argnames=("steps", "method", "backend"))
@@ -45,11 +63,13 @@ class Setup:
     report_runs: int
     report_seed: int
     confidence: float
+    limits: tuple[tuple[float, float], ...] = ()
+    """Lower and upper limit of each tuned number, (p, 2), in its unit; empty in results that were saved without."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuneResult:
-    """A tuned scenario, how it was found, and what it is worth on runs that tuning never saw."""
+    """A tuned scenario, how it was found, and what it is worth: on runs that tuning never saw, where something is perturbed."""
 
     scenario: Scenario
     """With the tuned gains."""
@@ -92,9 +112,29 @@ class TuneResult:
         """Values with derivatives that were computed, each of `setup.runs` rollouts."""
         return int(self.history["evaluations"][-1])
 
+    @property
+    def at_limits(self) -> dict[str, AtLimit]:
+        """The tuned numbers that sit at an end of their range, by name: a wider range, or a price on what they cost, would move them."""
+        found = {}
+        for name, x, ends in zip(self.names, self.tuned, self.setup.limits, strict=False):
+            width = ends[1] - ends[0] if np.isfinite(ends[1] - ends[0]) else 1.0
+            for side, end in zip(("lower", "upper"), ends, strict=True):
+                if np.isfinite(end) and abs(x - end) <= NEAR * (abs(end) or width):
+                    found[name] = AtLimit(float(x), side, float(end))
+        return found
+
+    @cached_property
+    def nominal(self) -> tuple[Rollout, Rollout]:
+        """The nominal run before and after, in full."""
+        setup = self.setup
+        dtype, steps = self.start.initial.q.dtype, checks.whole_steps(setup.duration, setup.dt)
+        folds, step = as_folds(None, dtype), jnp.asarray(setup.dt, dtype)
+        run = partial(trajectory, folds=folds, dt=step, steps=steps, method=setup.method, record_every=1)
+        return run(canonical(self.start)), run(canonical(self.scenario))
+
     @cached_property
     def report(self) -> Report:
-        """Before and after on fresh draws, requirement by requirement."""
+        """Before and after, requirement by requirement: on fresh draws where something is perturbed, else on the one nominal run."""
         return self.check()
 
     def check(self, runs: int | None = None, seed: int | None = None) -> Report:
@@ -105,7 +145,7 @@ class TuneResult:
           seed: of their draws; never the one that was tuned on.
 
         Returns:
-          A `Report`, which prints as text.
+          A `Report`, which prints as text; without perturbations it is on the one nominal run, whatever `runs` and `seed` say.
 
         Raises:
           ValueError: the seed of the tuning itself.
@@ -128,6 +168,7 @@ class TuneResult:
             confidence=setup.confidence,
             timing=timing,
             backend=setup.backend,
+            at_limits=tuple(f"{name} {end}" for name, end in self.at_limits.items()) if setup.limits else None,
         )
 
     def landscape(self, first: str, second: str, *, points: int = 13, span: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -162,7 +203,7 @@ class TuneResult:
         return a, b, np.where(sound, np.asarray(values), np.inf).reshape(points, points)
 
     def plot(self, **options):
-        """Figure of the tuning: loss, gains, margin, tubes before and after.  Options as `plotting.tuning`."""
+        """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as `plotting.tuning`."""
         from iblf_jax import plotting
 
         return plotting.tuning(self, **options)
@@ -179,10 +220,12 @@ class TuneResult:
         save_tuning(self, path)
 
     def __repr__(self) -> str:
-        steps = len(self.history["evaluations"])
         steps, how = len(self.history["evaluations"]), f"{self.optimiser}, {self.mode} mode"
         lines = [f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {self.stopped})"]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
+        lines += [f"  {name} {end}" for name, end in self.at_limits.items()]
+        peaks = [np.max(np.asarray(run.metrics.peak_torque)) for run in self.nominal]
+        lines.append(f"  peak torque of the nominal run: {peaks[0]:.5g} -> {peaks[1]:.5g} N m")
         return "\n".join(lines)

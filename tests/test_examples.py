@@ -1,0 +1,63 @@
+"""The files in examples/ do what they say, through the command line, and what the documentation names is there."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import cli
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+COMMANDS = {
+    "arm.toml": ["simulate", "--out", "out"],
+    "study.toml": ["montecarlo", "--quiet"],
+    "sweep.toml": ["sweep", "--store", "sweep.zarr", "--quiet"],
+    "tune.toml": ["tune", "--quiet"],
+}
+"""File -> the command that its first line names, and its options."""
+
+
+def test_every_example_is_run_and_names_its_command():
+    assert {path.name for path in EXAMPLES.glob("*.toml")} == set(COMMANDS)
+    for name, (command, *_) in COMMANDS.items():
+        assert f"python -m iblf_jax {command} examples/{name}" in (EXAMPLES / name).read_text(encoding="utf-8").split("\n", 2)[0] + "\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_examples_run(name, tmp_path, monkeypatch, capsys):
+    if name == "arm.toml":
+        pytest.importorskip("mujoco")
+    if name == "sweep.toml":
+        pytest.importorskip("zarr")
+    monkeypatch.chdir(tmp_path)
+    command, *options = COMMANDS[name]
+    assert cli.main([command, str(EXAMPLES / name), *options]) == 0, capsys.readouterr().err
+    said = capsys.readouterr().out
+    assert {"arm.toml": "status: ok", "study.toml": "512 runs", "sweep.toml": "768 runs", "tune.toml": "peak torque < 30 N m"}[name] in said
+
+
+def test_the_arm_of_the_examples_is_the_one_that_readme_speaks_of():
+    pytest.importorskip("mujoco")
+    arm = ij.robots.load(EXAMPLES / "arm.urdf", tip="tool0")
+    reference = ij.references.Quintic(start=arm.lower * 0.2, end=arm.upper * 0.2, duration=2.0)
+    scenario = ij.presets.arm_scenario(arm, reference)
+    heavier = ij.with_parameters(scenario, {"plant.payload": 2.0, "plant.link[forearm].mass": 1.2})
+    np.testing.assert_array_equal(heavier.plant.mass, [2.5, 1.8, 1.2])
+
+
+def test_files_that_the_documentation_names_are_there():
+    texts = [(ROOT / "README.md").read_text(encoding="utf-8")]
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        texts += ["".join(cell["source"]) for cell in cells]
+    named = {name for text in texts for name in re.findall(r"examples/[\w.]+\w", text)}
+    assert {f"examples/{name}" for name in (*COMMANDS, "arm.urdf")} - named <= {"examples/arm.toml"}
+    assert all((ROOT / name).is_file() for name in named)
+    assert not [text for text in texts if re.search(r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\[", text)]

@@ -1,0 +1,76 @@
+"""What a study says about its runs adds up: counts, starts outside the bounds, what statistics are over, progress."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import study_cases as cases
+
+import iblf_jax as ij
+from iblf_jax import Status
+from iblf_jax.status import FAILED
+from iblf_jax.studies import monte_carlo, progress, sensitivity
+
+
+@pytest.fixture(scope="module")
+def study():
+    """600 runs, some of which start outside their bounds, and then some with flags of every kind."""
+    found = cases.study()
+    status = np.array(found.status)
+    calm = np.flatnonzero(status == 0)
+    status[calm[:5]] |= int(Status.TORQUE_SATURATED)
+    status[calm[5:9]] |= int(Status.GUARD_ACTIVE | Status.STEP_TOO_LARGE)
+    status[calm[9:12]] |= int(Status.BOUND_VIOLATED)
+    return dataclasses.replace(found, status=status)
+
+
+def test_the_counts_add_up(study):
+    counts = study.status_counts
+    assert counts["OK"] + counts["FLAGGED"] + counts["FAILED"] == len(study)
+    assert counts["FLAGGED"] == np.sum((study.status != 0) & (study.status & int(FAILED) == 0)) >= 5
+    assert f"failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok: {counts['OK']}" in repr(study)
+
+
+def test_starts_outside_are_told_from_violations_of_the_law(study):
+    q = np.asarray(study.samples["initial.q"])
+    tube = ij.bounds.tube_at(study.scenario.reference, study.scenario.bounds, 0.0)
+    outside = np.any((q <= np.asarray(tube.lower)) | (q >= np.asarray(tube.upper)), axis=1)
+    assert outside.any()
+    np.testing.assert_array_equal(study.started_outside, outside)
+    np.testing.assert_array_equal(study.started_outside[outside], np.asarray(study.metrics.first_violation_time)[outside] == 0)
+    counts = study.status_counts
+    assert counts["STARTED_OUTSIDE"] == outside.sum() == counts["BOUND_VIOLATED"] - 3
+    assert f"{outside.sum()} of them at t = 0, because they started outside" in repr(study)
+    assert f"{outside.sum()} of them because they started outside" in study.plot(runs=256).get_suptitle().replace("\n", " ")
+    with pytest.warns(ij.SimulationWarning, match="joint 1 was drawn .* rad beyond one at t = 0.*not the law's"):
+        study.replay(int(np.flatnonzero(outside)[0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        study.replay(int(np.flatnonzero(study.status == 0)[0]))
+
+
+def test_what_statistics_are_over_is_said(study):
+    failed = study.status_counts["FAILED"]
+    assert f"statistics are over 600 runs, {failed} failed ones included (exclude_failed=True leaves them out)" in repr(study)
+    said = study.quantiles().attrs
+    assert (said["runs"], said["failed_included"], said["excluded"]) == (600, failed, 0)
+    said = study.quantiles(exclude_failed=True).attrs
+    assert (said["runs"], said["failed_included"], said["excluded"]) == (600 - failed, 0, failed)
+
+
+@pytest.mark.parametrize("runs", [300, 600])
+def test_a_progress_bar_ends_where_it_should(monkeypatch, runs):
+    shown = []
+
+    def bar(*args, **options):
+        shown.append(progress.bar(True, *args[1:], **options))
+        return shown[-1]
+
+    monkeypatch.setattr(monte_carlo, "bar", bar)
+    monkeypatch.setattr(sensitivity, "bar", bar)
+    cases.study(runs)
+    ij.sensitivity(ij.presets.zhang_yan_2024(), cases.perturbations(0.01, 0.003), points=64, **cases.options())
+    assert [(x.n, x.total) for x in shown] == [(runs, runs), (320, 320)]
