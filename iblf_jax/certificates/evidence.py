@@ -24,12 +24,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 from iblf_jax.certificates.claims import law_of
 from iblf_jax.closed_loop import LoopState, Sample, evaluate, rate
+from iblf_jax.compact_loop import stepped
 from iblf_jax.controllers import Backstepping
-from iblf_jax.integrators import stages
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
 from iblf_jax.scenario import Scenario
@@ -186,20 +185,6 @@ def _sizes(scenario: Scenario, t: jax.Array, state: LoopState, M0, now, ahead, f
     return terms, torque_rate, jnp.sqrt(reach)
 
 
-def stepped(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, method: str) -> LoopState:
-    """The state one step later.  As `integrators.step`, but a loop over the stages: the vector field is compiled once."""
-    x, whole = ravel_pytree(state)
-
-    def stage(slope_and_sum, weights):
-        (k, total), (c, a, b) = slope_and_sum, weights
-        k, _ = ravel_pytree(rate(scenario, t + c * dt, whole(x + dt * (a * k))))
-        return (k, total + b * k), None
-
-    weights = tuple(jnp.asarray(w, x.dtype) for w in stages(method))
-    (_, total), _ = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
-    return whole(x + dt * total)
-
-
 def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, method: str) -> jax.Array:
     """The integrator's error in V2 over one step, (): one step against two half steps, times two for safety.
 
@@ -220,17 +205,3 @@ def along_run(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.A
         return *observed(scenario, t, state), defect(scenario, t, state, dt, method)
 
     return jax.vmap(one)(times, states)
-
-
-@partial(jax.jit, static_argnames=("length", "method"))
-def onward(scenario: Scenario, first: jax.Array, states: LoopState, dt: jax.Array, *, length: int, method: str):
-    """The states before each of `length` steps, (R, length, ...), and after the last, from R states at the steps `first`, (R,)."""
-
-    def one(state, index):
-        return stepped(scenario, index.astype(dt.dtype) * dt, state, dt, method), state
-
-    def row(first, state):
-        last, before = jax.lax.scan(one, state, first + jnp.arange(length, dtype=first.dtype))
-        return before, last
-
-    return jax.vmap(row)(first, states)

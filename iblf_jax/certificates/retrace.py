@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.certificates.evidence import along_run, onward
+from iblf_jax.certificates.evidence import along_run
 from iblf_jax.closed_loop import LoopState, initial_state
+from iblf_jax.compact_loop import onward
 from iblf_jax.status import Status, describe
 
 STRETCH = 1024
