@@ -406,7 +406,9 @@ LOAD = {"carried": ij.robots.Payload(mass=0.5, start=0.1, rise=0.2)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [{"damping": 0.5, "friction": 0.3}, LOAD], ids=["friction", "load"])
+@pytest.mark.parametrize(
+    "changes", [{"damping": 0.5, "friction": 0.3}, pytest.param(LOAD, marks=pytest.mark.release)], ids=["friction", "load"]
+)
 def test_one_arm_with_friction_or_a_load_is_case_2(changes):
     scenario = one_joint(pendulum(**changes))
     certificate = certify(scenario, duration=0.5)
