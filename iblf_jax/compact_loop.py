@@ -107,3 +107,31 @@ def run(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, 
         return run_compactly(scenario, folds, dt, steps=steps, record_every=record_every, method=method, alone=alone)
     one = partial(scan_steps, steps=steps, record_every=record_every, method=method)
     return (as_one_function(one) if alone else one)(scenario, folds, dt)
+
+
+def stepped(scenario: Scenario, t: jax.Array, state, dt: jax.Array, method: str):
+    """The state one step later.  As `integrators.step`, but a loop over the stages: the vector field is compiled once."""
+    x, whole = ravel_pytree(state)
+
+    def stage(slope_and_sum, weights):
+        (k, total), (c, a, b) = slope_and_sum, weights
+        k, _ = ravel_pytree(evaluate(scenario, t + c * dt, whole(x + dt * (a * k)))[0])
+        return (k, total + b * k), None
+
+    weights = tuple(jnp.asarray(w, x.dtype) for w in stages(method))
+    (_, total), _ = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
+    return whole(x + dt * total)
+
+
+@partial(jax.jit, static_argnames=("length", "method"))
+def onward(scenario: Scenario, first: jax.Array, states, dt: jax.Array, *, length: int, method: str):
+    """The states before each of `length` steps, (R, length, ...), and after the last, from R states at the steps `first`, (R,)."""
+
+    def one(state, index):
+        return stepped(scenario, index.astype(dt.dtype) * dt, state, dt, method), state
+
+    def row(first, state):
+        last, before = jax.lax.scan(one, state, first + jnp.arange(length, dtype=first.dtype))
+        return before, last
+
+    return jax.vmap(row)(first, states)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.scenario import Scenario
+from iblf_jax.scenario import Scenario, canonical
 
 _TOKEN = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)\]|\[([^\[\]]*[^\W\d_][^\[\]]*)\]")
 
@@ -308,3 +309,14 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         for full in expand(path):
             scenario = _replaced(scenario, _resolved(scenario, path, full)[0], value, full, None)
     return scenario
+
+
+def why_inadmissible(scenario: Scenario, values: Mapping[str, Any]) -> str:
+    """Why the scenario with these leaves replaced cannot be run, in words (a start outside its bounds, a negative mass); "" if it can."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # advice on gains
+        try:
+            canonical(with_parameters(scenario, values))
+        except ValueError as error:
+            return str(error)
+    return ""

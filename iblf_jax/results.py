@@ -118,6 +118,8 @@ class Rollout:
     """Time step, () [s]."""
     method: str = dataclasses.field(metadata={"static": True})
     """The integrator."""
+    steps: int | None = dataclasses.field(default=None, metadata={"static": True})
+    """Steps that were made, recorded or not; None if it is not known whether there were more than up to the last sample."""
 
     @property
     def ok(self) -> bool:

@@ -124,6 +124,7 @@ def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record
         fastest_mode=outcome.fastest_mode,
         dt=dt,
         method=method,
+        steps=steps,
         **arrays,
     )
 

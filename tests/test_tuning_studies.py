@@ -1,6 +1,7 @@
 """Fronts, attacks on tuned gains, saved results, the command line and the figures of tuning."""
 
 import dataclasses
+import warnings
 from types import SimpleNamespace
 
 import jax
@@ -42,6 +43,36 @@ def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
         assert np.all(attack.values[path] <= high + 1e-9)
     with pytest.raises(ValueError, match="bounded"):
         ij.falsify(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.01))}, **SHORT)
+
+
+def run_again(attack):
+    """The replay of an attack, which must not raise."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ij.rollout.SimulationWarning)
+        return attack.replay()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "sets",
+    [
+        {"initial.q": ij.value(ij.uniform(0.2, 1.2)), "initial.dq": ij.value(ij.uniform(-3.0, 3.0))},
+        {"reference.amplitude": ij.value(ij.uniform(0.0, 0.8)), "reference.frequency": ij.value(ij.uniform(0.0, 3.0))},
+    ],
+    ids=["start over its bound", "reference over its bound"],
+)
+def test_falsify_returns_what_can_be_run(paper, sets):
+    attack = ij.falsify(paper, sets, starts=3, iterations=4, **SHORT)
+    again = run_again(attack)
+    assert attack.margin == pytest.approx(float(np.min(again.metrics.margin)), abs=1e-9)
+    assert attack.margin <= np.nanmin(attack.history)
+    assert attack.margin < attack.first_margin
+    assert np.all((again.q[0] > again.lower[0]) & (again.q[0] < again.upper[0]))
+
+
+def test_falsify_refuses_sets_without_an_admissible_run(paper):
+    with pytest.raises(ValueError, match=r"sets: got \{'initial.q': .*start inside the bounds .*Narrow"):
+        ij.falsify(paper, {"initial.q": ij.value(ij.uniform(1.1, 1.2))}, starts=2, **SHORT)
 
 
 @pytest.mark.slow

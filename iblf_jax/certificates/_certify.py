@@ -11,14 +11,17 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.facts import Facts, facts_of, same_structure, same_tree
-from iblf_jax.certificates.lines import all_lines, applicable_case, bounds_along, left_side
-from iblf_jax.certificates.result import FAILS, NOT_APPLICABLE, Certificate, Line, Traces
+from iblf_jax.certificates.facts import Facts, Whole, look, same_structure, same_tree
+from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
+from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
+from iblf_jax.certificates.retrace import believed
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
 
 WORST = 16
+RECORDED = 20_000
+"""Samples that are recorded, at most about, of a run that is made here; all steps are looked at whatever is recorded."""
 
 
 def certify(
@@ -32,14 +35,15 @@ def certify(
 ) -> Certificate:
     """Theorem 2, inequality by inequality, with margins.
 
-        V2' + rho V2 - 1/2 |f'|^2 <= 0  at every recorded sample, and what follows from it                  (3.17)-(3.31)
+        V2' + rho V2 - 1/2 |f'|^2 <= 0  at every step, and what follows from it                             (3.17)-(3.31)
 
     V2' and f' are exact (by jvp along the vector field of the whole loop).  A law, an observer or a situation without a claim is
-    "not applicable", never "fails".
+    "not applicable", never "fails".  Steps that a run did not record are made again, from each recorded sample to the next.
 
     Args:
       scenario: what runs.
-      run: a `Rollout` of it (one run or a batch), or a study (with `replay(i)`, `metrics`, `len`); simulated here if not given.
+      run: a `Rollout` of it (one run or a batch), or a study (with `replay(i)`, `metrics`, `len`), whose runs that were not made are
+        left out; simulated here if not given.
       duration, dt, method: of the simulation, if `run` is not given [s].
       worst: of a study, judge that many runs, those nearest to their bounds; None for all.
 
@@ -47,7 +51,8 @@ def certify(
       A `Certificate`; over many runs each line is that of the run with the smallest margin.
 
     Raises:
-      ValueError: a run of another scenario, without recorded samples, or arguments of the wrong kind.
+      ValueError: a run of another scenario, one that its own scenario, dt and method do not reproduce (or whose samples do not say how
+        many steps it had), or arguments of the wrong kind.
 
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
     """
@@ -55,17 +60,18 @@ def certify(
     if not checks.is_concrete(scenario):
         raise checks.fail("scenario", "traced values", "numbers", "certify works on the host: call it outside jit, vmap and grad.")
     if run is None:
-        run = simulate(scenario, duration=duration, dt=dt, method=method)
+        every = 1 + checks.whole_steps(duration, dt) // RECORDED
+        run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
     if isinstance(run, Rollout):
         if run.is_batch:
             _check_same_kind(scenario, run)
             on_host = jax.tree.map(np.asarray, run)
             return _many(((i, on_host[i]) for i in range(len(run))), len(run))
         _check_same(scenario, run)
-        return _one(run)
+        return _one(jax.tree.map(np.asarray, run))
     if hasattr(run, "replay") and hasattr(run, "metrics") and hasattr(run, "__len__"):
         indices = _worst_of(run, worst)
-        return _many(((i, run.replay(i)) for i in indices), len(indices))
+        return _many(((i, jax.tree.map(np.asarray, _replayed(run, i))) for i in indices), len(indices))
     raise checks.fail("run", run, "a Rollout, a study or None", "Pass what ij.simulate or ij.monte_carlo returned.")
 
 
@@ -81,12 +87,13 @@ def _check_same(scenario: Scenario, run: Rollout) -> None:
 
 
 def _worst_of(study: Any, worst: int | None) -> list[int]:
-    """The runs of a study that came nearest to their bounds, the nearest first."""
+    """The runs of a study that came nearest to their bounds, the nearest first, of those that were made."""
     if worst is not None:
         worst = checks.positive_integer("worst", worst)
     count = len(study)
-    if worst is None or worst >= count:
-        return list(range(count))
+    made = np.broadcast_to(getattr(study, "made", True), (count,))
+    if worst is None or worst >= np.sum(made):
+        return np.flatnonzero(made).tolist()
     try:
         margin = np.asarray(study.metrics["xi_margin"])
     except KeyError:
@@ -94,7 +101,14 @@ def _worst_of(study: Any, worst: int | None) -> list[int]:
             "run.metrics", list(study.metrics), "the metric xi_margin", "Run the study with metrics.Margin, or pass worst=None."
         ) from None
     nearest = np.min(margin.reshape(count, -1), axis=1)
-    return [int(i) for i in np.argsort(np.nan_to_num(nearest, nan=-np.inf), kind="stable")[:worst]]
+    order = np.argsort(np.nan_to_num(nearest, nan=-np.inf), kind="stable")
+    return order[made[order]][:worst].tolist()
+
+
+def _replayed(study: Any, index: int) -> Rollout:
+    """One run of a study, with no more samples than memory should hold."""
+    steps = round(study.duration / study.dt) if hasattr(study, "duration") and hasattr(study, "dt") else 0
+    return study.replay(index, record_every=1 + steps // RECORDED) if steps > RECORDED else study.replay(index)
 
 
 def _heading(scenario: Scenario) -> str:
@@ -108,49 +122,53 @@ def _heading(scenario: Scenario) -> str:
 
 
 def _one(run: Rollout) -> Certificate:
-    """The certificate of one run."""
-    facts = facts_of(jax.tree.map(np.asarray, run))
-    return Certificate(_heading(run.scenario), tuple(all_lines(facts)), _numbers(facts), _traces(facts))
+    """The certificate of one run, its arrays on the host."""
+    whole, stretches = look(run)
+    parts, traces = [], []
+    for facts in stretches:
+        parts.append(of_stretch(facts))
+        traces.append(_traces(facts))
+    lines = tuple(over_run(whole, parts))
+    return Certificate(_heading(run.scenario), lines, _numbers(whole), Traces(*map(np.concatenate, zip(*traces, strict=True))))
 
 
-def _numbers(facts: Facts) -> dict[str, Any]:
+def _numbers(facts: Whole) -> dict[str, Any]:
     """The constants of the claim."""
-    evidence = facts.evidence
     rho = {f"rho_{where}_case_{case}": value for (case, where), value in facts.rho.items()}
     return rho | {
         "case": facts.case,
-        "F_m": float(np.max(np.linalg.norm(evidence.f, axis=1))),
+        "F_m": facts.F_m,
         "F_d": facts.F_d,
         "rho2": facts.F_d**2 / 2,
-        "V2_start": float(evidence.V[0]),
-        "V2_end": float(evidence.V[-1]),
-        "lambda_min_run": float(evidence.lambda_min.min()),
-        "lambda_max_run": float(evidence.lambda_max.max()),
+        "V2_start": facts.V_ends[0],
+        "V2_end": facts.V_ends[1],
+        "lambda_min_run": facts.lambda_min,
+        "lambda_max_run": facts.lambda_max,
         "lambda_min_box": facts.box.lambda_min,
         "lambda_max_box": facts.box.lambda_max,
         "lambda_searched": facts.box.searched,
         "q_of_lambda_max_box": facts.box.q_max,
         "jump_times": facts.jumps,
-        "samples": int(facts.run.t.size),
-        "samples_left_out": int(np.sum(evidence.held)),
+        "samples": facts.samples,
+        "samples_left_out": facts.left_out,
     }
 
 
 def _traces(facts: Facts) -> Traces:
-    """What the figure shows; NaN where there is no claim."""
-    run, evidence, case = facts.run, facts.evidence, applicable_case(facts)
-    nothing = np.full(run.t.shape, np.nan)
+    """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim."""
+    sample, evidence, case = facts.sample, facts.evidence, applicable_case(facts.whole)
+    nothing = np.full(facts.t.shape, np.nan)
     envelope, left = (nothing, nothing) if case is None else (facts.envelope[case].bound, left_side(facts, case))
     bounds = (
-        {"xi, by V1": np.full(run.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
+        {"xi, by V1": np.full(sample.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
     )
-    return Traces(
-        t=run.t,
+    traces = Traces(
+        t=facts.t,
         V=evidence.V,
         envelope=envelope,
         left=np.where(evidence.held, np.nan, left),
         dropped=evidence.dropped_e2 + evidence.dropped_f,
-        xi=run.xi,
+        xi=sample.xi,
         xi_bound=bounds["xi, by V1"],
         e2=np.linalg.norm(evidence.e2, axis=1),
         e2_bound=bounds["e2"],
@@ -158,6 +176,7 @@ def _traces(facts: Facts) -> Traces:
         f_tilde_bound=bounds["f_tilde"],
         held=evidence.held,
     )
+    return Traces(*(x[facts.recorded] for x in traces))
 
 
 def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], count: int) -> Certificate:
@@ -166,10 +185,12 @@ def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], c
         raise checks.fail("run", "no runs", "at least one run")
     lines: dict[str, list[Line]] = {}
     judged: list[int] = []
+    disbelieved: list[int] = []
     worst: tuple[tuple, int, Certificate] | None = None
     for index, run in runs:
         certificate = _one(run)
         judged.append(index)
+        disbelieved += [] if believed(run) else [index]
         for line in certificate.lines:
             lines.setdefault(line.name, []).append(dataclasses.replace(line, run=index))
         badness = min(map(_badness, filter(lambda line: line.name.startswith("inequality"), certificate.lines)))
@@ -177,7 +198,7 @@ def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], c
         if worst is None or badness < worst[0]:
             worst = (badness, index, certificate)
     assert worst is not None
-    merged = tuple(_worst_line(same) for same in lines.values())
+    merged = tuple(_worst_line(same, disbelieved) for same in lines.values())
     _, index, certificate = worst
     return Certificate(certificate.heading, merged, certificate.numbers, certificate.traces, tuple(judged), index)
 
@@ -190,9 +211,14 @@ def _badness(line: Line) -> tuple[float, float]:
     return rank, np.inf if line.value is None else -line.value
 
 
-def _worst_line(same: list[Line]) -> Line:
-    """The line of the worst run, with a word on how many runs failed or had no claim."""
+def _worst_line(same: list[Line], disbelieved: list[int]) -> Line:
+    """The line of the worst run, with a word on how many runs failed or had no claim.
+
+    What is not judged in a run that is not to be believed does not hold in all runs.
+    """
     worst = min(same, key=_badness)
+    if worst.verdict == HOLDS:
+        worst = next((line for line in same if line.run in disbelieved and line.verdict == NOT_APPLICABLE), worst)
     failed = sum(line.verdict == FAILS for line in same)
     absent = sum(line.verdict == NOT_APPLICABLE for line in same)
     notes = [f"fails in {failed} of {len(same)} runs"] if failed else []

@@ -20,17 +20,17 @@ are added up in `Evidence.terms`.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from iblf_jax.certificates.claims import law_of
-from iblf_jax.closed_loop import LoopState, evaluate, rate
+from iblf_jax.closed_loop import LoopState, Sample, evaluate, rate
+from iblf_jax.compact_loop import stepped
 from iblf_jax.controllers import Backstepping
-from iblf_jax.integrators import step
 from iblf_jax.observers import Printed
-from iblf_jax.robots import mass_matrix_rate
+from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
 from iblf_jax.scenario import Scenario
 
 ROUNDING = 2.0
@@ -63,7 +63,7 @@ class Evidence(NamedTuple):
     dropped_f: jax.Array
     """-f_tilde^T kf M0' q' for the observer as printed, else 0, () [1/s]."""
     steady: jax.Array
-    """Whether the torque of the disturbance component does not change along the loop, exactly, () bool."""
+    """Whether f' = 0 exactly, () bool: the plant is the model at this time, and the torque that is left in f does not change."""
     held: jax.Array
     """Whether the guard at the wall or a torque limit was at work: nothing is claimed then, () bool."""
     terms: jax.Array
@@ -85,8 +85,19 @@ def _probe(scenario: Scenario, t: jax.Array, state: LoopState):
     law = law_of(scenario)
     barrier_slope = law.barrier.slope(scenario.setting.tube(t), state.q) if isinstance(law, Backstepping) else jnp.zeros_like(state.q)
     smooth = {name: getattr(sample, name) for name in ("V", "disturbance", "disturbance_estimate", "tau", "alpha", "xi", "e2", "dq_d")}
-    torque = scenario.disturbance.torque(t, state.q, state.dq, scenario.plant, scenario.model)
-    return smooth | {"ddq": slope_of_state.dq, "s": barrier_slope, "torque": torque}, sample
+    plant = at_time(scenario.plant, t)
+    # All that f holds where the plant is the model: what is pushed besides the law's torque.
+    pushed = scenario.disturbance.torque(t, state.q, state.dq, plant, scenario.model) + friction_torque(plant, state.dq)
+    return smooth | {"ddq": slope_of_state.dq, "s": barrier_slope, "pushed": pushed}, sample
+
+
+def _alike(one: Any, other: Any) -> jax.Array:
+    """Whether two robots are the same, leaf by leaf, () bool."""
+    structure: Any = jax.tree.structure(one)
+    if structure != jax.tree.structure(other):
+        return jnp.zeros((), bool)
+    same = [jnp.all(a == b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)]
+    return jnp.all(jnp.stack(same)) if same else jnp.ones((), bool)
 
 
 def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
@@ -97,6 +108,11 @@ def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
       t: time, () [s].
       state: state of the loop at t.
     """
+    return observed(scenario, t, state)[0]
+
+
+def observed(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Evidence, Sample]:
+    """The evidence at one state, as `evidence_at`, and the sample that a run records there."""
     along = rate(scenario, t, state)
     now, ahead, sample = jax.jvp(partial(_probe, scenario), (t, state), (jnp.ones_like(t), along), has_aux=True)
     M0 = scenario.model.mass_matrix(state.q)
@@ -105,7 +121,7 @@ def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
     eigenvalues = jnp.linalg.eigvalsh(M0)
     dropped_e2, dropped_f = _dropped(scenario, dM0, state.dq, now["e2"], f_tilde)
     terms, df_terms, V_terms = _sizes(scenario, t, state, M0, now, ahead, f_tilde)
-    return Evidence(
+    evidence = Evidence(
         V=now["V"],
         dV=ahead["V"],
         f=now["disturbance"],
@@ -117,12 +133,13 @@ def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
         lambda_max=eigenvalues[-1],
         dropped_e2=dropped_e2,
         dropped_f=dropped_f,
-        steady=jnp.all(ahead["torque"] == 0.0),
+        steady=_alike(at_time(scenario.plant, t), scenario.model) & jnp.all(ahead["pushed"] == 0.0),
         held=jnp.any(sample.guard_active | sample.saturated) | _limited(scenario, t, state, now),
         terms=terms,
         df_terms=df_terms,
         V_terms=V_terms,
     )
+    return evidence, sample
 
 
 def _limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
@@ -173,27 +190,18 @@ def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, me
 
     With it the envelopes can be held against a run in which V2 has fallen below what the integrator resolves.
     """
-    vector_field = partial(rate, scenario)
-
-    def advance(t, state, dt):
-        return step(method, vector_field, t, state, dt, vector_field(t, state))
-
-    middle, end = t + 0.5 * dt, t + dt
-    sizes = jnp.stack([dt, 0.5 * dt])
-    first = jax.vmap(lambda size: advance(t, state, size))(sizes)
+    first = jax.vmap(lambda size: stepped(scenario, t, state, size, method))(jnp.stack([dt, 0.5 * dt]))
     whole, half = (jax.tree.map(lambda x, i=i: x[i], first) for i in (0, 1))
-    ends = jax.tree.map(lambda *x: jnp.stack(x), whole, advance(middle, half, 0.5 * dt))
-    V = jax.vmap(lambda state: evaluate(scenario, end, state)[1].V)(ends)
+    ends = jax.tree.map(lambda *x: jnp.stack(x), whole, stepped(scenario, t + 0.5 * dt, half, 0.5 * dt, method))
+    V = jax.vmap(lambda state: evaluate(scenario, t + dt, state)[1].V)(ends)
     return 2.0 * jnp.abs(V[0] - V[1])
 
 
-@jax.jit
-def along_run(scenario: Scenario, times: jax.Array, states: LoopState) -> Evidence:
-    """The evidence at every recorded sample; time axis first."""
-    return jax.vmap(partial(evidence_at, scenario))(times, states)
-
-
 @partial(jax.jit, static_argnames="method")
-def defects(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str) -> jax.Array:
-    """The integrator's error in V2 over one step from every recorded sample, (T,)."""
-    return jax.vmap(lambda t, state: defect(scenario, t, state, dt, method))(times, states)
+def along_run(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str):
+    """The evidence, the sample and the integrator's error in V2 over one step, at every state; time axis first."""
+
+    def one(t, state):
+        return *observed(scenario, t, state), defect(scenario, t, state, dt, method)
+
+    return jax.vmap(one)(times, states)

@@ -1,17 +1,21 @@
-"""One run as the certificate sees it: evidence at every sample, the constants of the claim, and the envelope of V2.
+"""One run as the certificate sees it: evidence at every step, the constants of the claim, and the envelope of V2.
 
     case 1:  V2(t) <= V2(s) exp(-rho (t - s)) for t >= s                                                                 (3.20)
     case 2:  V2(t) <= V2(s) exp(-rho (t - s)) + rho2/rho,   rho2 = F_d^2/2, F_d = sup |f'| over the run                  (3.28)
 
 The claim holds from any instant s on.  So where f jumps (Assumption 1 is broken there), and where the guard or a torque limit was at
-work, the envelope starts anew at the next sample.
+work, the envelope starts anew at the next step.
 
 A run is not the exact solution: the envelope is widened by the integrator's own error in V2 (`evidence.defect`), carried along at the
 rate of the claim, and by rounding, so that V2 may be followed down to where it is only noise.
+
+All steps are looked at, whatever the run recorded (`retrace`), twice: rho and F_d are known after the first time only.  A run of few
+steps is kept in between; a long one is made again, so that memory stays bounded.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -19,18 +23,19 @@ import numpy as np
 
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.box import Extremes, eigenvalues_over
-from iblf_jax.certificates.evidence import along_run, defects, rounding
-from iblf_jax.closed_loop import LoopState
+from iblf_jax.certificates.evidence import rounding
+from iblf_jax.certificates.retrace import DISBELIEVED, Stretch, believed, check_status, grid, stretches
 from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status, describe
+from iblf_jax.status import describe
 
-DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 NOISE = 32.0
 """Units of the last place by which sqrt(2 V2) may be off, relative to the sizes of its terms."""
+KEPT = 100_000
+"""A run of at most so many steps is kept in memory between the two looks."""
 
 
 class Envelope(NamedTuple):
-    """The bound on V2 along a run, (T,) each; NaN where nothing is claimed."""
+    """The bound on V2 along a stretch, (T,) each; NaN where nothing is claimed."""
 
     bound: np.ndarray
     """Right-hand side of (3.20) or (3.28)."""
@@ -38,13 +43,22 @@ class Envelope(NamedTuple):
     """What rounding and the integrator add to it."""
 
 
-class Facts(NamedTuple):
-    """One run, on the host, with everything that the lines are made of."""
+class Anchor(NamedTuple):
+    """Where an envelope comes from, at the last step of a stretch."""
+
+    t: float
+    """When it started [s]."""
+    V: float
+    noise: float
+    carried: float
+    """The integrator's error since then, carried to the step after."""
+
+
+class Whole(NamedTuple):
+    """What is known of a run as a whole."""
 
     run: Any
     """The Rollout, its arrays on the host."""
-    evidence: Any
-    """Its Evidence, time axis first, on the host."""
     eps: float
     """Relative error put down to rounding."""
     no_claim: str
@@ -57,36 +71,115 @@ class Facts(NamedTuple):
     """1 if f' = 0, else 2."""
     rho: dict[tuple[int, str], float]
     """The rate, by case and by where lambda_max was taken ("run", "box") [1/s]."""
+    F_m: float
     F_d: float
+    lambda_min: float
+    """Smallest eigenvalue of M0 along the run [kg m^2]."""
+    lambda_max: float
     box: Extremes
     claim: claims.Claim | None
+    samples: int
+    """Steps that were looked at, and the last instant."""
+    left_out: int
+    """Those of them at which the guard or a torque limit was at work."""
+    V_ends: tuple[float, float]
+    """V2 at the first and at the last."""
+
+
+class Facts(NamedTuple):
+    """A stretch of a run with everything that the lines are made of."""
+
+    whole: Whole
+    t: np.ndarray
+    sample: Any
+    evidence: Any
+    recorded: np.ndarray
     envelope: dict[int, Envelope]
 
 
-def facts_of(run: Any) -> Facts:
-    """Everything that the lines are made of, for one run with its arrays on the host."""
-    scenario = run.scenario
-    states = LoopState(run.q, run.dq, run.controller_state, run.observer_state)
-    evidence = jax.tree.map(np.asarray, along_run(scenario, run.t, states))
-    no_claim = claims.why_no_claim(scenario)
-    constants = None if no_claim else claims.claim(scenario)
-    box = eigenvalues_over(scenario.model, np.min(run.lower, axis=0), np.max(run.upper, axis=0))
-    # With plant and model alike, f is the torque of the disturbance component: f' = 0 can be seen exactly.
-    case = 1 if bool(np.all(evidence.steady)) and same_tree(scenario.plant, scenario.model) else 2
-    F_d = 0.0 if case == 1 else float(np.max(np.linalg.norm(evidence.df, axis=1)))
-    rates, envelopes = {}, {}
-    jumps = _jumps(scenario, run.t)
+def look(run: Any) -> tuple[Whole, Iterator[Facts]]:
+    """What is known of one run, its arrays on the host, and its stretches one after the other."""
+    seen: Iterable[Stretch] = list(stretches(run)) if grid(run)[1] <= KEPT else stretches(run)
+    whole = _whole(run, seen)
+    return whole, _facts(whole, seen if isinstance(seen, list) else stretches(run))
+
+
+class _Tally:
+    """Extremes over the stretches of a run."""
+
+    def __init__(self) -> None:
+        self.low: Any = np.inf
+        self.high: Any = -np.inf
+        self.margin = self.lambda_min = np.inf
+        self.F_m = self.F_d = self.lambda_max = -np.inf
+        self.steady, self.samples, self.left_out = True, 0, 0
+        self.V_ends = (np.nan, np.nan)
+
+    def add(self, stretch: Stretch) -> None:
+        """Takes a stretch into account; what is no number stays none."""
+        sample, evidence = stretch.sample, stretch.evidence
+        self.low, self.high = np.minimum(self.low, sample.lower.min(axis=0)), np.maximum(self.high, sample.upper.max(axis=0))
+        self.margin = np.minimum(self.margin, np.minimum(sample.q - sample.lower, sample.upper - sample.q).min())
+        self.F_m = np.maximum(self.F_m, np.linalg.norm(evidence.f, axis=1).max())
+        self.F_d = np.maximum(self.F_d, np.linalg.norm(evidence.df, axis=1).max())
+        self.lambda_min = np.minimum(self.lambda_min, evidence.lambda_min.min())
+        self.lambda_max = np.maximum(self.lambda_max, evidence.lambda_max.max())
+        self.steady = self.steady and bool(evidence.steady.all())
+        self.V_ends = (evidence.V[0] if self.samples == 0 else self.V_ends[0], evidence.V[-1])
+        self.samples, self.left_out = self.samples + stretch.t.size, self.left_out + int(evidence.held.sum())
+
+
+def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
+    """The first look: extremes over all steps, and what follows from them."""
+    tally = _Tally()
+    for stretch in seen:
+        tally.add(stretch)
+    no_run = ""
+    if believed(run):
+        check_status(run, float(tally.margin))
+    else:
+        no_run = f"the run is not to be believed: {describe(int(run.status) & int(DISBELIEVED))}"
+    no_claim = claims.why_no_claim(run.scenario)
+    constants = None if no_claim else claims.claim(run.scenario)
+    box = eigenvalues_over(run.scenario.model, tally.low, tally.high)
+    case = 1 if tally.steady else 2
+    rates = {}
     if constants is not None:
-        defect = np.asarray(defects(scenario, run.t, states, run.dt, method=run.method))
         for each in claims.CASES:
-            for where, largest in (("run", evidence.lambda_max.max()), ("box", box.lambda_max)):
+            for where, largest in (("run", tally.lambda_max), ("box", box.lambda_max)):
                 rates[each, where] = float(claims.rho(constants, largest, each))
-            offset = 0.0 if each == 1 else F_d**2 / 2
-            envelopes[each] = _envelope(run, evidence, defect, jumps, rates[each, "run"], offset)
-    believed = not int(run.status) & int(DISBELIEVED)
-    no_run = "" if believed else f"the run is not to be believed: {describe(int(run.status) & int(DISBELIEVED))}"
-    eps = rounding(np.asarray(run.q).dtype)
-    return Facts(run, evidence, eps, no_claim, no_run, jumps, case, rates, F_d, box, constants, envelopes)
+    return Whole(
+        run=run,
+        eps=rounding(run.q.dtype),
+        no_claim=no_claim,
+        no_run=no_run,
+        jumps=_jumps(run.scenario, grid(run)[1] * float(run.dt)),
+        case=case,
+        rho=rates,
+        F_m=float(tally.F_m),
+        F_d=0.0 if case == 1 else float(tally.F_d),
+        lambda_min=float(tally.lambda_min),
+        lambda_max=float(tally.lambda_max),
+        box=box,
+        claim=constants,
+        samples=tally.samples,
+        left_out=tally.left_out,
+        V_ends=(float(tally.V_ends[0]), float(tally.V_ends[1])),
+    )
+
+
+def _facts(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Facts]:
+    """The second look: the stretches, with the envelopes that run through them."""
+    anchors: dict[int, Anchor] = {}
+    t, held = np.zeros(0), np.zeros(0, bool)
+    for stretch in seen:
+        starts = starts_of(np.append(t, stretch.t), np.append(held, stretch.evidence.held), whole.jumps)[t.size :]
+        t, held = stretch.t[-1:], stretch.evidence.held[-1:]
+        envelopes = {}
+        if whole.claim is not None:
+            for case in claims.CASES:
+                envelopes[case], anchors[case] = _envelope(whole, case, stretch, starts, anchors.get(case))
+        yield Facts(whole, stretch.t, stretch.sample, stretch.evidence, stretch.recorded, envelopes)
 
 
 def same_structure(one: Any, other: Any) -> bool:
@@ -102,9 +195,9 @@ def same_tree(one: Any, other: Any) -> bool:
     )
 
 
-def _jumps(scenario: Scenario, t: np.ndarray) -> np.ndarray:
+def _jumps(scenario: Scenario, end: float) -> np.ndarray:
     times = np.sort(np.ravel(np.asarray(scenario.disturbance.jump_times())))
-    return times[(times > t[0]) & (times <= t[-1])]
+    return times[(times > 0) & (times <= end)]
 
 
 def starts_of(t: np.ndarray, held: np.ndarray, jumps: np.ndarray) -> np.ndarray:
@@ -113,23 +206,23 @@ def starts_of(t: np.ndarray, held: np.ndarray, jumps: np.ndarray) -> np.ndarray:
     return np.concatenate([[True], fresh | held[:-1]])
 
 
-def _envelope(run: Any, evidence: Any, defect: np.ndarray, jumps: np.ndarray, rate: float, rho2: float) -> Envelope:
-    """The envelope of V2 and its tolerance along a run; NaN at held samples, and everywhere if the rate is not positive."""
-    t, V, size = run.t, evidence.V, run.t.shape[0]
-    bound, tolerance = np.full(size, np.nan), np.full(size, np.nan)
+def _envelope(whole: Whole, case: int, stretch: Stretch, starts: np.ndarray, before: Anchor | None) -> tuple[Envelope, Anchor]:
+    """The envelope of V2 and its tolerance along a stretch; NaN at held steps, and everywhere if the rate is not positive."""
+    rate, rho2 = whole.rho[case, "run"], 0.0 if case == 1 else whole.F_d**2 / 2
+    t, V, noise = stretch.t, stretch.evidence.V, NOISE * float(np.finfo(stretch.evidence.V.dtype).eps) * stretch.evidence.V_terms
+    if before is None:
+        before = Anchor(t[0], V[0], noise[0], 0.0)
+    # Index of the step at which the envelope started, 0 for one before this stretch.
+    first = np.maximum.accumulate(np.where(starts, np.arange(1, t.size + 1), 0))
+    start_t, start_V, start_noise = (np.append(a, b)[first] for a, b in zip(before[:3], (t, V, noise), strict=True))
+    decay, sums, total = np.exp(-max(rate, 0.0) * float(whole.run.dt)), [], before.carried
+    for fresh, error in zip(starts.tolist(), stretch.defect.tolist(), strict=True):
+        sums.append(0.0 if fresh else total)
+        total = decay * sums[-1] + error
+    after = Anchor(start_t[-1], start_V[-1], start_noise[-1], total)
     if not rate > 0:
-        return Envelope(bound, tolerance)
-    noise = NOISE * float(np.finfo(V.dtype).eps) * evidence.V_terms
-    steps = np.rint(np.diff(t) / float(run.dt))
-    starts = starts_of(t, evidence.held, jumps)
-    first, carried = 0, 0.0
-    for k in range(size):
-        if starts[k]:
-            first, carried = k, 0.0
-        else:
-            carried = carried * np.exp(-rate * (t[k] - t[k - 1])) + steps[k - 1] * defect[k - 1]
-        if not evidence.held[k]:
-            bound[k] = V[first] * np.exp(-rate * (t[k] - t[first])) + rho2 / rate
-            widened = np.sqrt(2 * (bound[k] + carried)) + noise[first] + noise[k]
-            tolerance[k] = 0.5 * widened**2 - bound[k]
-    return Envelope(bound, tolerance)
+        nothing = np.full(t.size, np.nan)
+        return Envelope(nothing, nothing), after
+    bound = np.where(stretch.evidence.held, np.nan, start_V * np.exp(-rate * (t - start_t)) + rho2 / rate)
+    widened = np.sqrt(2 * (bound + np.asarray(sums))) + start_noise + noise
+    return Envelope(bound, 0.5 * widened**2 - bound), after

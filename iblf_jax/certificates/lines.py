@@ -1,4 +1,4 @@
-"""The lines of a certificate: each inequality of Theorem 2 held against one run.
+"""The lines of a certificate: each inequality of Theorem 2 held against one run, stretch by stretch.
 
 Assumptions, gain conditions and rates come first, then the differential inequality, which is checked at every sample; then what
 follows from it by integration: the envelope of V2 and the bounds on xi, e2 and f_tilde.  For readings with a gap in their proof,
@@ -7,6 +7,8 @@ the dropped terms are measured beside the margin that the proof leaves for them.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -14,9 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.facts import Facts
+from iblf_jax.certificates.facts import Facts, Whole
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
+from iblf_jax.certificates.retrace import STRETCH
 from iblf_jax.scenario import Scenario
+from iblf_jax.status import Status
 
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 RHO = {1: "(3.19)", 2: "(3.27)"}
@@ -32,43 +36,79 @@ Description = dict[str, Any]
 NO_BOUND = "the barrier states no bound on xi from V1"
 
 
-def all_lines(facts: Facts) -> list[Line]:
-    """Every line of the certificate of one run, in the theorem's order."""
-    lines = [*assumptions(facts), *gains(facts)]
-    for case in claims.CASES:
-        lines += rates(facts, case)
+ASSUMED = ("f bounded", "f' bounded", "reference inside", "start inside")
+"""Lines that come before those of the gains."""
+
+
+def over_run(whole: Whole, parts: Iterable[tuple[list[Line], dict[str, float]]]) -> list[Line]:
+    """Every line of the certificate of one run, in the theorem's order, from those of its stretches (`of_stretch`)."""
+    found: dict[str, list[Line]] = {}
+    largest: dict[str, float] = {}
+    for lines, shares in parts:
+        for line in lines:
+            found.setdefault(line.name, []).append(line)
+        for name, share in shares.items():
+            largest[name] = max(share, largest.get(name, 0.0))
+    merged = {name: _worst(same) for name, same in found.items()}
+    for name, share in largest.items():
+        merged[name] = dataclasses.replace(merged[name], note=f"at most {100 * share:.3g} % of that margin at one instant")
+    constant = [*gains(whole), *(line for case in claims.CASES for line in rates(whole, case))]
+    first = [merged.pop(name) for name in ASSUMED]
+    return [*first, *constant, *merged.values()]
+
+
+def _worst(same: list[Line]) -> Line:
+    """One line from those of the stretches: failed before not applicable before held, then the smallest margin; the largest value."""
+    rank = {FAILS: 0, NOT_APPLICABLE: 1, HOLDS: 2}
+
+    def order(line: Line) -> tuple[float, float]:
+        if line.margin is not None:
+            return rank[line.verdict], line.margin
+        return rank[line.verdict], np.inf if line.value is None else -line.value
+
+    worst = min(same, key=order)
+    values = [line.value for line in same if line.value is not None]
+    return dataclasses.replace(worst, value=max(values)) if worst.value is not None and values else worst
+
+
+def of_stretch(facts: Facts) -> tuple[list[Line], dict[str, float]]:
+    """The lines that are about instants, for one stretch, and the largest share that each dropped term has of its margin there."""
+    lines = assumptions(facts)
     lines += [inequality(facts, case) for case in claims.CASES]
     lines += [envelope(facts, case) for case in claims.CASES]
-    return lines + bounds(facts) + dropped(facts) + [conclusion(facts)]
+    terms, shares = dropped(facts)
+    return [*lines, *bounds(facts), *terms, conclusion(facts)], shares
 
 
-def why_not(facts: Facts, case: int) -> str:
+def why_not(whole: Whole, case: int) -> str:
     """Why the claim of a case does not apply to this run; "" if it does."""
-    if facts.no_claim or facts.no_run:
-        return facts.no_claim or facts.no_run
-    if case == 1 and facts.case == 2:
-        return f"case 1 is for f' = 0; here |f'| reaches {facts.F_d:.4g} N m/s, see case 2"
-    if not facts.rho[case, "run"] > 0:
+    if whole.no_claim or whole.no_run:
+        return whole.no_claim or whole.no_run
+    if case == 1 and whole.case == 2:
+        return f"case 1 is for f' = 0; here |f'| reaches {whole.F_d:.4g} N m/s, see case 2"
+    if not whole.rho[case, "run"] > 0:
         return f"the gain conditions {CONDITION[case]} are not met"
-    if np.all(facts.evidence.held):
+    if whole.left_out == whole.samples:
         return "the guard or a torque limit was at work all the time"
     return ""
 
 
-def applicable_case(facts: Facts) -> int | None:
+def applicable_case(whole: Whole) -> int | None:
     """The case whose bounds apply to the run: the stronger one that does, or None."""
-    return next((case for case in claims.CASES if not why_not(facts, case)), None)
+    return next((case for case in claims.CASES if not why_not(whole, case)), None)
 
 
 def left_side(facts: Facts, case: int) -> np.ndarray:
-    """The left side of the differential inequality at every sample, (T,) [1/s]."""
+    """The left side of the differential inequality at every step, (T,) [1/s]."""
     evidence = facts.evidence
-    left = evidence.dV + facts.rho[case, "run"] * evidence.V
+    left = evidence.dV + facts.whole.rho[case, "run"] * evidence.V
     return left if case == 1 else left - 0.5 * np.sum(evidence.df**2, axis=1)
 
 
 def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, description: Description) -> Line:
-    """A line from margins at every sample, (T,) or (T, n), with NaN where nothing is claimed."""
+    """A line from margins at every step, (T,) or (T, n), with NaN where nothing is claimed."""
+    if np.all(facts.evidence.held):
+        return Line(verdict=HOLDS, margin=np.inf, **description)
     margins = np.asarray(margins, float)
     tolerances = np.broadcast_to(np.asarray(tolerances, float), margins.shape)
     claimed = ~(facts.evidence.held if margins.ndim == 1 else np.broadcast_to(facts.evidence.held[:, None], margins.shape))
@@ -79,42 +119,47 @@ def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, de
         verdict=FAILS if np.any(broken) else HOLDS,
         margin=float(margins[place]),
         tolerance=float(tolerances[place]),
-        time=float(facts.run.t[place[0]]),
+        time=float(facts.t[place[0]]),
         joint=int(place[1]) if margins.ndim == 2 else None,
         **description,
     )
 
 
-def _excluded(facts: Facts) -> str:
+def _excluded(whole: Whole) -> str:
     """What was left out of a line, and where claims start anew, in words."""
-    held, notes = int(np.sum(facts.evidence.held)), []
-    if held:
-        notes.append(f"{held} of {facts.run.t.size} samples are left out: the guard or a torque limit was at work")
-    if facts.jumps.size:
-        notes.append(f"f jumps at t = {', '.join(f'{x:.4g}' for x in facts.jumps)} s, and the claim starts anew there")
+    notes = []
+    if whole.left_out:
+        notes.append(f"{whole.left_out} of {whole.samples} samples are left out: the guard or a torque limit was at work")
+    if whole.jumps.size:
+        notes.append(f"f jumps at t = {', '.join(f'{x:.4g}' for x in whole.jumps)} s, and the claim starts anew there")
     return "; ".join(notes)
 
 
 def assumptions(facts: Facts) -> list[Line]:
     """Bounds of Assumption 1 along the run, and feasibility of the reference, Assumption 2."""
-    run, evidence = facts.run, facts.evidence
+    whole, sample, evidence = facts.whole, facts.sample, facts.evidence
     size, speed = np.linalg.norm(evidence.f, axis=1), np.linalg.norm(evidence.df, axis=1)
     lines = []
     for name, statement, values, unit in (
         ("f bounded", "|f| <= F_m", size, "N m"),
-        ("f' bounded", "|f'| <= F_d between jumps", speed if facts.case == 2 else 0.0 * speed, "N m/s"),
+        ("f' bounded", "|f'| <= F_d between jumps", speed if whole.case == 2 else 0.0 * speed, "N m/s"),
     ):
         at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
-        jumps = "" if name == "f bounded" or not facts.jumps.size else f"Assumption 1 is broken by a jump of f: {_excluded(facts)}"
+        jumps = "" if name == "f bounded" or not whole.jumps.size else f"Assumption 1 is broken by a jump of f: {_excluded(whole)}"
         verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
-        lines.append(Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(run.t[at]), note=jumps))
-    room = np.minimum(run.q_d - run.lower, run.upper - run.q_d)
-    sample, joint = np.unravel_index(np.argmin(room), room.shape)
+        lines.append(
+            Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(facts.t[at]), note=jumps)
+        )
+    room = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
+    row, joint = np.unravel_index(np.argmin(room), room.shape)
     feasible: Description = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
-    lines.append(_plain(feasible, float(room[sample, joint]), joint=int(joint), time=float(run.t[sample])))
-    start = np.minimum(run.q[0] - run.lower[0], run.upper[0] - run.q[0])
-    inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
-    return [*lines, _plain(inside, float(start.min()), joint=int(start.argmin()), time=float(run.t[0]))]
+    line = _plain(feasible, float(room[row, joint]), joint=int(joint), time=float(facts.t[row]))
+    lines.append(_as_status(whole, line, Status.INFEASIBLE_REFERENCE))
+    if facts.t[0] == 0:
+        start = np.minimum(sample.q[0] - sample.lower[0], sample.upper[0] - sample.q[0])
+        inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
+        lines.append(_plain(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
+    return lines
 
 
 def _plain(description: Description, margin: float, **more: Any) -> Line:
@@ -122,7 +167,15 @@ def _plain(description: Description, margin: float, **more: Any) -> Line:
     return Line(verdict=HOLDS if margin > 0 else FAILS, margin=margin, **description, **more)
 
 
-def gains(facts: Facts) -> list[Line]:
+def _as_status(whole: Whole, line: Line, flag: Status) -> Line:
+    """A line about something that the run's status knows too: with the verdict of the status, which saw every step of the run itself."""
+    verdict = FAILS if int(whole.run.status) & int(flag) else HOLDS
+    if verdict == line.verdict:
+        return line
+    return dataclasses.replace(line, verdict=verdict, note="the verdict is that of the run's own status")
+
+
+def gains(whole: Whole) -> list[Line]:
     """The gain conditions (3.17) and (3.25)."""
     described = (
         ("K2", "(3.17)", "lambda_min(K2 - I/2) > 0", "K2", claims.LOWEST_K2, "N m s/rad"),
@@ -132,54 +185,54 @@ def gains(facts: Facts) -> list[Line]:
     lines = []
     for name, equation, statement, field, lowest, unit in described:
         description: Description = {"name": name, "equation": equation, "statement": statement, "unit": unit}
-        if facts.claim is None:
-            lines.append(Line(verdict=NOT_APPLICABLE, note=facts.no_claim, **description))
+        if whole.claim is None:
+            lines.append(Line(verdict=NOT_APPLICABLE, note=whole.no_claim, **description))
             continue
-        margins = np.asarray(getattr(facts.claim, field)) - lowest
-        spare = name == "kf, case 2" and facts.case == 1
+        margins = np.asarray(getattr(whole.claim, field)) - lowest
+        spare = name == "kf, case 2" and whole.case == 1
         note = "f' = 0 on this run, so case 1 is what counts" if spare else ""
         lines.append(_plain(description, float(margins.min()), joint=int(margins.argmin()), counts=not spare, note=note))
     return lines
 
 
-def rates(facts: Facts, case: int) -> list[Line]:
+def rates(whole: Whole, case: int) -> list[Line]:
     """The rate rho of one case, with lambda_max(M0) along the run and over the admissible box."""
     lines = []
     for where in ("run", "box"):
         name = f"rho, case {case}" + ("" if where == "run" else ", over the box")
         description: Description = {"name": name, "equation": RHO[case], "unit": "1/s"}
         description["statement"] = f"rho = min(decay of V1, 2 (K2 - 1/2)/lambda_max(M0), 2 (kf - {claims.LOWEST_KF[case]:g})) > 0"
-        reason = facts.no_claim or ("" if case == 2 or facts.case == 1 else why_not(facts, 1))
-        if reason or facts.claim is None:
+        reason = whole.no_claim or ("" if case == 2 or whole.case == 1 else why_not(whole, 1))
+        if reason or whole.claim is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        largest = float(facts.evidence.lambda_max.max()) if where == "run" else facts.box.lambda_max
-        terms = np.asarray(claims.rho_terms(facts.claim, jnp.asarray(largest), case))
+        largest = whole.lambda_max if where == "run" else whole.box.lambda_max
+        terms = np.asarray(claims.rho_terms(whole.claim, jnp.asarray(largest), case))
         least = ("the decay rate of V1", "K2 over lambda_max(M0)", "kf")[int(np.argmin(terms))]
-        note = f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({facts.box.searched})" if where == "box" else "") + f"; set by {least}"
-        counts = not (case == 2 and facts.case == 1)
-        lines.append(_plain(description, facts.rho[case, where], value=facts.rho[case, where], note=note, counts=counts))
+        note = f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.box.searched})" if where == "box" else "") + f"; set by {least}"
+        counts = not (case == 2 and whole.case == 1)
+        lines.append(_plain(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
     return lines
 
 
 def inequality(facts: Facts, case: int) -> Line:
-    """The differential inequality, at every sample."""
+    """The differential inequality, at every step."""
     description: Description = {"name": f"inequality, case {case}", "equation": INEQUALITY[case], "statement": LEFT[case], "unit": "1/s"}
-    reason = why_not(facts, case)
+    reason = why_not(facts.whole, case)
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
-    tolerance = facts.eps * (facts.evidence.terms + facts.rho[case, "run"] * facts.evidence.V)
-    return judged(facts, -left_side(facts, case), tolerance, {**description, "note": _excluded(facts)})
+    tolerance = facts.whole.eps * (facts.evidence.terms + facts.whole.rho[case, "run"] * facts.evidence.V)
+    return judged(facts, -left_side(facts, case), tolerance, {**description, "note": _excluded(facts.whole)})
 
 
 def envelope(facts: Facts, case: int) -> Line:
-    """The envelope of V2, at every sample."""
+    """The envelope of V2, at every step."""
     description: Description = {"name": f"envelope, case {case}", "equation": ENVELOPE[case], "statement": ENVELOPED[case]}
-    reason = why_not(facts, case)
+    reason = why_not(facts.whole, case)
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
     upper = facts.envelope[case]
-    return judged(facts, upper.bound - facts.evidence.V, upper.tolerance, {**description, "note": _excluded(facts)})
+    return judged(facts, upper.bound - facts.evidence.V, upper.tolerance, {**description, "note": _excluded(facts.whole)})
 
 
 @jax.jit
@@ -191,19 +244,20 @@ def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | Non
 
 def bounds_along(facts: Facts, V: np.ndarray) -> dict[str, np.ndarray]:
     """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
-    by_barrier = _xi_bound(facts.run.scenario, facts.run.t, jnp.asarray(V, facts.run.t.dtype))
+    places = np.minimum(np.arange(STRETCH), V.size - 1)  # one program for stretches of every size
+    by_barrier = _xi_bound(facts.whole.run.scenario, facts.t[places], jnp.asarray(V[places], facts.t.dtype))
     return {
-        "xi, by V1": np.full(facts.run.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier),
-        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], facts.run.q.shape),
-        "e2": np.sqrt(2 * V / facts.evidence.lambda_min.min()),
+        "xi, by V1": np.full(facts.sample.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier)[: V.size],
+        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], facts.sample.q.shape),
+        "e2": np.sqrt(2 * V / facts.whole.lambda_min),
         "f_tilde": np.sqrt(2 * V),
     }
 
 
 def bounds(facts: Facts) -> list[Line]:
     """The bounds on xi, e2 and f_tilde that follow from the envelope of the case at hand."""
-    case = applicable_case(facts)
-    shown = case or facts.case
+    case = applicable_case(facts.whole)
+    shown = case or facts.whole.case
     descriptions: list[Description] = [
         {
             "name": "xi, by V1",
@@ -215,7 +269,7 @@ def bounds(facts: Facts) -> list[Line]:
         {"name": "f_tilde", "equation": BOUNDS[shown], "statement": "|f_tilde| <= sqrt(2 Vbar)", "unit": "N m"},
     ]
     if case is None:
-        reason = why_not(facts, facts.case)
+        reason = why_not(facts.whole, facts.whole.case)
         return [Line(verdict=NOT_APPLICABLE, note=reason, **description) for description in descriptions]
     upper, evidence = facts.envelope[case], facts.evidence
     tight, wide = bounds_along(facts, upper.bound), bounds_along(facts, upper.bound + upper.tolerance)
@@ -224,11 +278,11 @@ def bounds(facts: Facts) -> list[Line]:
     lines = []
     for description in descriptions:
         name = description["name"]
-        reason = _no_xi_bound(tight) if name.startswith("xi") else ""
+        reason = _no_xi_bound(tight) if name.startswith("xi") and not np.all(evidence.held) else ""
         if reason and (name == "xi" or np.all(np.isnan(tight["xi, by V1"]))):
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(facts)) if x)
+        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(facts.whole)) if x)
         lines.append(judged(facts, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
     return lines
 
@@ -241,45 +295,45 @@ def _no_xi_bound(tight: dict[str, np.ndarray]) -> str:
     return "" if np.all(stronger | np.isnan(tight["xi"])) else "xi^2/2 <= V1 (Theorem 1) is not so for this barrier"
 
 
-def dropped(facts: Facts) -> list[Line]:
-    """The size of the terms that the printed proof drops, against the margin that the proof has without them."""
-    law, evidence, case = claims.law_of(facts.run.scenario), facts.evidence, applicable_case(facts)
+def dropped(facts: Facts) -> tuple[list[Line], dict[str, float]]:
+    """The size of the terms that the printed proof drops, against the margin that it leaves, and their largest share of it."""
+    law, evidence, case = claims.law_of(facts.whole.run.scenario), facts.evidence, applicable_case(facts.whole)
     described = (
         ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", evidence.dropped_e2),
         ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", evidence.dropped_f),
     )
     exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(facts))
-    lines = []
+    lines, shares = [], {}
     for (name, equation, statement, term), none_dropped in zip(described, exact, strict=True):
         description: Description = {"name": name, "equation": equation, "statement": statement, "unit": "1/s", "counts": False}
-        reason = facts.no_claim or facts.no_run or none_dropped or ("" if case else why_not(facts, facts.case))
+        reason = facts.whole.no_claim or facts.whole.no_run or none_dropped or ("" if case else why_not(facts.whole, facts.whole.case))
         if reason or case is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
         proven = evidence.dropped_e2 + evidence.dropped_f - left_side(facts, case)
-        tolerance = facts.eps * evidence.terms
+        tolerance = facts.whole.eps * evidence.terms
         free = ~evidence.held
-        share = np.max(np.where(free, term / np.maximum(proven, tolerance), 0.0))
-        note = f"at most {max(100 * share, 0.0):.3g} % of that margin at one instant"
-        largest = float(np.max(np.abs(term[free])))
-        lines.append(judged(facts, proven - term, tolerance, {**description, "value": largest, "note": note}))
-    return lines
+        shares[name] = float(np.max(np.where(free, term / np.maximum(proven, tolerance), 0.0)))
+        largest = float(np.max(np.abs(term[free]), initial=0.0))
+        lines.append(judged(facts, proven - term, tolerance, {**description, "value": largest}))
+    return lines, shares
 
 
 def _exact_observer(facts: Facts) -> str:
-    return "exact: the observer has momentum form" if type(facts.run.scenario.observer).__name__ == "Momentum" else ""
+    return "exact: the observer has momentum form" if type(facts.whole.run.scenario.observer).__name__ == "Momentum" else ""
 
 
 def conclusion(facts: Facts) -> Line:
-    """Properties (I) and (II): every joint inside its bounds, at every sample."""
+    """Properties (I) and (II): every joint inside its bounds, at every step."""
     description: Description = {"name": "joints inside", "equation": "(I), (II)", "statement": "|xi_i| < 1: -k_l < e1 < k_u"}
-    room = 1.0 - np.abs(facts.run.xi)
+    room = 1.0 - np.abs(facts.sample.xi)
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
-    case = applicable_case(facts)
-    line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(facts.run.t[at]))
-    unclaimed = case is not None and _xi_bound(facts.run.scenario, facts.run.t[:1], facts.evidence.V[:1]) is None
+    case = applicable_case(facts.whole)
+    line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(facts.t[at]))
+    line = _as_status(facts.whole, line, Status.BOUND_VIOLATED)
+    unclaimed = case is not None and _xi_bound(facts.whole.run.scenario, facts.t[:1], facts.evidence.V[:1]) is None
     if case is None or unclaimed:
-        reason = NO_BOUND if unclaimed else why_not(facts, facts.case)
+        reason = NO_BOUND if unclaimed else why_not(facts.whole, facts.whole.case)
         note = f"no claim, only seen ({reason})"
         return Line(**{**vars(line), "verdict": NOT_APPLICABLE, "note": note})
     return line

@@ -8,13 +8,16 @@ each perturbation is the unknown, and every one of S attacks, started at random,
 with a rate that falls, all attacks in one batch, gradients by forward mode.  What comes back is the run with the smallest margin that
 was seen, so it is never better news than its own starting points.
 
+What cannot be run is no answer: a start outside its bounds, a mass matrix that is not positive definite, a reference that leaves the
+bounds.  Attacks start at admissible points, and one that steps out goes back towards where it came from.
+
 Source: projected sign-gradient ascent, A. Madry et al., ICLR 2018.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,10 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.certificates.box import admissible_points, none_admissible
 from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.lowering import BACKENDS
-from iblf_jax.paths import with_parameters
+from iblf_jax.paths import get, why_inadmissible, with_parameters
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
@@ -39,6 +43,8 @@ from iblf_jax.tuning.tangents import by_coordinates
 
 FIRST_RATE, LAST_RATE = 0.5, 0.02
 """Steps in u, from the first to the last."""
+HALVINGS = 8
+"""How often a step that leads out of what is admissible is halved before the attack stays where it is."""
 SMOOTHING = 1e-3
 """rad.  Of the smallest margin over time and joints."""
 
@@ -77,7 +83,7 @@ class Attack:
     status: int
     """Flags of `Status` of that run."""
     history: np.ndarray
-    """Margin of every attack at every step, (iterations + 1, starts) [rad]."""
+    """Margin of every attack at every step, (iterations + 1, starts) [rad]; NaN where the reference left the bounds."""
     runs: int
     """Rollouts with derivatives that were made."""
     timing: dict[str, Any]
@@ -131,7 +137,7 @@ def falsify(
       An `Attack`: the worst run found, and whether it left its bounds.  Not to have found one proves nothing.
 
     Raises:
-      ValueError: a set without bounds (a normal distribution), or bad arguments.
+      ValueError: a set without bounds (a normal distribution), sets in which nothing admissible was found, or bad arguments.
 
     Source: head of this module.
     """
@@ -148,23 +154,50 @@ def falsify(
     cases = Cases(scenario, by_path, jax.random.key(0))
     sizes = _Sizes(tuple(sample_size(targets, by_path).items()))
     push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method, backend=backend)
-    u, best, history = np.random.default_rng([check_seed(seed), 3]).uniform(size=(starts, sizes.total)), None, []
+    made = jax.jit(partial(_made, cases, targets, sizes))
+
+    def refused(point: np.ndarray) -> str:
+        return why_inadmissible(scenario, made(jnp.asarray(point, dtype)))
+
+    ranges = {target.path: by_path[target.path].range(np.asarray(get(scenario, target.path))) for target in targets}
+    seed = check_seed(seed)
+    u = admissible_points("sets", ranges, starts, sizes.total, [seed, 3], refused)
+    sound, ever, best, history = u.copy(), np.zeros(starts, bool), None, []
     with bar(progress, iterations + 1, unit="steps") as shown:
         for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
             margin, slope, status = (np.asarray(x) for x in push(cases, step, jnp.asarray(u, dtype)))
-            history.append(margin)
-            s = int(np.argmin(margin))
-            if best is None or margin[s] < best[0]:
+            fine = np.isfinite(margin) & (status & int(Status.INFEASIBLE_REFERENCE) == 0)
+            history.append(np.where(fine, margin, np.nan))
+            s = int(np.argmin(np.where(fine, margin, np.inf)))
+            if fine[s] and (best is None or margin[s] < best[0]):
                 best = (float(margin[s]), u[s].copy(), int(status[s]))
             if rate is not None:
-                u = np.clip(u - rate * np.sign(np.where(np.isfinite(slope), slope, 0.0)), 0.0, 1.0)
+                stepped = np.clip(u - rate * np.sign(np.where(np.isfinite(slope), slope, 0.0)), 0.0, 1.0)
+                ahead = np.where(fine[:, None], stepped, 0.5 * (u + sound))
+                sound, ever = np.where(fine[:, None], u, sound), ever | fine
+                if not ever.all():  # an attack that has nowhere to go back to starts somewhere else
+                    anew = admissible_points("sets", ranges, starts, sizes.total, [seed, 3, len(history)], refused)
+                    sound, ahead = (np.where(ever[:, None], x, anew) for x in (sound, ahead))
+                u = np.stack([_back(refused, *pair) for pair in zip(sound, ahead, strict=True)])
             shown.update(1)
-            shown.set_postfix_str(f"margin {best[0]:.4g} rad")
-    assert best is not None
-    values = {path: np.asarray(x) for path, x in _made(cases, targets, sizes, jnp.asarray(best[1], dtype)).items()}
+            shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} rad")
+    if best is None:
+        mend = "Its reference leaves the bounds in every run that was tried (Assumption 2): narrow the sets, or widen the bounds."
+        raise none_admissible("sets", ranges, mend)
+    values = {path: np.asarray(x) for path, x in made(jnp.asarray(best[1], dtype)).items()}
     timing = {"duration": duration, "dt": dt, "method": method}
     worst = with_parameters(scenario, values)
-    return Attack(worst, values, best[0], float(history[0].min()), best[2], np.stack(history), starts * (iterations + 1), timing)
+    first = next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row)))
+    return Attack(worst, values, best[0], first, best[2], np.stack(history), starts * (iterations + 1), timing)
+
+
+def _back(refused: Callable[[np.ndarray], str], sound: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """`ahead`, or the first of the points halfway back to `sound` that is admissible."""
+    for _ in range(HALVINGS):
+        if not refused(ahead):
+            return ahead
+        ahead = 0.5 * (sound + ahead)
+    return sound
 
 
 def _check_bounded(scenario: Scenario, targets: tuple[Target, ...], by_path) -> None:
