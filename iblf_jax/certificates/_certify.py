@@ -56,6 +56,7 @@ def certify(
         raise checks.fail("scenario", "traced values", "numbers", "certify works on the host: call it outside jit, vmap and grad.")
     if run is None:
         run = simulate(scenario, duration=duration, dt=dt, method=method)
+    worst = None if worst is None else checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
         if run.is_batch:
             _check_same_kind(scenario, run)
@@ -82,8 +83,6 @@ def _check_same(scenario: Scenario, run: Rollout) -> None:
 
 def _worst_of(study: Any, worst: int | None) -> list[int]:
     """The runs of a study that came nearest to their bounds, the nearest first."""
-    if worst is not None:
-        worst = checks.positive_integer("worst", worst)
     count = len(study)
     if worst is None or worst >= count:
         return list(range(count))

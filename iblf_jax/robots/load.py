@@ -51,6 +51,8 @@ def load(
 
     Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
     """
+    base, tip = (None if x is None else checks.word(what, x, "the name of a link") for what, x in (("base", base), ("tip", tip)))
+    locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
     root = description.read(path)
     mimics: dict[str, urdf.Mimic] = {}
     if root.tag == "robot":
@@ -59,7 +61,7 @@ def load(
         mimics = description_.mimics
     else:
         tree = Tree.compiled(mjcf.checked(root), str(path), root="world")
-    return _Chain.picked(tree, base, tip, dict(locked or {}), mimics).arm(gravity)
+    return _Chain.picked(tree, base, tip, dict(locked), mimics).arm(gravity)
 
 
 class _Chain(NamedTuple):

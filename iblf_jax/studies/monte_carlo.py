@@ -17,8 +17,8 @@ from iblf_jax import checks, distributed
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario
-from iblf_jax.studies.blocks import MEMORY, Results, block_size, run_blocks
-from iblf_jax.studies.designs import check_sampler
+from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
+from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.setup import prepare
 from iblf_jax.studies.study import Study
@@ -76,7 +76,8 @@ def monte_carlo(
 
     Source: design of this package.
     """
-    runs, chunk = checks.positive_integer("runs", runs), None if chunk is None else checks.positive_integer("chunk", chunk)
+    how = checked_how(chunk, memory, devices)
+    runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
     replicates = check_sampler(sampler, runs, replicates)
     if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail(
@@ -84,11 +85,12 @@ def monte_carlo(
         )
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
     setup = prepare(scenario, perturbations, runs, seed, metrics=metrics, backend=backend, sampler=sampler, replicates=replicates, **timing)
+    checks.fits("runs", runs, setup.bytes_a_case)
     results, blocks = None, range(-(-runs // block_size()))
     mine = distributed.share(blocks) or [0]
     begin = time.monotonic()
     with bar(progress, min(runs, len(mine) * block_size())) as shown:
-        for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, chunk=chunk, memory=memory, devices=devices):
+        for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, **how):
             results = _stored(results, part, block, runs)
             shown.update(min(block_size(), runs - block * block_size()))
     results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))

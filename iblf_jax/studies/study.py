@@ -271,7 +271,7 @@ class Study:
         Source: design of this package.
         """
         i = self._index(index)
-        record_every = checks.positive_integer("record_every", record_every)
+        record_every = checks.recorded_every(record_every, self.setup.program.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
             raise checks.fail(f"run {i}", drawn, "admissible draws", "It was not made; see study.made.")

@@ -75,7 +75,7 @@ class Integral:
     """sum_k dt |y(t_k)|^2 over the samples with t >= after."""
 
     signal: str = static(default="error")
-    joints: jax.Array = leaf("1", shape="any", default=1.0)
+    joints: jax.Array = leaf("1", default=1.0)
     """Weight of each joint."""
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     tolerance: jax.Array | None = leaf("rad", sign="positive", shape="scalar", default=None)
@@ -122,7 +122,7 @@ class Peak:
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
     """The size of y that matters, in its unit."""
     signal: str = static(default="torque")
-    joints: jax.Array = leaf("1", shape="any", default=1.0)
+    joints: jax.Array = leaf("1", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     smoothing: jax.Array = leaf("1", sign="positive", shape="scalar", default=0.01)
     units: ClassVar[dict[str, str]] = {name: unit for name, unit in SIGNALS.items() if name != "outside"}
