@@ -229,7 +229,7 @@ def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None 
 
 def fits(name: str, count: int, bytes_each: float, mend: str = "") -> None:
     """Raises if `count` things of that size are more than this machine's memory holds; says how many it does."""
-    most = int(memory() // max(1.0, bytes_each))
+    most = int(memory() // max(1, bytes_each))
     if count > most:
         raise fail(name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", mend)
 
@@ -287,14 +287,14 @@ def file_path(name: str, value: Any, what: str = "a file") -> Path:
     try:
         text = os.fspath(value)
         if not isinstance(text, str) or not text or "\0" in text:
-            raise fail(name, value, expected)
+            raise fail(name, value, expected, "Nothing is there." if not text else "")
         os.lstat(text)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         pass
     except (TypeError, UnicodeError):
         raise fail(name, value, expected) from None
     except OSError as error:
-        if error.errno not in (errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP):
+        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
             raise
         raise fail(name, text, expected, f"{error.strerror}.") from None
     return Path(text)

@@ -162,7 +162,7 @@ def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None
 def _with_units(text: str, units: Mapping[str, str]) -> str:
     """The text with the unit of each number behind it, as a comment."""
     lines, prefix, counts = [], "", dict[str, int]()
-    for line in text.splitlines():
+    for line in text.removesuffix("\n").split("\n"):  # and at no other character that is a line break to Unicode
         if header := re.fullmatch(r"(\[\[?)([\w.]+)\]\]?", line):
             prefix, names = "", header[2].split(".")
             for depth, name in enumerate(names):

@@ -79,7 +79,7 @@ def sweep(
     Args:
       scenario: what to run, of n joints.
       grid: path -> values for a grid: numbers, or arrays for a vector leaf; a number fills every entry.  Path -> distribution (or
-        `factor`, `offset` of one) for the other designs.  Empty for one point.
+        `factor`, `offset` of one) for the other designs.  Empty for one point, the scenario itself, with perturbed runs.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s].
       perturbations: path -> `factor`, `offset` or `value` of a distribution, around the values of each point.
@@ -116,6 +116,8 @@ def sweep(
     checks.mapping("perturbations", perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
     if not perturbations and runs > 1:
         raise checks.fail("runs", runs, "1 without perturbations", "Without any all runs at a point are the same.")
+    if not perturbations and isinstance(grid, Mapping) and not grid:
+        raise checks.fail("grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate.")
     unit = None if unit is None else checks.positive_integer("unit", unit)
     store = None if store is None else checks.file_path("store", store, "a folder")
     where = make_points(canonical(scenario), grid, design, points, check_seed(seed))

@@ -140,7 +140,7 @@ def falsify(
     checks.one_of("backend", backend, BACKENDS)
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
-    checks.fits("iterations", iterations, 8.0 * starts)
+    checks.fits("iterations", iterations, 8 * starts)
     targets, by_path = plan(scenario, sets, "sets")
     if not targets:
         raise checks.fail("sets", sets, "at least one set", "Say what may vary, and between which limits.")

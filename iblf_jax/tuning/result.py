@@ -149,7 +149,7 @@ class TuneResult:
         for name in (first, second):
             checks.one_of("landscape: name", name, self.names)
         points, span = checks.positive_integer("points", points), checks.positive_number("span", span, "1")
-        checks.fits("points", points, 8.0 * points * NUMBERS_A_RUN)
+        checks.fits("points", points, 8 * points * NUMBERS_A_RUN)
         factor = np.exp(np.linspace(-span, span, points))
         a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
         changes = {first: np.repeat(a, points), second: np.tile(b, points)}
