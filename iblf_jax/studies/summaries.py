@@ -61,7 +61,7 @@ def correlations(study: Study, metrics: Sequence[str] | None, exclude_failed: bo
     import xarray
 
     used, said = study.chosen(exclude_failed)
-    names = list(study.metrics) if metrics is None else list(metrics)
+    names = list(study.metrics) if metrics is None else checks.listed("metrics", metrics, '["margin", "rmse"]')
     drawn = statistics.columns(study.samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
