@@ -78,6 +78,7 @@ def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exc
     import xarray
 
     levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
+    exclude_failed = checks.flag("exclude_failed", exclude_failed)
     count = min(checks.positive_integer("runs", runs), study.runs)
     record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
     parts, times = [], np.zeros(0)
