@@ -28,7 +28,7 @@ from iblf_jax import bounds as bounds_
 from iblf_jax import checks, disturbances, references
 from iblf_jax.bounds import Bounds
 from iblf_jax.codec import decode_fields
-from iblf_jax.controllers import Controller, PDGravity, law_by_name, within_effort
+from iblf_jax.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import Momentum, Printed
@@ -68,7 +68,13 @@ def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST
       rate: [1/s].
       least: smallest entry [N m s/rad].
     """
-    return jnp.maximum(rate * _diagonal(robot, jnp.asarray(q, jnp.result_type(float))), least)
+    checks.conforms("robot", robot, Robot)
+    given = {name: checks.as_floats(name, x) for name, x in (("q", q), ("rate", rate), ("least", least))}
+    checks.shape_is("q", given["q"], (robot.n,))
+    for name in ("rate", "least"):
+        if given[name].shape not in ((), (robot.n,)):
+            raise checks.fail(name, given[name], f"one number, or {robot.n} (one a joint)")
+    return jnp.maximum(given["rate"] * _diagonal(robot, given["q"].astype(jnp.result_type(float))), given["least"])
 
 
 @jax.jit
@@ -108,9 +114,12 @@ def arm_scenario(
 
     Source: this package.
     """
+    checks.one_of("law", law, LAWS)
     checks.one_of("reading", reading, ("printed", "corrected"))
+    checks.conforms("robot", robot, Robot)
+    checks.conforms("reference", reference, Reference)
     start = reference.position(jnp.zeros(()))
-    K2 = inertial_gain(model or robot, start)
+    K2 = inertial_gain(robot if model is None else model, jnp.broadcast_to(start, (robot.n,)) if jnp.ndim(start) == 0 else start)
     if law == "pd":  # its gains by name are for one size of joint
         controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)
     else:

@@ -10,7 +10,7 @@ and with their rates, all taken here, once, by automatic differentiation: `tube_
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -109,6 +109,15 @@ class Bounds:
             checks.conforms(f"Bounds.{name}", getattr(self, name), Side, "A constant bound is iblf_jax.bounds.Constant(value).")
 
 
+def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
+    """One number, or one a joint, from a user's argument."""
+    array = checks.as_floats(name, value)
+    checks.check_values(name, array, sign)
+    if array.shape not in ((), (n,)):
+        raise checks.fail(name, value, f"one number, or {n} (one a joint)")
+    return array
+
+
 def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = None) -> Bounds:
     """Constant bounds at a robot's joint limits.
 
@@ -124,12 +133,15 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
     """
     if not hasattr(robot, "limits"):
         raise checks.fail("robot", type(robot).__name__, "a robot with joint limits, such as an Arm", "Give bounds of your own.")
+    kept, far = (
+        _distance("margin", margin, robot.n, None),
+        0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive"),
+    )
     sides = []
     for side, sign in zip(robot.limits, (1.0, -1.0), strict=True):
         if checks.is_concrete(side) and not np.all(np.isfinite(side)) and unlimited is None:
             raise checks.fail("robot.limits", side, "limits on every joint", "Say what to use where there are none: unlimited=6.3.")
-        far = -sign * (unlimited if unlimited is not None else 0.0)
-        sides.append(jnp.where(jnp.isfinite(side), side + sign * margin, far))
+        sides.append(jnp.where(jnp.isfinite(side), side + sign * kept, -sign * far))
     lower, upper = sides
     if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
         raise checks.fail(

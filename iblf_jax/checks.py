@@ -7,8 +7,12 @@ points work under `jit`, `vmap` and `grad`.  What can only be known inside a run
 from __future__ import annotations
 
 import dataclasses
+import errno
 import numbers
-from collections.abc import Hashable
+import os
+import re
+from collections.abc import Hashable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,29 +25,80 @@ MOST_STEPS = 2**31 - 1
 LIMITS = ("limit", "positive limit")
 """Signs of leaves that may be infinite."""
 
+LONGEST = {"field": 200, "value": 160, "words": 800}
+"""Characters of an error message's parts: what a user typed may be of any length."""
+
+DEEPEST = 32
+"""Lists inside each other that can be an array."""
+
 
 def is_concrete(value: Any) -> bool:
     """Whether every leaf of `value` is a number now, rather than a tracer or a placeholder."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
+    if is_deep(value):
+        return True
+    try:
+        leaves = jax.tree.leaves(value)
+    except Exception:  # a dict whose keys have no order: nothing that is traced
+        return True
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+
+
+def is_deep(value: Any) -> bool:
+    """Whether lists, tuples and dicts are inside each other deeper than any array or file of this package is.
+
+    JAX must not see such a thing: it recurses, and the interpreter's count of levels is wrong ever after.
+    """
+    level = [value]
+    for _ in range(DEEPEST):
+        parts = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, list | tuple | dict))
+        level = list({id(x): x for part in parts for x in part if isinstance(x, list | tuple | dict)}.values())
+        if not level:
+            return False
+    return True
+
+
+def flat_enough(name: str, value: Any) -> None:
+    """Raises for lists, tuples and dicts inside each other that JAX must not see."""
+    if is_deep(value):
+        raise fail(name, value, f"at most {DEEPEST} lists inside each other")
+
+
+def line(text: str, part: str = "words") -> str:
+    """Text as one line of a message: cut, and without characters that would break the line or cannot be printed."""
+    most = LONGEST[part]
+    text = re.sub(r"\s*\n\s*", " ", text[: 4 * most])
+    text = "".join(x if x.isprintable() else ascii(x)[1:-1] for x in text)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def shown(value: Any) -> str:
+    """A value as an error message quotes it."""
+    if not is_concrete(value):
+        return "a value that JAX is tracing"
+    try:
+        if isinstance(value, jax.Array | np.ndarray):
+            text = np.array2string(np.asarray(value), precision=6, threshold=8)
+        else:
+            text = repr(value.item() if isinstance(value, np.generic) else value)
+    except Exception:  # an integer of thousands of digits, a key, lists nested thousands deep, a class whose repr is broken
+        text = f"an object of class {type(value).__name__}"
+    return line(text, "value")
 
 
 def fail(field: str, got: Any, expected: str, mend: str = "") -> ValueError:
-    """The one form of error message: field, value, expectation and mend."""
-    if not is_concrete(got):
-        shown = "a value that JAX is tracing"
-    elif isinstance(got, jax.Array | np.ndarray):
-        shown = np.array2string(np.asarray(got), precision=6, threshold=8)
-    else:
-        shown = repr(got.item() if isinstance(got, np.generic) else got)
-    if len(shown) > 160:
-        shown = shown[:157] + "..."
-    return ValueError(f"{field}: got {shown}, expected {expected}." + (f" {mend}" if mend else ""))
+    """The one form of error message: field, value, expectation and mend, in one line."""
+    return ValueError(f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}." + (f" {line(mend)}" if mend else ""))
 
 
-def _is_number_like(value: Any) -> bool:
+def inside(where: str | os.PathLike, error: Exception) -> ValueError:
+    """An error in a file, or in a part of one: the same with a name in front."""
+    return ValueError(f"{line(os.fspath(where), 'field')}: {error}" if where else str(error))
+
+
+def _is_number_like(value: Any, depth: int = 0) -> bool:
     if isinstance(value, numbers.Number | np.ndarray | np.generic | jax.Array):
         return True
-    return isinstance(value, list | tuple) and all(_is_number_like(x) for x in value)
+    return isinstance(value, list | tuple) and depth < DEEPEST and all(_is_number_like(x, depth + 1) for x in value)
 
 
 def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
@@ -76,9 +131,10 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
 
 def as_floats(name: str, value: Any) -> jax.Array:
     """An array of floating-point numbers, or a ValueError that names the field."""
+    flat_enough(name, value)
     try:
         array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError) as error:
+    except Exception as error:  # whatever NumPy and JAX make of it: too large, ragged, nested too deep, no numbers
         raise fail(name, value, "numbers in a rectangular array") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array
@@ -110,7 +166,7 @@ def structural(owner: str, name: str, value: Any) -> None:
         )
     try:
         hash(value)
-    except TypeError as error:
+    except Exception as error:
         raise fail(f"{owner}.{name}", value, "a hashable value", "Give a tuple in place of a list.") from error
 
 
@@ -140,32 +196,128 @@ def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:
         raise fail(name, array, f"shape {shape}", f"Its shape is {jnp.shape(array)}.")
 
 
-def positive_number(name: str, value: Any, unit: str) -> float:
-    """A finite positive Python float from a user's argument, or a ValueError."""
+def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> float:
+    """A finite positive Python float (or 0, if that may be) from a user's argument, or a ValueError."""
+    expected = f"a {'number >= 0' if zero else 'positive number'} [{unit}]"
     if isinstance(value, jax.core.Tracer):
         mend = "It decides how many steps are compiled: use a Python number, or static_argnames in your jit."
-        raise fail(name, value, f"a positive number [{unit}]", mend)
+        raise fail(name, value, expected, mend)
     array_like = isinstance(value, np.generic | np.ndarray | jax.Array)
     if isinstance(value, bool) or not (array_like or isinstance(value, numbers.Real)):
-        raise fail(name, value, f"a positive number [{unit}]")
-    if array_like and (value.ndim != 0 or value.dtype.kind not in "fiu"):
-        raise fail(name, value, f"a positive number [{unit}]")
+        raise fail(name, value, expected)
+    if array_like and (value.ndim != 0 or not jnp.issubdtype(value.dtype, np.number) or jnp.iscomplexobj(value)):
+        raise fail(name, value, expected)
     try:
         number = float(value)
     except OverflowError:
         number = float("inf")
-    if not np.isfinite(number) or number <= 0:
-        raise fail(name, value, f"a positive number [{unit}]")
+    if not np.isfinite(number) or number < 0 or (number == 0 and not zero):
+        raise fail(name, value, expected)
     return number
 
 
-def positive_integer(name: str, value: Any) -> int:
-    """A positive Python int from a user's argument, or a ValueError."""
+def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """A Python int from `least` on, at most `most`, from a user's argument, or a ValueError."""
+    expected = f"a whole number >= {least}" + (f" and <= {most}" if most is not None else "")
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
-        raise fail(name, value, "a whole number >= 1")
-    if value < 1:
-        raise fail(name, value, "a whole number >= 1")
-    return int(value)
+        raise fail(name, value, expected)
+    number = int(value)
+    if number < least or (most is not None and number > most):
+        raise fail(name, value, expected)
+    return number
+
+
+def fits(name: str, count: int, bytes_each: float, mend: str = "") -> None:
+    """Raises if `count` things of that size are more than this machine's memory holds; says how many it does."""
+    most = int(memory() // max(1, bytes_each))
+    if count > most:
+        raise fail(name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", mend)
+
+
+def memory() -> int:
+    """Bytes of this machine's memory; 16 GiB where the system does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 16 * 2**30
+
+
+def flag(name: str, value: Any, optional: bool = False) -> Any:
+    """True or False (or None, if that may be) from a user's argument, or a ValueError."""
+    if value is None and optional:
+        return None
+    if not isinstance(value, bool | np.bool_):
+        raise fail(name, value, "True or False" + (" or None" if optional else ""))
+    return bool(value)
+
+
+def word(name: str, value: Any, what: str) -> str:
+    """A string from a user's argument, or a ValueError."""
+    if not isinstance(value, str):
+        raise fail(name, value, what)
+    return value
+
+
+def mapping(name: str, value: Any, example: str) -> Mapping[str, Any]:
+    """`value` if it is a mapping from words, else a ValueError."""
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise fail(name, value, f"a mapping from words such as {example}")
+    return value
+
+
+def listed(name: str, value: Any, example: str) -> list[Any]:
+    """The entries of a list or tuple that has some, else a ValueError."""
+    if not isinstance(value, list | tuple) or not value:
+        raise fail(name, value, f"a list such as {example}")
+    return list(value)
+
+
+def devices(name: str, value: Any) -> list[jax.Device]:
+    """A user's devices, all of this process if there are none given, or a ValueError."""
+    if value is None:
+        return list(jax.local_devices())
+    if not isinstance(value, list | tuple) or not value or not all(isinstance(x, jax.Device) for x in value):
+        raise fail(name, value, "a list of at least one device", "jax.devices() lists them; leave it out for all of them.")
+    return list(value)
+
+
+def file_path(name: str, value: Any, what: str = "a file") -> Path:
+    """A path from a user's argument that this system can spell, or a ValueError.  Nothing need be there."""
+    expected = f"the path of {what}"
+    try:
+        text = os.fspath(value)
+        if not isinstance(text, str) or not text or "\0" in text:
+            raise fail(name, value, expected, "Nothing is there." if not text else "")
+        os.lstat(text)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (TypeError, UnicodeError):
+        raise fail(name, value, expected) from None
+    except OSError as error:
+        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise
+        raise fail(name, text, expected, f"{error.strerror}.") from None
+    return Path(text)
+
+
+def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
+    """The path of a file that is there, or a ValueError; FileNotFoundError where nothing is."""
+    path = file_path(name, value, what)
+    if not path.exists():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    if not path.is_file():
+        raise fail(name, str(path), f"the path of {what}", "It is a folder." if path.is_dir() else "It is not a file.")
+    return path
+
+
+def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
+    """A path where a file can be written, or a ValueError; FileNotFoundError where its folder is not there."""
+    path = file_path(name, value, what)
+    if path.is_dir():
+        raise fail(name, str(path), f"the path of {what}", "It is a folder.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    return path
 
 
 def whole_steps(duration: Any, dt: Any) -> int:
@@ -182,3 +334,8 @@ def whole_steps(duration: Any, dt: Any) -> int:
             "duration", duration, f"a whole number of steps dt = {dt:g} s", f"Take duration={near * dt:.12g} or dt={duration / near:.12g}."
         )
     return steps
+
+
+def recorded_every(value: Any, steps: int) -> int:
+    """Every how many steps to record, as the compiled loops count it: in int32, and past the last step is as good as any further."""
+    return min(positive_integer("record_every", value), steps + 1, MOST_STEPS)

@@ -268,7 +268,7 @@ def choice(values: Any, weights: Any = None) -> Choice:
     Raises:
       ValueError: an empty list, or weights that do not fit it.
     """
-    return Choice(values, jnp.ones(np.shape(values)) if weights is None else weights)
+    return Choice(values, jnp.ones(checks.as_floats("choice: values", values).shape) if weights is None else weights)
 
 
 def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:

@@ -100,7 +100,7 @@ def save_rollouts(path: str | os.PathLike, runs: Mapping[str, Rollout] | Rollout
       ValueError: another ending, no runs, a bad name, or something that is not a Rollout.
       OSError: the file cannot be written.
     """
-    ending = _ending(path)
+    ending = _ending(checks.file_to_write("path", path, "a file that ends in .nc or .npz"))
     runs = {"run": runs} if isinstance(runs, Rollout) else runs
     if not isinstance(runs, Mapping) or not runs:
         raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
@@ -121,13 +121,14 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
       ValueError: another ending, or a file that `save_rollouts` did not write.
       OSError: the file cannot be read.
     """
-    read = _read_netcdf if _ending(path) == ".nc" else _read_npz
-    with open(path, "rb"):  # a missing or locked file is an OSError, whatever the reader would make of it
+    place = checks.file_path("path", path, "a file that ends in .nc or .npz")
+    read = _read_netcdf if _ending(place) == ".nc" else _read_npz
+    with open(checks.file_to_read("path", place), "rb"):  # a locked file is an OSError, whatever the reader would make of it
         pass
     try:
-        return read(path)
+        return read(place)
     except Exception as error:
-        raise checks.fail(f"{os.fspath(path)}", type(error).__name__, "a file written by save_rollouts", str(error)) from error
+        raise checks.fail(str(place), type(error).__name__, "a file written by save_rollouts", str(error)) from error
 
 
 # ------------------------------------------------------------------------------------------------------------ the Dataset
@@ -226,10 +227,10 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
 # ------------------------------------------------------------------------------------------------------------------ files
 
 
-def _ending(path: str | os.PathLike) -> str:
-    ending = Path(path).suffix.lower()
+def _ending(path: Path) -> str:
+    ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise checks.fail("path", os.fspath(path), "a file that ends in .nc (netCDF) or .npz (NumPy)")
+        raise checks.fail("path", str(path), "a file that ends in .nc (netCDF) or .npz (NumPy)")
     return ending
 
 

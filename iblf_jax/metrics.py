@@ -19,6 +19,7 @@ from iblf_jax import checks
 from iblf_jax.accuracy import UNITS
 from iblf_jax.closed_loop import Sample
 from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.scenario import fit_joints
 
 
 class Fold(Protocol):
@@ -275,8 +276,8 @@ class Estimation:
         return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
 
 
-def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike) -> tuple[Fold, ...]:
-    """The folds that a user asked for (None: the standard ones), checked, their numbers in one floating-point type.
+def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int | None = None) -> tuple[Fold, ...]:
+    """The folds that a user asked for (None: the standard ones), checked (for n joints), their numbers in one floating-point type.
 
     Raises:
       ValueError: something that is not a fold, or two folds that return the same name.
@@ -288,6 +289,8 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike) -> tup
     owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
     for i, fold in enumerate(metrics):
         checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
+        if n is not None:
+            fit_joints(fold, n, f"metrics[{i}]")
         for name in fold.units:
             if name in owner:
                 raise checks.fail(f"metrics[{i}]", fold, "names that no other fold returns", f"{owner[name]} returns {name!r} too.")

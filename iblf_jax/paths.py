@@ -2,8 +2,8 @@
 
 Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow the fields of the components;
 `[i]` selects a part of a `Sum` or one entry of an array.  A component with rows that have names (class attribute `rows`, such as
-`robots.Arm`) can be addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names (and a
-name without a letter cannot be told from a number: use that).
+`robots.Arm`) can be addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names.
+A name without a letter, or with a bracket, a line break or the like, is written as a JSON string: 'plant.link["a]b"].mass'.
 `robot.` stands for `plant.` and `model.` together: use it to change the robot that is simulated and the one that the law knows alike.
 A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is looked through: "controller.K2" is the
 wrapped law's K2, and "controller.law.K2" works too.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import re
 import warnings
 from collections.abc import Iterator, Mapping
@@ -25,7 +26,9 @@ import numpy as np
 from iblf_jax import checks
 from iblf_jax.scenario import Scenario, canonical
 
-_TOKEN = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+)\]|\[([^\[\]]*[^\W\d_][^\[\]]*)\]")
+_BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
+"""The name of a row that needs no quotes."""
+_TOKEN = re.compile(rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({_BARE})\]""")
 
 
 class Row(str):
@@ -76,7 +79,7 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
       A tuple of `Parameter`, which prints as a table.
     """
     _need_component(scenario)
-    return ParameterTable(_walk(scenario, "", named))
+    return ParameterTable(_walk(scenario, "", checks.flag("named", named)))
 
 
 def _need_component(scenario: Any) -> None:
@@ -116,7 +119,21 @@ def _rows(part: Any, path: str) -> Iterator[Parameter]:
             for field in fields:
                 value = getattr(part, field)
                 row = value[..., i] if jnp.ndim(value) == 1 else value[i]
-                yield Parameter(f"{path}.{word}[{name}].{field}" if path else f"{word}[{name}].{field}", jnp.shape(row), units[field], row)
+                place = f"{word}[{_quoted(name)}].{field}"
+                yield Parameter(f"{path}.{place}" if path else place, jnp.shape(row), units[field], row)
+
+
+def _quoted(name: str) -> str:
+    """The name of a row as a path spells it."""
+    return name if re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"') else json.dumps(name)
+
+
+def _unquoted(text: str) -> str | None:
+    """The name that a JSON string spells; None if it is none."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None
 
 
 def parse(path: str) -> list[str | int]:
@@ -127,7 +144,10 @@ def parse(path: str) -> list[str | int]:
         match = _TOKEN.match(path, position)
         if match is None or (position == 0) == path[position].startswith((".", "[")):
             break
-        tokens.append(match[1] if match[1] is not None else int(match[2]) if match[2] is not None else Row(match[3]))
+        name = match[4] if match[3] is None else _unquoted(match[3])
+        if match[1] is None and match[2] is None and name is None:
+            break
+        tokens.append(match[1] if match[1] is not None else int(match[2]) if match[2] is not None else Row(name))
         position = match.end()
     if not isinstance(path, str) or not path or position < len(path):
         raise checks.fail("path", path, 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"')

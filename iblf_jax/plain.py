@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import tomllib
 import types
 import typing
 from collections.abc import Iterable
@@ -27,6 +28,23 @@ class Words(str):
 
     def __repr__(self) -> str:
         return str(self)
+
+
+def toml_tables(text: str) -> dict[str, Any]:
+    """The tables of a text in TOML.
+
+    Raises:
+      tomllib.TOMLDecodeError: it is none.
+      ValueError: it is nested deeper than any file of this package is.
+    """
+    problem = f"more than {checks.DEEPEST} tables and lists inside each other"
+    try:
+        tables = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(problem) from None
+    if checks.is_deep(tables):
+        raise ValueError(problem)
+    return tables
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
@@ -100,6 +118,8 @@ def plain_static(value: Any, path: str) -> Any:
         value = value.item()
     if isinstance(value, tuple):
         return [plain_static(x, f"{path}[{i}]") for i, x in enumerate(value)]
+    if isinstance(value, str) and any("\ud800" <= x <= "\udfff" for x in value):
+        raise checks.fail(path, value, "text without halves of surrogate pairs", "A scenario file cannot hold it.")
     if isinstance(value, bool | str | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
     raise checks.fail(path, value, "a finite number, a string, a bool or a tuple of these", "A scenario file cannot hold it.")

@@ -53,7 +53,12 @@ def component(cls: type[T]) -> type[T]:
 
     A class may define `check(self)`, called once after construction, to raise ValueError when fields do not fit together.
     """
-    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    if not isinstance(cls, type):
+        raise checks.fail("component", cls, "a class", "Write @iblf_jax.component above it.")
+    try:
+        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    except (TypeError, ValueError) as error:
+        raise checks.fail("component", cls, "a class of annotated fields, those with defaults last", f"{error}.") from error
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     children = tuple(f.name for f in fields if not f.metadata.get("static"))
     structure = tuple(f.name for f in fields if f.metadata.get("static"))
@@ -114,14 +119,15 @@ def astype(tree: T, dtype: jax.typing.DTypeLike) -> T:
     """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`.
 
     Raises:
-      ValueError: a type that is not a floating-point one.
+      ValueError: a type that is not a floating-point one, or something in the component that is no number.
     """
     import jax.numpy as jnp
 
     try:
-        floating = jnp.issubdtype(dtype, jnp.floating)
-    except TypeError:
+        floating = jnp.issubdtype(jnp.zeros((), dtype).dtype, jnp.floating)
+    except Exception:  # whatever NumPy makes of it
         floating = False
     if not floating:
         raise checks.fail("dtype", dtype, 'a floating-point type, such as "float32"')
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
+    checks.flat_enough("tree", tree)
+    return jax.tree.map(lambda x: checks.as_floats("tree", x).astype(dtype), tree)

@@ -90,13 +90,13 @@ def simulate(
     tableau(method)
     checks.one_of("backend", backend, SINGLE_RUN_BACKENDS)
     steps = checks.whole_steps(duration, dt)
-    record_every = checks.positive_integer("record_every", record_every)
+    record_every, throw = checks.recorded_every(record_every, steps), checks.flag("throw", throw)
     if steps // record_every > MOST_SAMPLES:
         mend = f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all the same."
         raise checks.fail("record_every", record_every, f"at most {MOST_SAMPLES} recorded samples of {steps} steps", mend)
     scenario = canonical(scenario)
     dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype)
+    folds = as_folds(metrics, dtype, scenario.n)
     step_size = jnp.asarray(dt, dtype)
     result = trajectory(scenario, folds, step_size, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:

@@ -27,7 +27,6 @@ import dataclasses
 import inspect
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +39,7 @@ from iblf_jax import checks
 from iblf_jax.codec import construct, decode_fields, encode_fields, field_hints
 from iblf_jax.integrators import TABLEAUS
 from iblf_jax.paths import parameters, with_parameters
-from iblf_jax.plain import Words, as_table, decode_static, did_you_mean, known_keys, numbers
+from iblf_jax.plain import Words, as_table, decode_static, did_you_mean, known_keys, numbers, toml_tables
 from iblf_jax.presets import PRESETS
 from iblf_jax.pytree import astype
 from iblf_jax.robot_file import names_a_file, with_robots_read
@@ -71,7 +70,7 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike, *, run: Mapping[s
       ValueError: the scenario holds a class that is in no MEMBERS, a NaN, or a batch.
       OSError: the file cannot be written.
     """
-    Path(path).write_text(scenario_to_toml(scenario, run=run), encoding="utf-8")
+    checks.file_to_write("path", path).write_text(scenario_to_toml(scenario, run=run), encoding="utf-8")
 
 
 def load_scenario(path: str | os.PathLike) -> Scenario:
@@ -89,16 +88,17 @@ def load_scenario(path: str | os.PathLike) -> Scenario:
 
 def load_scenario_file(path: str | os.PathLike) -> ScenarioFile:
     """Scenario and [run] table of a TOML file; raises as `load_scenario`."""
-    return from_dict(read_toml(path), source=os.fspath(path), folder=Path(path).parent)
+    data = read_toml(path)
+    return from_dict(data, source=os.fspath(path), folder=Path(path).parent)
 
 
 def read_toml(path: str | os.PathLike) -> dict[str, Any]:
     """The tables of a TOML file, unchecked; ValueError if it is not TOML, OSError if it cannot be read."""
-    content = Path(path).read_bytes()
+    content = checks.file_to_read("path", path, "a TOML file").read_bytes()
     try:
-        return tomllib.loads(content.decode("utf-8"))
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
-        raise ValueError(f"{os.fspath(path)}: not a TOML file: {error}") from error
+        return toml_tables(content.decode("utf-8"))
+    except ValueError as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
+        raise checks.inside(path, ValueError(f"not a TOML file: {checks.line(str(error))}")) from error
 
 
 # ---------------------------------------------------------------------------------------------------------------- to tables
@@ -151,8 +151,8 @@ def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None
     import tomli_w
 
     tables = scenario_to_dict(scenario)
-    if run:
-        tables["run"] = _run_table(dict(run))
+    if run is not None:
+        tables["run"] = _run_table(dict(checks.mapping("run", run, '{"duration": 20.0}')))
     text = tomli_w.dumps(tables)
     # tomli_w writes one number a line; a row a line reads better.  A line break inside a string is escaped, so this is safe.
     text = re.sub(r"\[\n(?:\s*[-+.\w]+,\n)+\s*\]", lambda m: "[" + ", ".join(re.findall(r"[-+.\w]+", m[0])) + "]", text)
@@ -162,7 +162,7 @@ def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None
 def _with_units(text: str, units: Mapping[str, str]) -> str:
     """The text with the unit of each number behind it, as a comment."""
     lines, prefix, counts = [], "", dict[str, int]()
-    for line in text.splitlines():
+    for line in text.removesuffix("\n").split("\n"):  # and at no other character that is a line break to Unicode
         if header := re.fullmatch(r"(\[\[?)([\w.]+)\]\]?", line):
             prefix, names = "", header[2].split(".")
             for depth, name in enumerate(names):
@@ -210,7 +210,7 @@ def from_dict(data: dict[str, Any], source: str = "", *, other_tables: Iterable[
         scenario = construct(with_parameters, {"scenario": scenario, "values": changes}, "parameters")
         return ScenarioFile(scenario, _run_table(data.get("run", {})))
     except ValueError as error:
-        raise ValueError(f"{source}: {error}" if source else str(error)) from error
+        raise checks.inside(source, error) from error
 
 
 def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenario:
@@ -256,6 +256,7 @@ def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
     Raises:
       ValueError: an unknown preset or argument, or a value that the preset refuses.
     """
+    as_table(arguments, "arguments")
     if not isinstance(name, str) or name not in PRESETS:
         raise checks.fail("preset", name, "the name of a preset", did_you_mean(name, PRESETS))
     preset = PRESETS[name]
@@ -297,5 +298,5 @@ def _run_table(table: Any) -> dict[str, Any]:
     if "method" in values:
         checks.one_of("run.method", values["method"], tuple(TABLEAUS))
     if "record_every" in values:
-        checks.positive_integer("run.record_every", values["record_every"])
+        values["record_every"] = checks.positive_integer("run.record_every", values["record_every"])
     return values

@@ -70,7 +70,9 @@ def load_study_file(path: str | os.PathLike, kind: str) -> StudyFile:
       ValueError: the file is not TOML or does not describe such a study; the message names file, key and mend.
       OSError: it cannot be read.
     """
-    return study_from_dict(read_toml(path), kind, os.fspath(path), Path(path).parent)
+    checks.one_of("kind", kind, tuple(OPTIONS))
+    data = read_toml(path)
+    return study_from_dict(data, kind, os.fspath(path), Path(path).parent)
 
 
 def study_from_dict(data: dict[str, Any], kind: str, source: str = "", folder: str | os.PathLike = "") -> StudyFile:
@@ -87,7 +89,7 @@ def study_from_dict(data: dict[str, Any], kind: str, source: str = "", folder: s
         grid = {path: _axis(entry, f"grid.{path}") for path, entry in _by_path(data, "grid").items()} if kind == "sweep" else {}
         return StudyFile(file.scenario, ways, grid, options)
     except ValueError as error:
-        raise ValueError(f"{source}: {error}" if source else str(error)) from error
+        raise checks.inside(source, error) from error
 
 
 def _options(table: Any, kind: str) -> dict[str, Any]:

@@ -34,15 +34,20 @@ import numpy as np
 
 from iblf_jax import checks, codec, distributions, metrics
 from iblf_jax.distributions import Distribution, Perturbation
+from iblf_jax.integrators import tableau
+from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
-from iblf_jax.plain import Words, as_table, known_keys
+from iblf_jax.plain import Words, as_table, known_keys, numbers
 from iblf_jax.scenario_file import from_dict, read_toml, scenario_to_dict
+from iblf_jax.studies.designs import MOST_RUNS, check_seed
+from iblf_jax.studies.draws import plan
+from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
-from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.objectives import Objective, checked
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import Setup, TuneResult
-from iblf_jax.tuning.robust import Risk, cvar
+from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
 
 DISTRIBUTIONS = {
     "uniform": distributions.Uniform,
@@ -57,6 +62,11 @@ codec.FAMILIES.setdefault(Distribution, ("distributions", DISTRIBUTIONS))
 OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin")
 REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "violation_probability_below")
 TABLES = ("tune", "objective", "requirement", "perturbations")
+HISTORY = dict.fromkeys(("loss", "objective", "terms", "excess", "margin", "gradient_norm", "z", "x"), "f") | {
+    "sound": "b",
+    "evaluations": "iu",
+}
+"""What a result's history holds, and the kinds of its numbers."""
 ARGUMENTS = (
     *("runs", "seed", "resample", "optimiser", "mode", "starts", "sharpenings", "iterations", "tolerance", "patience"),
     *("learning_rate", "backend", "report_runs", "report_seed", "confidence"),
@@ -82,7 +92,7 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
         table = as_table(data.get("perturbations", {}), "perturbations")
         drawn = {key: _perturbation(value, f"perturbations.{key}") for key, value in table.items()}
     except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
+        raise checks.inside(source, error) from error
     timing = {"duration": 5.0} | {key: x for key, x in dict(file.run or {}).items() if key in ("duration", "dt", "method")}
     return {"scenario": file.scenario, "objective": goal, "perturbations": drawn, **options, **timing}
 
@@ -103,39 +113,45 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
     parameters = [_parameter(x, f"tune.parameters[{i}]") for i, x in enumerate(table["parameters"])]
     options = {"parameters": parameters, **{key: table[key] for key in ARGUMENTS if key in table}}
     if "risk" in table:
-        options["risk"] = cvar(table["level"]) if table["risk"] == "cvar" and "level" in table else table["risk"]
+        checks.one_of("tune.risk", table["risk"], KINDS)
+        options["risk"] = table["risk"]
+    if options.get("risk") == "cvar" and "level" in table:
+        options["risk"] = codec.construct(cvar, {"level": table["level"]}, "tune.level")
     return options
 
 
 def _parameter(entry: Any, key: str) -> Any:
     if isinstance(entry, str):
         return entry
-    table = as_table(entry, key)
+    table = dict(as_table(entry, key))
     known_keys(table, key, ("path", "low", "high", "tied", "scale"))
-    if "path" not in table:
-        raise checks.fail(f"{key}.path", Words("nothing"), "the path of a leaf")
-    return tunable(**table)
+    path = checks.word(f"{key}.path", table.pop("path", Words("nothing")), "the path of a leaf")
+    limits: dict[str, Any] = {name: numbers(table[name], f"{key}.{name}") for name in ("low", "high") if name in table}
+    return codec.construct(tunable, {"path": path, **table, **limits}, key)
 
 
 def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, besides: tuple[str, ...] = ()) -> Any:
     table = as_table(entry, key)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
     function = getattr(module, table["kind"])
-    known_keys(table, key, ("kind", *besides, *inspect.signature(function).parameters))
-    arguments = {name: value for name, value in table.items() if name not in ("kind", *besides)}
-    try:
-        return function(**arguments)
-    except TypeError as error:
-        raise ValueError(f"{key}: {error}") from error
+    taken = inspect.signature(function).parameters
+    known_keys(table, key, ("kind", *besides, *taken))
+    for name, parameter in taken.items():
+        if parameter.default is parameter.empty and name not in table:
+            raise checks.fail(f"{key}.{name}", Words("nothing"), f"a number; {table['kind']} needs it")
+    return codec.construct(function, {name: numbers(table[name], f"{key}.{name}") for name in taken if name in table}, key)
 
 
 def _objective(terms: Any, requirements: Any) -> Objective:
     if not isinstance(terms, list) or not terms:
-        raise checks.fail("objective", Words("nothing"), "at least one [[objective]] table", 'Such as kind = "tracking".')
+        raise checks.fail("objective", terms or Words("nothing"), "at least one [[objective]] table", 'Such as kind = "tracking".')
     total = Objective()
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
-        total += as_table(entry, key).get("weight", 1.0) * _called(objectives, OBJECTIVES, entry, key, ("weight",))
+        term, weight = _called(objectives, OBJECTIVES, entry, key, ("weight",)), numbers(entry.get("weight", 1.0), f"{key}.weight")
+        total += codec.construct(term.__mul__, {"weight": weight}, key)
+    if not isinstance(requirements, list):
+        raise checks.fail("requirement", requirements, "[[requirement]] tables", 'Such as kind = "margin_above".')
     for i, entry in enumerate(requirements):
         total += _called(objectives, REQUIREMENTS, entry, f"requirement[{i}]")
     return total
@@ -146,15 +162,21 @@ def _perturbation(entry: Any, key: str) -> Perturbation:
     shared = table.pop("shared", False)
     if len(table) != 1 or next(iter(table)) not in distributions.KINDS:
         raise checks.fail(key, entry, "one of factor, offset, value", "Such as { factor = { uniform = [0.7, 1.3] } }.")
+    if not isinstance(shared, bool):
+        raise checks.fail(f"{key}.shared", shared, "true or false")
     kind, inner = next(iter(table.items()))
     inner = as_table(inner, f"{key}.{kind}")
     if len(inner) != 1 or next(iter(inner)) not in DISTRIBUTIONS:
         raise checks.fail(f"{key}.{kind}", inner, "one of " + ", ".join(DISTRIBUTIONS), "Such as { uniform = [0.7, 1.3] }.")
     name, arguments = next(iter(inner.items()))
+    where, make = f"{key}.{kind}.{name}", getattr(distributions, name)
     if not isinstance(arguments, list):
-        raise checks.fail(f"{key}.{kind}.{name}", arguments, "a list of its arguments")
+        raise checks.fail(where, arguments, "a list of its arguments")
     arguments = [arguments] if name == "choice" else arguments
-    return getattr(distributions, kind)(getattr(distributions, name)(*arguments), shared=shared)
+    values = dict(zip(inspect.signature(make).parameters, numbers(arguments, where), strict=False))
+    if name != "choice" and (len(values) < len(arguments) or (len(values) < 2 and name != "normal")):
+        raise checks.fail(where, arguments, "a list of two numbers")
+    return getattr(distributions, kind)(codec.construct(make, values, where), shared=shared)
 
 
 # ------------------------------------------------------------------------------------------------------------- saved results
@@ -163,13 +185,13 @@ def _perturbation(entry: Any, key: str) -> Perturbation:
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     setup = result.setup
-    numbers = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
+    history = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
     plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits")
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
         "values": {key: np.asarray(x).tolist() for key, x in result.values.items()},
-        "history": numbers,
+        "history": history,
         "setup": {name: getattr(setup, name) for name in plain},
         "risk": list(setup.risk),
         "objective": codec.encode_fields(setup.objective, "objective"),
@@ -177,7 +199,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         **{name: getattr(result, name) for name in ("names", "best_start", "stopped", "optimiser", "mode", "seconds")},
         "report": result.report.to_dict(),
     }
-    target = Path(path)
+    target = checks.file_to_write("path", path)
     temporary = target.with_name(f".{target.name}.partial")
     temporary.write_text(json.dumps(data, indent=1), encoding="utf-8")
     os.replace(temporary, target)
@@ -193,20 +215,51 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
       ValueError: the file is something else.
       OSError: the file cannot be read.
     """
+    place, expected = checks.file_to_read("path", path), "a file that TuneResult.save wrote"
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = json.loads(place.read_text(encoding="utf-8"))
         if data["what"] != "iblf_jax tuning result":
             raise KeyError("what")
-    except (ValueError, KeyError, TypeError) as error:
-        raise checks.fail("path", os.fspath(path), "a file that TuneResult.save wrote") from error
-    start = from_dict(data["start"], source=os.fspath(path)).scenario
-    values = {key: np.asarray(x) for key, x in data["values"].items()}
+    except Exception as error:
+        raise checks.fail("path", str(place), expected) from error
+    try:
+        return _decoded(data)
+    except Exception as error:  # whatever is missing in it, or of another kind
+        raise checks.fail("path", str(place), expected, f"{type(error).__name__}: {error}") from error
+
+
+def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
+    if np.dtype(entry["dtype"]).kind not in kinds:
+        raise checks.fail("history", entry["dtype"], f"numbers of kind {kinds}")
+    return np.asarray(entry["values"], entry["dtype"]).reshape(entry["shape"])
+
+
+def _decoded(data: dict[str, Any]) -> TuneResult:
+    """The result that `save_tuning` encoded."""
+    start = from_dict(data["start"]).scenario
+    values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
     setup = Setup(
-        objective=codec.decode_fields(Objective, data["objective"], "objective"),
+        objective=checked(codec.decode_fields(Objective, data["objective"], "objective")),
         perturbations={key: codec.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
-        risk=Risk(*data["risk"]),
-        **data["setup"] | {"limits": tuple((low, high) for low, high in data["setup"].get("limits", ()))},
+        risk=as_risk(Risk(*data["risk"])),
+        **data["setup"] | {"limits": tuple((float(low), float(high)) for low, high in data["setup"].get("limits", ()))},
     )
-    history = {name: np.asarray(x["values"], x["dtype"]).reshape(x["shape"]) for name, x in data["history"].items()}
-    rest = {name: data[name] for name in ("best_start", "stopped", "optimiser", "mode", "seconds")}
-    return TuneResult(with_parameters(start, values), start, values, tuple(data["names"]), history, setup=setup, **rest)
+    tableau(setup.method)
+    checks.one_of("backend", setup.backend, BACKENDS)
+    checks.whole_steps(setup.duration, setup.dt)
+    check_confidence(setup.confidence)
+    for name in ("runs", "report_runs"):
+        checks.positive_integer(name, getattr(setup, name), most=MOST_RUNS)
+    for name in ("seed", "report_seed"):
+        check_seed(getattr(setup, name))
+    plan(start, setup.perturbations)
+    words = {name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")}
+    names = tuple(checks.word("names", name, "a string") for name in data["names"])
+    history = {name: _array(data["history"][name], kinds) for name, kinds in HISTORY.items()}
+    steps, starts, size = history["x"].shape
+    shapes = {name: x.shape[:2] for name, x in history.items() if name != "evaluations"}
+    if size != len(names) or not steps or set(shapes.values()) != {(steps, starts)} or history["evaluations"].shape != (steps,):
+        raise checks.fail("history", Words("arrays that do not fit each other"), f"(steps, starts, ...) of {len(names)} numbers")
+    best = checks.positive_integer("best_start", data["best_start"], least=0, most=starts - 1)
+    seconds = checks.positive_number("seconds", data["seconds"], "s", zero=True)
+    return TuneResult(with_parameters(start, values), start, values, names, history, best, seconds=seconds, setup=setup, **words)

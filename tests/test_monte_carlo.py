@@ -312,6 +312,16 @@ def test_sobol_indices_of_what_is_known():
         ij.sensitivity(SCENARIO, ways, output="first_violation_time", points=64, **cases.options())
 
 
+@pytest.mark.slow
+def test_sobol_indices_of_one_number_from_few_points():
+    ways = {"initial.q[1]": ij.offset(ij.normal(0.0, 0.003))}
+    found = ij.sensitivity(SCENARIO, ways, output=lambda m: m.margin[:, 1], points=4, **cases.options())
+    assert found.first_order.shape == (1,)
+    assert np.all(np.isfinite([found.first_order_interval, found.total_order_interval]))
+    with pytest.raises(ValueError, match="not the same in all runs"):
+        ij.sensitivity(SCENARIO, ways, output=lambda m: np.full(len(m.margin), 3.0), points=4, **cases.options())
+
+
 # --------------------------------------------------------------------------------------------------------------- refusals
 
 

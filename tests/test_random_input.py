@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import math
 import warnings
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 from members import FAMILIES
 
 import iblf_jax as ij
-from iblf_jax import checks, paths, rollout
+from iblf_jax import checks, metrics, paths, robots, rollout
 from iblf_jax.pytree import is_leaf_field
 from iblf_jax.scenario import check_values
 from iblf_jax.status import Status
@@ -172,3 +174,200 @@ def test_no_silent_nan_in_a_run(paper, values):
     others = [np.asarray(x) for x in (run.tau, run.e1, run.e2, run.xi, run.disturbance, run.disturbance_estimate, run.V)]
     if not all(np.all(np.isfinite(x)) for x in others):
         assert status & Status.NOT_FINITE, values
+
+
+# ----------------------------------------------------------------------------------------- whatever a user may put in the place of it
+
+DEEP: list = [1.0]
+for _ in range(5000):
+    DEEP = [DEEP]
+
+
+class Broken:
+    """Nothing can be asked of it."""
+
+    def __bool__(self):
+        raise RuntimeError
+
+    __len__ = __iter__ = __array__ = __float__ = __repr__ = __eq__ = __bool__
+    __hash__ = None
+
+
+NASTY = {
+    "none": None,
+    "long": "x" * 5000,
+    "null-byte": "a\0b.npz",
+    "surrogate": "\ud800.nc",
+    "huge": 10**5000,
+    "2**40": 2**40,
+    "int8": np.int8(-3),
+    "nan": float("nan"),
+    "key": jax.random.key(0),
+    "keys": jax.random.split(jax.random.key(0)),
+    "array": np.ones(3),
+    "objects": np.asarray([object(), None]),
+    "ragged": [[1.0], [1.0, 2.0]],
+    "deep": DEEP,
+    "mixed-dict": {1: 2, "a": DEEP},
+    "date": datetime.date(2020, 1, 1),
+    "class": int,
+    "generator": (x for x in (1.0, 2.0)),
+    "words": ["cpu"],
+    "bytes": b"abc",
+    "folder": Path("/"),
+    "broken": Broken(),
+}
+WAYS = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
+GOAL = ij.objectives.tracking(scale=1.0)
+ENTRIES = {
+    "simulate": (ij.simulate, {"scenario": None, "method": "rk4", "record_every": 1, "throw": False, "backend": "auto"}),
+    "compare": (ij.compare, {"scenario": None, "laws": ["log"], "record_every": 1, "equal_effort": True}),
+    "monte_carlo": (
+        ij.monte_carlo,
+        {"scenario": None, "perturbations": WAYS, "runs": 4, "seed": 0, "sampler": "sobol", "replicates": 2, "chunk": 8, "memory": 1e9}
+        | {"devices": None, "progress": False},
+    ),
+    "sweep": (
+        ij.sweep,
+        {"scenario": None, "grid": {"controller.K2": [1.0, 2.0]}, "perturbations": None, "runs": 1, "points": None, "store": None}
+        | {"unit": None, "memory": 1e9, "devices": None, "progress": False},
+    ),
+    "sensitivity": (ij.sensitivity, {"scenario": None, "perturbations": WAYS, "points": 4, "memory": 1e9, "devices": None}),
+    "tune": (
+        ij.tune,
+        {"scenario": None, "parameters": ["controller.K2"], "objective": GOAL, "runs": 1, "seed": 0, "resample": False, "starts": 1}
+        | {"sharpenings": 2, "iterations": 2, "tolerance": 1e-5, "patience": 3, "report_runs": 4, "report_seed": None, "confidence": 0.9}
+        | {"checkpoint": None, "callback": None, "risk": "mean", "perturbations": None, "progress": False},
+    ),
+    "pareto": (
+        ij.pareto,
+        {"scenario": None, "parameters": ["controller.K2"], "objectives": (GOAL, GOAL), "points": 2, "iterations": 2, "tolerance": 1e-5},
+    ),
+    "falsify": (ij.falsify, {"scenario": None, "sets": WAYS, "starts": 2, "iterations": 2, "seed": 0, "progress": False}),
+    "certify": (ij.certify, {"scenario": None, "run": None, "worst": 3}),
+    "explain": (ij.explain, {"scenario": None, "varied": (), "metrics": ()}),
+    "load_scenario": (ij.load_scenario, {"path": "x.toml"}),
+    "load_rollouts": (ij.load_rollouts, {"path": "x.npz"}),
+    "load_sweep": (ij.load_sweep, {"store": "x.zarr"}),
+    "load_tuning": (ij.load_tuning, {"path": "x.json"}),
+    "tune_file": (ij.tune_file, {"path": "x.toml"}),
+    "robots.load": (robots.load, {"path": "x.urdf", "base": None, "tip": None, "locked": None}),
+    "save_scenario": (ij.save_scenario, {"scenario": None, "path": "/", "run": None}),
+    "astype": (ij.astype, {"tree": None, "dtype": "float32"}),
+    "choice": (ij.choice, {"values": [1.0], "weights": None}),
+    "tunable": (ij.tunable, {"path": "controller.K2", "low": None, "high": None, "tied": False, "scale": None}),
+    "arm_scenario": (ij.presets.arm_scenario, {"robot": None, "reference": None, "law": "log", "model": None}),
+}
+"""Entry points and arguments; None stands for what is made in the test, or for none."""
+TIMED = ("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "pareto", "falsify")
+
+
+@pytest.fixture
+def no_runs(monkeypatch):
+    """Whatever would run raises Entered."""
+    for place in (
+        "rollout._run_lowered",
+        "studies.blocks._execute",
+        "studies.setup._execute",
+        "tuning._tune.slope",
+        "tuning._tune.gradient",
+        "tuning.problem.slope",
+        "tuning._falsify._push",
+        "lowering.explain.instructions",
+        "certificates._certify._one",
+    ):
+        monkeypatch.setattr(f"iblf_jax.{place}", entered)
+    monkeypatch.setattr("iblf_jax.studies.blocks.settled", lambda *_, **__: "xla")
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.filterwarnings("ignore")
+def test_anything_in_the_place_of_any_argument(entry, paper, no_runs, tmp_path, monkeypatch):
+    """A ValueError that says what came, in one line that can be read; or nothing is there; or the call goes on to its runs."""
+    monkeypatch.chdir(tmp_path)
+    function, arguments = ENTRIES[entry]
+    for name in arguments:
+        for label, value in NASTY.items():
+            given = {"duration": 0.01} if entry in TIMED else {}
+            given |= {key: paper if x is None and key in ("scenario", "tree") else x for key, x in arguments.items()} | {name: value}
+            if entry == "arm_scenario":
+                given = {"robot": paper.plant, "reference": paper.reference} | {key: x for key, x in given.items() if x is not None}
+            try:
+                function(**given)
+            except (Entered, FileNotFoundError, ij.StoreError):
+                continue
+            except ValueError as error:
+                text = str(error)
+                assert ": got " in text, (name, label, text)
+                assert len(text) < 1500, (name, label)
+                assert "\n" not in text, (name, label)
+    assert depth_left(500)  # a deep list that reached JAX would have spoilt the interpreter's count
+
+
+def depth_left(n: int) -> bool:
+    return n == 0 or depth_left(n - 1)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda s: ij.monte_carlo(s, WAYS, runs=2**31, duration=0.01), ("runs", "at most", "GiB")),
+        (lambda s: ij.sweep(s, {"controller.K2": ij.uniform(1.0, 2.0)}, design="random", points=2**31, duration=0.01), ("points", "GiB")),
+        (lambda s: ij.sensitivity(s, WAYS, points=2**30, duration=0.01), ("points", "at most", "GiB")),
+        (lambda s: ij.tune(s, ["controller.K2"], GOAL, starts=2**40, duration=0.01), ("starts", "at most", "GiB")),
+        (lambda s: ij.falsify(s, WAYS, starts=2**40, duration=0.01), ("GiB",)),
+        (lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=[], duration=0.01), ("devices", "at least one")),
+        (lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=["cpu"], duration=0.01), ("devices", "cpu")),
+        (lambda s: ij.simulate(s, metrics=[metrics.Settling(tolerance=[0.1] * 3)], duration=0.01), ("metrics[0].tolerance", "2")),
+        (lambda s: ij.tune(s, ["controller.K2"], ij.objectives.effort(joints=[1.0] * 3), duration=0.01), ("joints", "(3,)")),
+        (lambda s: ij.objectives.margin_above(0.1, allowed=5.0), ("allowed", "0 to 1")),
+    ],
+)
+def test_sizes_devices_and_shapes(paper, call, words):
+    with pytest.raises(ValueError, match=": got ") as caught:
+        call(paper)
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+@pytest.mark.slow
+def test_recording_less_often_than_there_are_steps(paper, short_run):
+    """Past the end of the run every step is as good as any; 2**31 is more than the compiled loop can count."""
+    run = ij.simulate(paper, record_every=2**31, **SHORT)
+    assert run.t.shape == (1,)
+    np.testing.assert_array_equal(run.metrics.rmse, short_run.metrics.rmse)
+
+
+@pytest.mark.parametrize("name", ["a\nb", "..", "a]b", "[", 'quo"te', "1", "back\\slash", '"x"', "\u2028", "plain name", "gelenk_ü"])
+def test_names_of_links_of_any_characters(name, tmp_path):
+    """Each listed path leads to its value, and back, in files too."""
+    arm = ij.presets.ur5()
+    names = (name, *arm.plant.links[1:])
+    arm = dataclasses.replace(arm, plant=dataclasses.replace(arm.plant, links=names))
+    (path,) = [p.path for p in ij.parameters(arm) if p.path.endswith("].mass")][:1]
+    other = ij.with_parameters(arm, {path: 7.5})
+    assert paths.get(other, path) == 7.5 == other.plant.mass[0]
+    assert paths.parse(path)[2] == name
+    ij.save_scenario(other, tmp_path / "arm.toml")
+    loaded = ij.load_scenario(tmp_path / "arm.toml")
+    assert loaded.plant.links == names
+    assert paths.get(loaded, path) == 7.5
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["x = " + "[" * 100_000, "[" + "a." * 5000 + "a]", "x = " + "[" * 60 + "]" * 60, "x = " + "9" * 6000, "run = 2020-01-01", "\0"],
+    ids=["lists", "tables", "closed", "digits", "date", "null"],
+)
+def test_toml_of_any_depth(text, tmp_path, capsys):
+    from iblf_jax.cli import main
+
+    file = tmp_path / "x.toml"
+    file.write_text(text)
+    for command in ("simulate", "montecarlo", "sweep", "tune"):
+        assert main([command, str(file)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "x.toml" in said
+        assert len(said) < 1500
+    assert depth_left(500)

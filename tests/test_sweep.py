@@ -306,6 +306,13 @@ def test_a_description_that_is_wrong_is_refused(finished, change):
     assert len(str(caught.value)) < 600 + len(str(finished))
 
 
+def test_an_empty_grid_is_one_point():
+    ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
+    data = ij.sweep(ij.presets.zhang_yan_2024(), {}, perturbations=ways, runs=2, **cases.options())
+    assert dict(data["margin"].sizes) == {"run": 2, "joint": 2}
+    assert data.attrs["cases"] == 2
+
+
 def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(ij.StoreError, match="cannot be written"):

@@ -1,6 +1,7 @@
 """Fronts, attacks on tuned gains, saved results, the command line and the figures of tuning."""
 
 import dataclasses
+import json
 import warnings
 from types import SimpleNamespace
 
@@ -198,3 +199,36 @@ def test_figures(paper):
         best.landscape("controller.k1[0]", "controller.o[0]")
     front = ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.effort()), points=2, iterations=2, **SHORT)
     assert front.plot().axes
+
+
+@pytest.fixture(scope="module")
+def tuned(paper, tmp_path_factory):
+    """A tuning, its checkpoint and its file."""
+    folder = tmp_path_factory.mktemp("tuned")
+    best = ij.tune(paper, ["controller.k1"], ij.objectives.tracking(scale=1.0), checkpoint=folder / "state.npz", **BRIEF)
+    best.save(folder / "best.json")
+    return folder
+
+
+BRIEF = {"duration": 0.01, "iterations": 1, "report_runs": 2, "progress": False}
+
+
+@pytest.mark.slow
+def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
+    """Checkpoints and saved results: cut anywhere, of another kind, with keys that are missing or of another type."""
+    np.save(tmp_path / "array.npy", np.ones(3))
+    state, saved = (tuned / "state.npz").read_bytes(), (tuned / "best.json").read_text()
+    for data in (b"", state[:10], state[: len(state) // 2], state[:-30], (tmp_path / "array.npy").read_bytes(), b"PK" + state[40:]):
+        (tmp_path / "bad.npz").write_bytes(data)
+        with pytest.raises(ValueError, match=r"checkpoint: got .*delete it or name another"):
+            ij.tune(paper, ["controller.k1"], ij.objectives.tracking(scale=1.0), checkpoint=tmp_path / "bad.npz", **BRIEF)
+        with pytest.raises(ValueError, match="save_rollouts"):
+            ij.load_rollouts(tmp_path / "bad.npz")
+    whole = json.loads(saved)
+    bad = [{key: x for key, x in whole.items() if key != left_out} for left_out in whole if left_out != "report"]
+    bad += [whole | {key: value} for key in whole for value in (None, 3, [[1]]) if key not in ("report", "best_start", "seconds")]
+    for data in (*map(json.dumps, bad), saved[:200], "[]", "[" * 100_000):
+        (tmp_path / "bad.json").write_text(data)
+        with pytest.raises(ValueError, match=r"path: got .*TuneResult\.save"):
+            ij.load_tuning(tmp_path / "bad.json")
+    assert ij.load_tuning(tuned / "best.json").names == ("controller.k1[0]", "controller.k1[1]")

@@ -62,6 +62,7 @@ def certify(
     if run is None:
         every = 1 + checks.whole_steps(duration, dt) // RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
+    worst = None if worst is None else checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
         if run.is_batch:
             _check_same_kind(scenario, run)
@@ -88,8 +89,6 @@ def _check_same(scenario: Scenario, run: Rollout) -> None:
 
 def _worst_of(study: Any, worst: int | None) -> list[int]:
     """The runs of a study that came nearest to their bounds, the nearest first, of those that were made."""
-    if worst is not None:
-        worst = checks.positive_integer("worst", worst)
     count = len(study)
     made = np.broadcast_to(getattr(study, "made", True), (count,))
     if worst is None or worst >= np.sum(made):

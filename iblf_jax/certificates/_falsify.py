@@ -78,8 +78,9 @@ def falsify(scenario: Scenario, ranges: Mapping[str, Any], *, starts: int = 16, 
     reason = claims.why_no_claim(scenario)
     if reason:
         raise checks.fail("scenario", type(scenario.controller).__name__, "a scenario with a claim", reason + ".")
-    starts = checks.positive_integer("starts", starts)
+    starts, seed = checks.positive_integer("starts", starts), checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
     low, high, split = _flat_ranges(scenario, ranges)
+    checks.fits("starts", starts, 8.0 * 2 * low.size)
     dtype = scenario.initial.q.dtype
 
     def at(unit):
@@ -123,7 +124,10 @@ def _flat_ranges(scenario: Scenario, ranges: Mapping[str, Any]):
         shapes[path] = jnp.shape(get(scenario, path))
         if not isinstance(pair, tuple | list) or len(pair) != 2:
             raise checks.fail(f"ranges[{path!r}]", pair, "(low, high)")
-        low, high = (np.broadcast_to(np.asarray(end, float), shapes[path]) for end in pair)
+        low, high = (np.asarray(checks.as_floats(f"ranges[{path!r}]", end), float) for end in pair)
+        if any(end.shape not in ((), shapes[path]) for end in (low, high)):
+            raise checks.fail(f"ranges[{path!r}]", pair, f"one number, or shape {shapes[path]}, for each end")
+        low, high = (np.broadcast_to(end, shapes[path]) for end in (low, high))
         if not np.all(low <= high) or not np.all(np.isfinite(low)) or not np.all(np.isfinite(high)):
             raise checks.fail(f"ranges[{path!r}]", pair, "finite low <= high")
         lows.append(low.ravel())

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -80,17 +81,22 @@ def _check_exists(name: str) -> None:
 
 def assignments(option: str, words: list[str]) -> dict[str, Any]:
     """NAME=VALUE words as a dict; values are TOML, and a bare word is a string."""
+    from iblf_jax import checks
+    from iblf_jax.plain import toml_tables
+
     values = {}
     for word in words:
-        name, equals, text = word.partition("=")
-        if not equals or not name.strip() or not text.strip():
-            raise ValueError(
-                f"{option}: got {word!r}, expected NAME=VALUE, such as {'law=log' if option == '--arg' else 'controller.K2=30'}."
-            )
+        # Of NAME the part in brackets, the name of a link, may hold an = itself.
+        found = re.fullmatch(r"""((?:\["(?:[^"\\]|\\.)*"\]|\[[^\]]*\]|[^=\[])*)=(.*)""", word, re.DOTALL)
+        name, text = found.groups() if found else ("", "")
+        if not name.strip() or not text.strip():
+            raise checks.fail(option, word, f"NAME=VALUE, such as {'law=log' if option == '--arg' else 'controller.K2=30'}")
         try:
-            values[name.strip()] = tomllib.loads(f"value = {text}")["value"]
+            values[name.strip()] = toml_tables(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             values[name.strip()] = text.strip()
+        except ValueError as error:
+            raise checks.fail(f"{option} {name.strip()}", text, "a value in TOML", f"It has {error}.") from None
     return values
 
 

@@ -7,14 +7,15 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
+from iblf_jax.integrators import tableau
 from iblf_jax.lowering import automatic, batch, native
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
 from iblf_jax.lowering.toolchain import threads
-from iblf_jax.metrics import standard
+from iblf_jax.metrics import as_folds
 from iblf_jax.paths import get
 from iblf_jax.scenario import Scenario, canonical
 
@@ -72,7 +73,10 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     """
     scenario = canonical(scenario)
     dtype = scenario.initial.q.dtype
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard() if metrics is None else tuple(metrics))
+    folds = as_folds(metrics, dtype, scenario.n)
+    tableau(method)
+    if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
+        raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
     one = batch.batch_of(native.run, scenario, leaves, folds, jnp.asarray(1e-3, dtype))
     program, _, _ = one.program(batch.step_function, one.start(method), method, False)

@@ -276,12 +276,16 @@ def save(figures: Mapping[str, Figure], folder: str | Path, formats: Sequence[st
     Raises:
       ValueError: an unknown format.
     """
-    formats = (formats,) if isinstance(formats, str) else tuple(formats)
-    known = Figure().canvas.get_supported_filetypes()
+    formats = (formats,) if isinstance(formats, str) else tuple(checks.listed("formats", formats, '("png", "pdf")'))
     for ending in formats:
-        if ending not in known:
-            raise checks.fail("formats", ending, f"one of {', '.join(sorted(known))}")
-    folder = Path(folder)
+        checks.one_of("formats", ending, sorted(Figure().canvas.get_supported_filetypes()))
+    for name, figure in checks.mapping("figures", figures, '{"overview": run.plot()}').items():
+        if not isinstance(figure, Figure):
+            raise checks.fail(f"figures[{name!r}]", figure, "a matplotlib Figure")
+        checks.file_path("figures: name", name)
+    folder = checks.file_path("folder", folder, "a folder")
+    if any(part.exists() and not part.is_dir() for part in (folder, *folder.parents)):
+        raise checks.fail("folder", str(folder), "the path of a folder", "It, or a part of it, is a file.")
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, figure in figures.items():

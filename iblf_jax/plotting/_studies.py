@@ -118,7 +118,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
       ValueError: not a study, or an unknown metric.
     """
     _check(study)
-    names = list(study.metrics) if metrics is None else list(metrics)
+    names = list(study.metrics) if metrics is None else checks.listed("metrics", metrics, '["margin", "rmse"]')
     values = {name: statistics.one_number(study.metrics, name) for name in names}
     if metrics is None:
         values = {name: x for name, x in values.items() if np.isfinite(x).any() and np.ptp(x[np.isfinite(x)]) > 0}
@@ -126,7 +126,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
         raise checks.fail("metrics", names, "at least one metric with values that differ")
     figure, panels = _grid(len(values), 2.0)
     for axes, (name, x) in zip(panels, values.items(), strict=True):
-        _draw_histogram(axes, study, name, x, checks.positive_integer("bins", bins))
+        _draw_histogram(axes, study, name, x, checks.positive_integer("bins", bins, most=10_000))
     _style.head(figure, [_verdict(study)])
     _style.legend_below(figure)
     return figure

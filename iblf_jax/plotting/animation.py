@@ -46,7 +46,9 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
     Raises:
       ValueError: another ending, no run, a batch, robots that do not fit together, or fps or speed out of range.
     """
-    curves, path = curves_of(runs), Path(path)
+    curves, path = curves_of(runs), checks.file_path("path", path)
+    if path.is_dir():
+        raise checks.fail("path", str(path), "the path of a file", "It is a folder.")
     writers: dict[str, Any] = {".gif": _write_gif, ".html": _write_html}
     if path.suffix.lower() not in writers:
         raise checks.fail("path", str(path), f"a file ending of {' or '.join(writers)}")

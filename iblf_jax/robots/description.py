@@ -51,9 +51,8 @@ def read(path: str | os.PathLike) -> ET.Element:
     Raises:
       ValueError: no such file, not a file, too large, too deep, not XML, or XML that declares entities.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise checks.fail("path", path, "the path of a URDF or MJCF file")
-    root = _Reader(Path(path).parent).parse(Path(path))
+    place = checks.file_path("path", path, "a URDF or MJCF file")
+    root = _Reader(place.parent).parse(place)
     if root.tag not in ("robot", "mujoco"):
         expected = "a URDF or MJCF file"
         if root.tag == "sdf":

@@ -67,18 +67,18 @@ def load(
 
     Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
     """
-    if not isinstance(repair, bool | np.bool_):
-        raise checks.fail("repair", repair, "True or False")
-    root, repairs = description.read(path), Repairs(bool(repair))
+    base, tip = (None if x is None else checks.word(what, x, "the name of a link") for what, x in (("base", base), ("tip", tip)))
+    locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
+    root, repairs = description.read(path), Repairs(checks.flag("repair", repair))
     if root.tag == "robot":
         file = urdf.checked(root)
         tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
-        chain = _Chain.picked(tree, base, tip, dict(locked or {}), repairs).following(file, repairs)
+        chain = _Chain.picked(tree, base, tip, dict(locked), repairs).following(file, repairs)
         arm = chain.arm(gravity, {}, repairs)
     else:
         model = mjcf.checked(root)
         tree = Tree.compiled(model.text, str(path), "world", mjcf.taken_out)
-        arm = _Chain.picked(tree, base, tip, dict(locked or {}), repairs).arm(gravity, model.tendons, repairs)
+        arm = _Chain.picked(tree, base, tip, dict(locked), repairs).arm(gravity, model.tendons, repairs)
     if arm.repaired:
         warnings.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".", stacklevel=2)
     return arm

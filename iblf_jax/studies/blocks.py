@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
 from iblf_jax.lowering import run_batch, settled
 from iblf_jax.status import Status, flag
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
@@ -63,6 +64,12 @@ class Results(NamedTuple):
 def block_size() -> int:
     """Runs in a block on the devices of this process."""
     return BLOCK.get(jax.default_backend(), BLOCK_ELSEWHERE)
+
+
+def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
+    """A user's arguments of `run_blocks` that say how and change no number, checked; they may be None (all devices, `memory` rules)."""
+    chunk = None if chunk is None else checks.positive_integer("chunk", chunk)
+    return {"chunk": chunk, "memory": checks.positive_number("memory", memory, "bytes"), "devices": checks.devices("devices", devices)}
 
 
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:

@@ -72,7 +72,7 @@ def compare(
 
     Source: design of this package; the factor 2 is a fact about (3.1).
     """
-    scenario = canonical(scenario)
+    scenario, equal_effort = canonical(scenario), checks.flag("equal_effort", equal_effort)
     named = _named_laws(laws)
     scenarios = {name: _with_law(scenario, law) for name, law in named.items()}
     options: dict[str, Any] = {"duration": duration, "dt": dt, "method": method, "record_every": record_every}

@@ -17,6 +17,10 @@ from scipy.stats import qmc
 from iblf_jax import checks
 
 SAMPLERS = ("independent", "latin_hypercube", "sobol")
+MOST_RUNS = 2**32
+"""A run's draws come from its number, which is a uint32."""
+MOST_SOBOL = (21201, 2**30)
+"""Dimensions and points that SciPy's Sobol sequence has."""
 
 
 def check_seed(seed: Any) -> int:
@@ -29,7 +33,7 @@ def check_seed(seed: Any) -> int:
 def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
     """The number of replicates; ValueError for a sampler, a number of runs and replicates that do not fit together."""
     checks.one_of("sampler", sampler, SAMPLERS)
-    replicates = checks.positive_integer("replicates", replicates)
+    replicates = checks.positive_integer("replicates", replicates, most=runs)
     if sampler == "independent" and replicates != 1:
         raise checks.fail(
             "replicates", replicates, "1 with independent draws", 'Replicates belong to sampler="latin_hypercube" or "sobol".'
@@ -44,7 +48,15 @@ def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
 
 
 def unit_points(sampler: str, dimension: int, runs: int, replicates: int, seed: int, salt: int = 0) -> np.ndarray:
-    """Points in the open unit cube, (runs, dimension): `replicates` independent designs, one after another."""
+    """Points in the open unit cube, (runs, dimension): `replicates` independent designs, one after another.
+
+    Raises:
+      ValueError: more than the memory holds, or than the sequence has.
+    """
+    checks.fits("runs" if not salt else "points", runs, 3 * 8.0 * dimension)
+    if sampler == "sobol" and (dimension > MOST_SOBOL[0] or runs // replicates > MOST_SOBOL[1]):
+        came = f"{runs // replicates} of {dimension} numbers"
+        raise checks.fail("sampler", sampler, f"at most {MOST_SOBOL[1]} points of {MOST_SOBOL[0]} numbers in a design, not {came}")
     designs = []
     for replicate in range(replicates):
         rng = np.random.default_rng([seed, replicate, salt])

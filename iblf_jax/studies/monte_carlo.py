@@ -20,8 +20,8 @@ from iblf_jax.accuracy import RELATIVE
 from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold
 from iblf_jax.scenario import Scenario
-from iblf_jax.studies.blocks import MEMORY, Results, block_size, run_blocks
-from iblf_jax.studies.designs import check_sampler
+from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
+from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.setup import prepare
@@ -80,7 +80,8 @@ def monte_carlo(
 
     Source: design of this package.
     """
-    runs, chunk = checks.positive_integer("runs", runs), None if chunk is None else checks.positive_integer("chunk", chunk)
+    how = checked_how(chunk, memory, devices)
+    runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
     replicates = check_sampler(sampler, runs, replicates)
     if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail(
@@ -88,12 +89,13 @@ def monte_carlo(
         )
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
     setup = prepare(scenario, perturbations, runs, seed, metrics=metrics, backend=backend, sampler=sampler, replicates=replicates, **timing)
+    checks.fits("runs", runs, setup.bytes_a_case)
     results, blocks = None, range(-(-runs // block_size()))
     mine = distributed.share(blocks) or [0]
     begin = time.monotonic()
     sizes = {block: min(block_size(), runs - block * block_size()) for block in mine}
     with bar(progress, sum(sizes.values())) as shown:
-        for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, chunk=chunk, memory=memory, devices=devices):
+        for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, **how):
             results = _stored(results, part, block, runs)
             shown.update(sizes[block])
     results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))

@@ -6,6 +6,7 @@ A grid has one dimension a path, and its points are numbered with the last path 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -15,9 +16,11 @@ import numpy as np
 from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation, is_distribution, value
 from iblf_jax.scenario import Scenario
-from iblf_jax.studies.designs import split, unit_points
+from iblf_jax.studies.designs import MOST_RUNS, split, unit_points
 from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, plan, sample_size
 
+MOST_DIMS = 60
+"""NumPy's arrays have 64; runs and joints come on top."""
 DESIGNS = ("grid", "random", "latin_hypercube")
 POINT = "point"
 _SALT = 0x706F696E
@@ -56,13 +59,17 @@ def make_points(scenario: Scenario, grid: Any, design: str, points: int | None, 
         if points is not None:
             raise checks.fail("points", points, "none with a grid", 'A grid has as many as it has; or take design="latin_hypercube".')
         return _grid(scenario, grid)
-    return _design(scenario, grid, design, checks.positive_integer("points", points), seed)
+    return _design(scenario, grid, design, checks.positive_integer("points", points, most=MOST_RUNS), seed)
 
 
 def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
     ticks = {path: _ticks(scenario, path, values) for path, values in grid.items()}
     dims = {path: len(values) for path, values in ticks.items()}
-    places = np.indices(tuple(dims.values())).reshape(len(dims), -1)
+    if len(dims) > MOST_DIMS:
+        raise checks.fail("grid", f"{len(dims)} paths", f"at most {MOST_DIMS}, as many dimensions as an array has")
+    total = math.prod(dims.values())
+    checks.fits("points of the grid", total, sum(8.0 * (2 + values[0].size) for values in ticks.values()))
+    places = np.indices(tuple(dims.values())).reshape(len(dims), total)
     values = {path: ticks[path][place] for path, place in zip(dims, places, strict=True)}
     return Points(dims, {path: path for path in grid}, ticks, values)
 
@@ -90,6 +97,7 @@ def _design(scenario: Scenario, grid: Mapping[str, Any], design: str, count: int
     dtype = scenario.initial.q.dtype
     by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
     designed: dict[str, np.ndarray] = {}
+    checks.fits("points", count, 3 * 8.0 * (1 + sum(math.prod(target.shape) for target in targets)))
     if design == "latin_hypercube":
         shapes = sample_size(targets, by_path)
         designed = split(

@@ -6,6 +6,8 @@ import sys
 import warnings
 from typing import Any
 
+from iblf_jax import checks
+
 DELAY = 1.0
 """Seconds before a bar appears that was not asked for."""
 
@@ -28,9 +30,10 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
       done: runs that were there before.
       unit: what is counted.
     """
+    progress = checks.flag("progress", progress, optional=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # tqdm warns where a notebook lacks ipywidgets and then falls back to text by itself
         from tqdm.auto import tqdm
-    shown = _has_reader() if progress is None else bool(progress)
+    shown = _has_reader() if progress is None else progress
     delay = DELAY if progress is None else 0.0
     return tqdm(total=total, initial=done, unit=f" {unit}", unit_scale=True, disable=not shown, delay=delay, dynamic_ncols=True)

@@ -28,14 +28,18 @@ from iblf_jax.results import Metrics
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import FAILED
 from iblf_jax.studies import statistics
-from iblf_jax.studies.blocks import MEMORY, block_size, run_blocks
-from iblf_jax.studies.designs import check_seed, split
+from iblf_jax.studies.blocks import MEMORY, block_size, checked_how, run_blocks
+from iblf_jax.studies.designs import MOST_SOBOL, check_seed, split
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.setup import Setup, prepare
 
 if TYPE_CHECKING:
     import xarray
+
+
+TAILS = (0.025, 0.975)
+"""Ends of an interval of 95 %."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,47 +126,66 @@ def sensitivity(
 
     Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
     """
-    points = checks.positive_integer("points", points)
+    points, how = checks.positive_integer("points", points, most=MOST_SOBOL[1]), checked_how(None, memory, devices)
     if points & (points - 1) or points < 2:
         raise checks.fail("points", points, "a power of two", f"Take points={max(2, 1 << round(np.log2(points)))}.")
-    if not perturbations:
+    if not isinstance(output, str) and not callable(output):
+        raise checks.fail("output", output, "the name of a metric, or a function of the metrics")
+    if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail("perturbations", perturbations, "at least one perturbation")
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
     setup = prepare(scenario, perturbations, 1, check_seed(seed), metrics=metrics, backend=backend, **timing)
     shapes = sample_size(setup.program.targets, setup.shared.cases.perturbations)
     names = [path + "".join(f"[{i}]" for i in place) for path, shape in shapes.items() for place in np.ndindex(shape)]
-    options = {"memory": memory, "devices": devices}
-    failed = 0
+    checks.fits("points", points, (len(names) + 2) * (setup.bytes_a_case + 3 * 8.0 * len(names)))
+    label = output if isinstance(output, str) else str(getattr(output, "__name__", "output"))
+    failed, values = 0, list[np.ndarray]()
     with bar(progress, points * (len(names) + 2)) as shown:
 
         def evaluate(u: np.ndarray) -> np.ndarray:
             nonlocal failed
-            y, bad = _evaluate(setup, u.T, shapes, output, options, shown)
+            y, bad = _evaluate(setup, u.T, shapes, output, how, shown)
             failed += bad
-            return y[None]
+            values.append(y)
+            # Twice, as if there were two outputs: of one number and one output SciPy makes scalars, and then fails to write into them.
+            return np.stack([y, y])
 
         rng = np.random.default_rng(setup.seed)
         found = stats.sobol_indices(func=evaluate, n=points, dists=[stats.uniform()] * len(names), rng=rng)
+        if np.ptp(np.concatenate(values[:2])) == 0:  # those of the runs whose variance all is divided by
+            mend = "Choose another output, wider distributions or more points."
+            raise checks.fail(label, float(values[0][0]), "an output that is not the same in all runs", mend)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # where an index is 0 in every resample SciPy warns and gives NaN for its interval
+            warnings.simplefilter("ignore")  # where an index is the same in every resample SciPy warns and gives NaN for its interval
             ends = found.bootstrap(confidence_level=0.95)
-    label = output if isinstance(output, str) else getattr(output, "__name__", "output")
     counts = (points * (len(names) + 2), failed)
-    orders = (np.ravel(found.first_order), np.ravel(found.total_order), _ends(ends.first_order), _ends(ends.total_order))
+    orders = (np.ravel(found.first_order[0]), np.ravel(found.total_order[0]), _ends(ends.first_order), _ends(ends.total_order))
     return Sensitivity(tuple(names), *orders, label, *counts)
 
 
 def _ends(bootstrapped: Any) -> np.ndarray:
+    """The interval of each index, (d, 2); where all resamples have the same, or BCa has none for another reason, their percentiles."""
     interval = bootstrapped.confidence_interval
-    return np.stack([np.ravel(interval.low), np.ravel(interval.high)], -1)
+    ends = np.stack([np.ravel(interval.low[0]), np.ravel(interval.high[0])], -1)
+    resampled = np.atleast_2d(bootstrapped.bootstrap_distribution[0])
+    percentiles = np.stack([np.nanquantile(np.where(np.isfinite(x), x, np.nan), TAILS) for x in resampled])
+    return np.where(np.isfinite(ends), ends, percentiles)
 
 
-def _evaluate(setup: Setup, u: np.ndarray, shapes: dict, output: Any, options: dict[str, Any], shown: Any) -> tuple[np.ndarray, int]:
+def _called(output: Callable[[Metrics], Any], metrics: Metrics) -> np.ndarray:
+    try:
+        return np.asarray(output(metrics))
+    except Exception as error:
+        expected = "a function of the metrics that returns one number a run"
+        raise checks.fail("output", f"{type(error).__name__}: {error}", expected) from error
+
+
+def _evaluate(setup: Setup, u: np.ndarray, shapes: dict, output: Any, how: dict[str, Any], shown: Any) -> tuple[np.ndarray, int]:
     """The output of every row of the unit cube, and how many of these runs failed."""
     dtype = setup.shared.cases.scenario.initial.q.dtype
     designed = dataclasses.replace(setup, runs=len(u), designed=split(u, shapes, dtype))
     parts: list[Any] = []
-    for _, part in run_blocks(setup.program, setup.shared, designed.lanes, range(-(-len(u) // block_size())), **options):
+    for _, part in run_blocks(setup.program, setup.shared, designed.lanes, range(-(-len(u) // block_size())), **how):
         shown.update(min(block_size(), len(u) - len(parts) * block_size()))
         parts.append(part)
     metrics: dict[str, Any] = {name: np.concatenate([p.metrics[name] for p in parts])[: len(u)] for name in parts[0].metrics}
@@ -170,10 +193,10 @@ def _evaluate(setup: Setup, u: np.ndarray, shapes: dict, output: Any, options: d
     if isinstance(output, str):
         y = statistics.one_number(metrics, output)
     else:
-        y = np.asarray(output(Metrics(metrics, metric_units(setup.shared.folds))))
+        y = _called(output, Metrics(metrics, metric_units(setup.shared.folds)))
     name = output if isinstance(output, str) else "output"
-    if y.shape != (len(u),):
-        raise checks.fail(name, y, f"one number a run, shape ({len(u)},)", f"Its shape is {y.shape}.")
+    if y.shape != (len(u),) or y.dtype.kind not in "fiub":
+        raise checks.fail(name, y, f"one number a run, shape ({len(u)},)", f"Its shape is {y.shape}, its type {y.dtype}.")
     if not np.all(np.isfinite(y)):
         bad = int(np.sum(~np.isfinite(y)))
         raise checks.fail(

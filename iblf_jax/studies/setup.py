@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.metrics import Fold, as_folds
 from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.studies.blocks import Program, Shared, block_size, with_settled_backend
+from iblf_jax.studies.blocks import Program, Results, Shared, _execute, block_size, with_settled_backend
 from iblf_jax.studies.designs import check_seed, split, unit_points
 from iblf_jax.studies.draws import Cases, Lanes, plan, sample_size
 
@@ -42,6 +43,16 @@ class Setup:
     def cases(self) -> int:
         """Number of cases: points times runs."""
         return self.runs * (len(next(iter(self.points.values()))) if self.points else 1)
+
+    @cached_property
+    def shapes(self) -> Results:
+        """Shapes and types of what a block leaves."""
+        return jax.eval_shape(partial(_execute, program=self.program), self.shared, self.lanes(np.arange(block_size())))
+
+    @property
+    def bytes_a_case(self) -> float:
+        """Memory that the results of a case take."""
+        return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self.shapes)) / block_size()
 
     def lanes(self, cases: np.ndarray) -> Lanes:
         """What differs between these cases; cases past the last one repeat it."""
@@ -71,7 +82,7 @@ def prepare(
     seed, scenario = check_seed(seed), canonical(scenario)
     targets, by_path = plan(scenario, perturbations)
     dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype)
+    folds = as_folds(metrics, dtype, scenario.n)
     by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
     designed: dict[str, Any] = {}
     if sampler != "independent":

@@ -83,8 +83,7 @@ def _between_replicates(events: np.ndarray, valid: np.ndarray, confidence: float
 
 def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
     """A metric as one number a run: the worst joint's, (N,)."""
-    if name not in metrics:
-        raise checks.fail("metric", name, "one of " + ", ".join(metrics))
+    checks.one_of("metric", name, metrics)
     values = np.asarray(metrics[name])
     if values.ndim == 1:
         return values

@@ -112,7 +112,7 @@ class Study:
 
     def _index(self, index: Any) -> int:
         if isinstance(index, bool) or not isinstance(index, int | np.integer) or not -self.runs <= index < self.runs:
-            raise IndexError(f"run {index!r}: the study has runs 0 to {self.runs - 1}")
+            raise IndexError(f"run {checks.shown(index)}: the study has runs 0 to {self.runs - 1}")
         return int(index) % self.runs
 
     def __getitem__(self, index: int) -> Run:
@@ -174,7 +174,10 @@ class Study:
 
         Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
         """
-        happened = self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
+        try:
+            happened = self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
+        except Exception:  # a number of more bits than flags, or nothing that is an array
+            happened = np.zeros(0)
         if happened.shape != (self.runs,) or happened.dtype != bool:
             raise checks.fail("event", event, f"flags of Status, or {self.runs} booleans")
         confidence = statistics.check_confidence(confidence)
@@ -206,6 +209,7 @@ class Study:
 
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
         """Which runs a statistic is over, (N,) bool, and what to say about it."""
+        exclude_failed = checks.flag("exclude_failed", exclude_failed)
         used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
         said = {"runs": int(used.sum()), "excluded": int(self.runs - used.sum()), "failed_excluded": str(bool(exclude_failed))}
         return used, said | {"failed_included": int(np.sum(used & (self.status & int(FAILED) != 0)))}
@@ -296,7 +300,7 @@ class Study:
         Source: design of this package.
         """
         i = self._index(index)
-        record_every = checks.positive_integer("record_every", record_every)
+        record_every = checks.recorded_every(record_every, self.setup.program.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
             raise checks.fail(f"run {i}", drawn, "admissible draws", "It was not made; see study.made.")

@@ -80,7 +80,7 @@ def correlations(study: Study, metrics: Sequence[str] | None, exclude_failed: bo
     import xarray
 
     used, said = study.chosen(exclude_failed)
-    names = list(study.metrics) if metrics is None else list(metrics)
+    names = list(study.metrics) if metrics is None else checks.listed("metrics", metrics, '["margin", "rmse"]')
     drawn = statistics.columns(study.samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
@@ -97,6 +97,7 @@ def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exc
     import xarray
 
     levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
+    exclude_failed = checks.flag("exclude_failed", exclude_failed)
     count = min(checks.positive_integer("runs", runs), study.runs)
     record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
     parts, times = [], np.zeros(0)

@@ -22,9 +22,9 @@ from iblf_jax.distributions import Perturbation
 from iblf_jax.metrics import Fold, metric_units
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.studies import config as configuration
-from iblf_jax.studies.blocks import MEMORY, Results, _execute, block_size, run_blocks
+from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
-from iblf_jax.studies.designs import check_sampler, check_seed
+from iblf_jax.studies.designs import MOST_RUNS, check_sampler, check_seed
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
 from iblf_jax.studies.progress import bar
@@ -44,15 +44,9 @@ UNITS = 16
 class _How(NamedTuple):
     """How a sweep is carried out; none of it changes a number."""
 
-    chunk: int | None
-    memory: float
-    devices: Sequence[jax.Device] | None
+    where: dict[str, Any]
+    """For `run_blocks`."""
     progress: bool | None
-
-    @property
-    def where(self) -> dict[str, Any]:
-        """For `run_blocks`."""
-        return {"chunk": self.chunk, "memory": self.memory, "devices": self.devices}
 
 
 def sweep(
@@ -87,7 +81,7 @@ def sweep(
     Args:
       scenario: what to run, of n joints.
       grid: path -> values for a grid: numbers, or arrays for a vector leaf; a number fills every entry.  Path -> distribution (or
-        `factor`, `offset` of one) for the other designs.  Empty for one point.
+        `factor`, `offset` of one) for the other designs.  Empty for one point, the scenario itself, with perturbed runs.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s].
       perturbations: path -> `factor`, `offset` or `value` of a distribution, around the values of each point.
@@ -118,17 +112,21 @@ def sweep(
 
     Source: design of this package.
     """
-    runs, chunk = checks.positive_integer("runs", runs), None if chunk is None else checks.positive_integer("chunk", chunk)
-    replicates, perturbations = check_sampler(sampler, runs, replicates), perturbations or {}
+    how = _How(checked_how(chunk, memory, devices), checks.flag("progress", progress, optional=True))
+    runs, perturbations = checks.positive_integer("runs", runs, most=MOST_RUNS), {} if perturbations is None else perturbations
+    replicates = check_sampler(sampler, runs, replicates)
+    checks.mapping("perturbations", perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
     if not perturbations and runs > 1:
         raise checks.fail("runs", runs, "1 without perturbations", "Without any all runs at a point are the same.")
-    if not perturbations and not grid:
+    if not perturbations and isinstance(grid, Mapping) and not grid:
         raise checks.fail("grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate.")
+    unit = None if unit is None else checks.positive_integer("unit", unit)
+    store = None if store is None else checks.file_path("store", store, "a folder")
     where = make_points(canonical(scenario), grid, design, points, check_seed(seed))
     options: dict[str, Any] = {"metrics": metrics, "backend": backend, "sampler": sampler, "replicates": replicates, "points": where.values}
     setup = prepare(scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options)
+    checks.fits("runs at all points", setup.cases, setup.bytes_a_case)
     config = configuration.describe(setup, where, design, float(dt))
-    how = _How(chunk, memory, devices, progress)
     result = _in_memory(setup, config, how) if store is None else _into_store(setup, config, how, store, unit)
     status, modes, errors = (np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE))
     tell_of_step(status, modes, errors, float(dt), method)
@@ -146,9 +144,10 @@ def load_sweep(store: str | os.PathLike) -> xarray.Dataset:
       `cases` say how far it is.
 
     Raises:
+      ValueError: something that is not a path.
       StoreError: no store, a foreign or a damaged one.
     """
-    opened = load_store(store)
+    opened = load_store(checks.file_path("store", store, "a folder"))
     try:
         return _dataset(opened)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, MemoryError) as error:
@@ -167,7 +166,7 @@ def _flat(results: Results) -> dict[str, Any]:
 
 def _variables(setup: Setup, config: dict[str, Any]) -> dict[str, Variable]:
     """The arrays of a sweep."""
-    shapes = _flat(jax.eval_shape(lambda *x: _execute(*x, program=setup.program), setup.shared, setup.lanes(np.arange(block_size()))))
+    shapes = _flat(setup.shapes)
     units = dict(metric_units(setup.shared.folds))
     units |= {"status": "1", "fastest_mode": "1/s"} | {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
     shapes = {name: shapes[name] for name in {n: None for n in units if n in shapes} | shapes}
@@ -210,7 +209,7 @@ def _units(setup: Setup, units: Sequence[int], unit: int, how: _How, shown: Any)
 def _chosen_unit(setup: Setup, unit: int | None) -> int:
     """Cases in a unit: whole blocks, or all there is."""
     size, cases = block_size(), setup.cases
-    wanted = min(STEPS_A_UNIT / setup.program.steps, cases / UNITS) if unit is None else checks.positive_integer("unit", unit)
+    wanted = min(STEPS_A_UNIT / setup.program.steps, cases / UNITS) if unit is None else unit
     return min(cases, size * max(1, round(wanted / size)))
 
 

@@ -38,6 +38,7 @@ from iblf_jax.status import Status
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.draws import Cases, Target, draw, plan, sample_size
 from iblf_jax.studies.progress import bar
+from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.tangents import by_coordinates
 
@@ -145,6 +146,7 @@ def falsify(
     checks.one_of("backend", backend, BACKENDS)
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
+    checks.fits("iterations", iterations, 8 * starts)
     targets, by_path = plan(scenario, sets, "sets")
     if not targets:
         raise checks.fail("sets", sets, "at least one set", "Say what may vary, and between which limits.")
@@ -153,6 +155,7 @@ def falsify(
     by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
     cases = Cases(scenario, by_path, jax.random.key(0))
     sizes = _Sizes(tuple(sample_size(targets, by_path).items()))
+    checks.fits("starts", starts, 8.0 * (1 + sizes.total) * NUMBERS_A_RUN)
     push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method, backend=backend)
     made = jax.jit(partial(_made, cases, targets, sizes))
 

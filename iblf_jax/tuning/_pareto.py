@@ -24,12 +24,13 @@ from iblf_jax import checks
 from iblf_jax.distributions import Perturbation
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario
+from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.progress import bar
 from iblf_jax.tuning._tune import build, make_method, way_in
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.optimise import Evaluator, Loop
 from iblf_jax.tuning.parameters import Block, Tunable, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST
+from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN
 from iblf_jax.tuning.robust import Risk
 
 MOST_WEIGHT = 0.95
@@ -117,12 +118,14 @@ def pareto(
     Source: design of this package.
     """
     began = time.perf_counter()
-    pair = _pair(objectives)
+    points, seed = checks.positive_integer("points", points), check_seed(seed)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    tolerance, pair = checks.positive_number("tolerance", tolerance, "1", zero=True), _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, scalarisation="log", mode="forward")
     if len(problem.box.z) > FORWARD_MOST:
         raise checks.fail("parameters", f"{len(problem.box.z)} numbers", f"at most {FORWARD_MOST} for a front", "Tie or leave out some.")
-    points = checks.positive_integer("points", points)
+    checks.fits("points", points, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = np.repeat(problem.box.z[None], points, axis=0)
     share = np.linspace(1 - MOST_WEIGHT, MOST_WEIGHT, points) if points > 1 else np.array([0.5])
     lanes = problem.lanes(z)._replace(weights=jnp.asarray(np.stack([share, 1 - share], axis=1), problem.shared.dt.dtype))

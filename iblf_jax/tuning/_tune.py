@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,22 +17,25 @@ from iblf_jax.distributions import Perturbation
 from iblf_jax.integrators import tableau
 from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
-from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.studies.designs import check_seed
+from iblf_jax.scenario import Scenario, canonical, fit_joints
+from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.draws import Cases, plan
 from iblf_jax.studies.progress import bar
+from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST, Lane, Plan, Shared, Slope, gradient, slope, value
+from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN, Lane, Plan, Shared, Slope, gradient, slope, value
 from iblf_jax.tuning.result import Setup, TuneResult
 from iblf_jax.tuning.robust import Risk, as_risk
 
 OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
 SPREAD = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a factor e for gains."""
+MOST_SHARPENINGS = 60
+"""Past them the smoothing is no number in float32."""
 SCREENED = 32
 """Points that are looked at where the first start leaves its bounds."""
 
@@ -111,20 +113,35 @@ def tune(
     Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
     """
     began = time.perf_counter()
+    iterations, starts = (
+        checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS),
+        checks.positive_integer("starts", starts),
+    )
+    patience, report_runs = (
+        checks.positive_integer("patience", patience),
+        checks.positive_integer("report_runs", report_runs, most=MOST_RUNS),
+    )
+    sharpenings = checks.positive_integer("sharpenings", sharpenings, least=0, most=MOST_SHARPENINGS)
+    tolerance = checks.positive_number("tolerance", tolerance, "1", zero=True)
+    learning_rate = checks.positive_number("learning_rate", learning_rate, "1")
+    confidence, resample, seed = check_confidence(confidence), checks.flag("resample", resample), check_seed(seed)
+    report_seed = (seed + 1) % 2**32 if report_seed is None else check_seed(report_seed)
+    checkpoint = None if checkpoint is None else checks.file_to_write("checkpoint", checkpoint)
+    if callback is not None and not callable(callback):
+        raise checks.fail("callback", callback, "a function that is called with the loop after each step")
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing, mode=mode)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
-    iterations, starts = checks.positive_integer("iterations", iterations), checks.positive_integer("starts", starts)
+    checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = starting_points(problem.box, starts, seed)
     evaluator = Evaluator(problem.plan, problem.shared, problem.lanes(z), mode)
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
-    stages = checks.positive_integer("sharpenings", sharpenings) if sharpenings else 0
-    stages = stages if method_.settles and is_smoothed(problem.shared.objective) else 0
+    stages = sharpenings if method_.settles and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
     loop.rescue = partial(way_in, problem, seed)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
     mark = fingerprint(problem.plan, problem.shared, options)
-    if checkpoint is not None and Path(checkpoint).exists():
+    if checkpoint is not None and checkpoint.exists():
         load_checkpoint(checkpoint, loop, mark)
     with bar(progress, iterations, int(loop.state["iteration"]), unit="steps") as shown:
 
@@ -135,7 +152,7 @@ def tune(
             if callback is not None:
                 callback(loop)
 
-        stopped = loop.run(iterations, tolerance=tolerance, patience=checks.positive_integer("patience", patience), on_step=on_step)
+        stopped = loop.run(iterations, tolerance=tolerance, patience=patience, on_step=on_step)
     _check_found(loop, problem)
     setup = Setup(
         problem.shared.objective,
@@ -147,8 +164,8 @@ def tune(
         float(dt),
         method,
         backend,
-        checks.positive_integer("report_runs", report_runs),
-        (seed + 1) % 2**32 if report_seed is None else check_seed(report_seed),
+        report_runs,
+        report_seed,
         confidence,
         tuple(zip(*(_in_units(problem.plan.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
     )
@@ -177,14 +194,15 @@ def build(
     tableau(timing["method"])
     checks.one_of("backend", timing.get("backend", "auto"), BACKENDS)
     steps = checks.whole_steps(timing["duration"], timing["dt"])
-    seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs), canonical(scenario)
+    seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs, most=MOST_RUNS), canonical(scenario)
     dtype = scenario.initial.q.dtype
-    targets, by_path = plan(scenario, perturbations or {})
+    targets, by_path = plan(scenario, {} if perturbations is None else perturbations)
     if not targets and runs > 1:
         raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
-    blocks, box = layout(scenario, parameters, timing["dt"], timing["method"])
-
+    blocks, box = layout(scenario, parameters, float(timing["dt"]), timing["method"])
+    checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
     goal = checked(objective)
+    fit_joints(goal, scenario.n, "objective")
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))

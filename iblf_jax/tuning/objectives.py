@@ -85,6 +85,12 @@ class Requirement:
     event: str = static(default="value")
     name: str = static(default="requirement")
 
+    def check(self) -> None:
+        """Raises ValueError for a share above 1, or another event."""
+        if checks.is_concrete(self.allowed) and self.allowed > 1:
+            raise checks.fail("Requirement.allowed", self.allowed, "a share of the runs, from 0 to 1")
+        checks.one_of("Requirement.event", self.event, ("value", "violated"))
+
     def excess(self, x: jax.Array) -> jax.Array:
         """g: below zero where the requirement holds."""
         return (x - self.limit) / self.scale
@@ -116,6 +122,7 @@ class Objective:
 
     def __mul__(self, weight: Any) -> Objective:
         weight = checks.as_floats("weight", weight)
+        checks.shape_is("weight", weight, ())
         terms = tuple(Term(t.quantity, weight * t.weight, t.scale, t.limit, t.sharpness, t.shape, t.name) for t in self.terms)
         return Objective(terms, self.requirements)
 
@@ -323,6 +330,5 @@ def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requi
       probability: the limit.
       scale: the margin that matters [rad].
     """
-    quantity = Peak(scale, "deficit")
-    name, zero = f"violation probability < {probability:g}", checks.as_floats("limit", 0.0)
-    return Requirement(quantity, zero, scale, probability, event="violated", name=name)
+    made = Requirement(Peak(scale, "deficit"), checks.as_floats("limit", 0.0), scale, probability, event="violated")
+    return dataclasses.replace(made, name=f"violation probability < {probability:g}")

@@ -287,11 +287,13 @@ def load_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
     Raises:
       ValueError: the file is not a checkpoint, or one of another problem.
     """
+    place = checks.file_to_read("checkpoint", path)
     try:
-        with np.load(path) as file:
+        with np.load(place) as file:
             arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise checks.fail("checkpoint", str(path), "a checkpoint of tune", f"It cannot be read: {error}") from error
+    except Exception as error:  # torn, another kind of file, or one that only looks like a zip
+        mend = f"It cannot be read ({type(error).__name__}: {error}): delete it or name another file."
+        raise checks.fail("checkpoint", str(path), "a checkpoint of tune", mend) from error
     if str(arrays.get("fingerprint")) != mark:
         raise checks.fail(
             "checkpoint",
@@ -299,6 +301,9 @@ def load_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
             "a checkpoint of this very problem",
             "Scenario, objective or options differ: delete it or name another file.",
         )
-    structure = jax.tree.structure(loop.state)
-    loop.state = jax.tree.unflatten(structure, [np.array(arrays[name]) for name in sorted(arrays) if name.startswith("state_")])
+    leaves, structure = jax.tree.flatten(loop.state)
+    found = [np.array(arrays[name]) for name in sorted(arrays) if name.startswith("state_")]
+    if [(x.shape, x.dtype) for x in found] != [(np.shape(x), np.asarray(x).dtype) for x in leaves]:
+        raise checks.fail("checkpoint", str(path), "a whole checkpoint", "Something is missing in it: delete it or name another file.")
+    loop.state = jax.tree.unflatten(structure, found)
     loop.history = {name[8:]: list(x) for name, x in arrays.items() if name.startswith("history_")}

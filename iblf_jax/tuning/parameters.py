@@ -13,7 +13,6 @@ fastest mode of the closed loop grows with every gain, and past stability / dt t
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -86,9 +85,16 @@ def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False,
     """
     if scale is not None:
         checks.one_of("tunable: scale", scale, ("log", "linear"))
-    if low is not None and high is not None and not np.all(np.asarray(low, float) < np.asarray(high, float)):
-        raise checks.fail(f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them.")
-    return Tunable(path, low, high, tied, scale)
+    paths.parse(path)
+    low, high = (None if x is None else checks.as_floats(f"tunable({path!r}): {name}", x) for name, x in (("low", low), ("high", high)))
+    if low is not None and high is not None:
+        try:
+            below = bool(jnp.all(low < high))
+        except (TypeError, ValueError):  # shapes that do not fit each other
+            below = False
+        if not below:
+            raise checks.fail(f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them.")
+    return Tunable(path, low, high, checks.flag("tunable: tied", tied), scale)
 
 
 def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple[tuple[Block, ...], Box]:
@@ -102,9 +108,8 @@ def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple
     Raises:
       ValueError: an unknown or overlapping path, limits that exclude the start or are not admissible.
     """
-    if isinstance(parameters, str) or not isinstance(parameters, Sequence) or not parameters:
-        raise checks.fail("parameters", parameters, 'a list of paths, such as ["controller.k1", "controller.K2"]')
-    wanted = [x if isinstance(x, Tunable) else Tunable(x) for x in parameters]
+    given = checks.listed("parameters", parameters, '["controller.k1", "controller.K2"]')
+    wanted = [x if isinstance(x, Tunable) else Tunable(x) for x in given]
     check_paths(scenario, [x.path for x in wanted], "parameters")
     blocks, parts, start = [], [], 0
     for item in wanted:
@@ -137,11 +142,11 @@ def _one(scenario: Scenario, item: Tunable, start: int, dt: float, method: str) 
 def _limit(item: Tunable, name: str, given: Any, default: Any, value: np.ndarray) -> np.ndarray:
     if given is None:
         given = default() if callable(default) else default
-    try:
-        limit = np.broadcast_to(np.asarray(given, float), value.shape)
-    except (TypeError, ValueError):
-        raise checks.fail(f"tunable({item.path!r}): {name}", given, f"one number, or shape {value.shape}") from None
-    return limit
+    field = f"tunable({item.path!r}): {name}"
+    limit = np.asarray(checks.as_floats(field, given), float)
+    if limit.shape not in ((), value.shape):
+        raise checks.fail(field, given, f"one number, or shape {value.shape}")
+    return np.broadcast_to(limit, value.shape)
 
 
 def _default_low(path: str, sign: str | None) -> float:

@@ -71,6 +71,10 @@ class Lane(NamedTuple):
     mu: Any
 
 
+NUMBERS_A_RUN = 100
+"""Numbers that one run of a batch holds while it is computed, roughly: its state, its stages, its folds."""
+
+
 class Value(NamedTuple):
     """A problem at one z."""
 

@@ -84,7 +84,7 @@ class Integral:
     """
 
     signal: str = static(default="error")
-    joints: jax.Array = leaf("1", shape="any", default=1.0)
+    joints: jax.Array = leaf("1", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     tolerance: jax.Array | None = leaf("rad", sign="positive", shape="scalar", default=None)
     units: ClassVar[dict[str, str]] = {"error": "rad^2 s", "torque": "N^2 m^2 s", "torque_rate": "N^2 m^2/s", "outside": "s"}
@@ -136,7 +136,7 @@ class Peak:
 
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
     signal: str = static(default="torque")
-    joints: jax.Array = leaf("1", shape="any", default=1.0)
+    joints: jax.Array = leaf("1", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     smoothing: jax.Array = leaf("1", sign="positive", shape="scalar", default=0.01)
     units: ClassVar[dict[str, str]] = {name: unit for name, unit in SIGNALS.items() if name != "outside"}

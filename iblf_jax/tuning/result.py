@@ -20,7 +20,7 @@ from iblf_jax.rollout import trajectory
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.problem import UNSOUND
+from iblf_jax.tuning.problem import NUMBERS_A_RUN, UNSOUND
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
@@ -189,12 +189,14 @@ class TuneResult:
         """
         for name in (first, second):
             checks.one_of("landscape: name", name, self.names)
-        factor = np.exp(np.linspace(-span, span, checks.positive_integer("points", points)))
+        points, span = checks.positive_integer("points", points), checks.positive_number("span", span, "1")
+        checks.fits("points", points, 8 * points * NUMBERS_A_RUN)
+        factor = np.exp(np.linspace(-span, span, points))
         a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
         changes = {first: np.repeat(a, points), second: np.tile(b, points)}
         setup, scenario = self.setup, canonical(self.scenario)
         dtype = scenario.initial.q.dtype
-        folds = as_folds((Quantities(setup.objective.quantities),), dtype)
+        folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario.n)
         steps = checks.whole_steps(setup.duration, setup.dt)
         options = {"steps": steps, "method": setup.method, "backend": setup.backend}
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), **options)

@@ -32,7 +32,8 @@ class Risk(NamedTuple):
 def as_risk(risk: str | Risk) -> Risk:
     """A Risk from what the user gave, "mean", "cvar", "worst" or `cvar(level)`."""
     if isinstance(risk, Risk):
-        return risk
+        checks.one_of("risk", risk.kind, KINDS)
+        return risk if risk.kind != "cvar" else cvar(risk.level)
     checks.one_of("risk", risk, KINDS)
     return Risk(risk)
 
