@@ -17,6 +17,7 @@ from iblf_jax.compact_loop import run
 from iblf_jax.integrators import tableau
 from iblf_jax.metrics import Fold, as_folds, metric_units
 from iblf_jax.results import Metrics, Rollout
+from iblf_jax.robots import joint_names
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.status import FAILED, Status, describe
 from iblf_jax.step_size import comfortable_dt, find_dt
@@ -150,8 +151,10 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     metrics = result.metrics
     if status & Status.BOUND_VIOLATED and "first_violation_time" in metrics:
         joint = int(metrics["first_violation_joint"])
+        name = joint_names(result.scenario.plant, result.n)[joint]
         texts.append(
-            f"Joint {joint} left its bounds first, at t = {float(metrics['first_violation_time']):.4g} s; "
+            f"Joint {joint}{'' if name == f'joint {joint}' else f' ({name})'} left its bounds first, "
+            f"at t = {float(metrics['first_violation_time']):.4g} s; "
             f"its smallest margin is {float(metrics['margin'][joint]):.3g} rad."
         )
     if status & Status.STEP_TOO_LARGE:
@@ -186,7 +189,7 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
     sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)
     where = f"t = {float(times[sample]):.4g} s"
     return checks.fail(
-        f"reference of joint {joint}",
+        f"reference of {joint_names(result.scenario.plant, result.n)[joint]}",
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g}, {float(upper[sample, joint]):.6g}) at {where}",
         "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the bounds or shorten the run.",

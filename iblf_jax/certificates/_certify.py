@@ -16,6 +16,7 @@ from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed
 from iblf_jax.results import Rollout
+from iblf_jax.robots import joint_names
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
 
@@ -128,7 +129,8 @@ def _one(run: Rollout) -> Certificate:
         parts.append(of_stretch(facts))
         traces.append(_traces(facts))
     lines = tuple(over_run(whole, parts))
-    return Certificate(_heading(run.scenario), lines, _numbers(whole), Traces(*map(np.concatenate, zip(*traces, strict=True))))
+    joined = Traces(*map(np.concatenate, zip(*traces, strict=True)))
+    return Certificate(_heading(run.scenario), lines, _numbers(whole), joined, joints=joint_names(run.scenario.plant, run.n))
 
 
 def _numbers(facts: Whole) -> dict[str, Any]:
@@ -199,7 +201,7 @@ def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], c
     assert worst is not None
     merged = tuple(_worst_line(same, disbelieved) for same in lines.values())
     _, index, certificate = worst
-    return Certificate(certificate.heading, merged, certificate.numbers, certificate.traces, tuple(judged), index)
+    return Certificate(certificate.heading, merged, certificate.numbers, certificate.traces, tuple(judged), certificate.joints, index)
 
 
 def _badness(line: Line) -> tuple[float, float]:

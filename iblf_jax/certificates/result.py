@@ -92,6 +92,8 @@ class Certificate:
     """Of the run, or of the worst of many."""
     runs: tuple[int, ...] = ()
     """The runs that were judged, if there were many."""
+    joints: tuple[str, ...] = ()
+    """What the joints are called."""
     worst_run: int | None = None
     """The run whose inequality has the smallest margin (or fails), if there were many; the traces are its."""
 

@@ -42,9 +42,7 @@ def windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) ->
     if zoom is None:
         wanted = 2.5 * max(transient_end(curves, row.quantity, row.joint) for row in rows)
         zoom = float(f"{min(max(wanted, 0.01 * end), MOST_ZOOMED * end):.0e}") if wanted else ZOOM_SHARE * end
-    if isinstance(zoom, bool) or not isinstance(zoom, int | float | np.number) or not np.isfinite(zoom) or zoom <= 0:
-        raise checks.fail("zoom", zoom, "a time > 0 [s]")
-    return (0.0, end), (0.0, min(float(zoom), end))
+    return (0.0, end), (0.0, min(checks.positive_number("zoom", zoom, "s"), end))
 
 
 @_style.styled()

@@ -23,6 +23,7 @@ from iblf_jax.plotting._arm import Scene, motions_of
 from iblf_jax.plotting._curves import Curve, curves_of
 from iblf_jax.plotting._figures import Runs
 
+MOST_FPS, MOST_FRAMES = 50.0, 10_000
 LONGEST = 10.0
 """How long an animation lasts at most if its speed is not given [s]."""
 
@@ -52,7 +53,9 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
     writers: dict[str, Any] = {".gif": _write_gif, ".html": _write_html}
     if path.suffix.lower() not in writers:
         raise checks.fail("path", str(path), f"a file ending of {' or '.join(writers)}")
-    fps = _positive("fps", fps, "frames a second, more than 0 and at most 50", 50.0)
+    fps = checks.positive_number("fps", fps, "1/s")
+    if fps > MOST_FPS:
+        raise checks.fail("fps", fps, f"at most {MOST_FPS:g} frames a second")
     t = _instants(curves, fps, speed)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _style.styled():
@@ -61,17 +64,14 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
     return path
 
 
-def _positive(name: str, value: Any, expected: str, most: float = np.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 < value <= most or not np.isfinite(value):
-        raise checks.fail(name, value, expected)
-    return float(value)
-
-
 def _instants(curves: list[Curve], fps: float, speed: float | None) -> np.ndarray:
     """The times of the frames, from 0 to the end of the longest run, (F,) [s]."""
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves)
-    speed = max(1.0, end / LONGEST) if speed is None else _positive("speed", speed, "a number > 0")
-    return np.linspace(0.0, end, max(2, round(end / speed * fps) + 1))
+    speed = max(1.0, end / LONGEST) if speed is None else checks.positive_number("speed", speed, "1")
+    frames = end / speed * fps
+    if not frames <= MOST_FRAMES:
+        raise checks.fail("speed", speed, f"one at which the run has at most {MOST_FRAMES} frames", f"It would have {frames:.3g}.")
+    return np.linspace(0.0, end, max(2, round(frames) + 1))
 
 
 def _pictures(scene: Scene) -> Iterator[Image.Image]:

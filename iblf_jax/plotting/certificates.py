@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from iblf_jax import checks
 from iblf_jax.certificates import Certificate, Traces
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import thinned
+from iblf_jax.plotting._curves import plain, thinned
 
 WIDTH = 10.0
 HEIGHT = 5.4
@@ -43,7 +43,7 @@ def certificate(shown: Certificate, *, title: str = "Theorem 2 along the run", u
     panels = figure.subplots(2, 3)
     _against_bound(panels[0, 0], traces.t, {"$V_2$": traces.V}, traces.envelope, "Lyapunov function $V_2$", "1")
     _inequality(panels[0, 1], traces)
-    _relative_error(panels[0, 2], traces)
+    _relative_error(panels[0, 2], traces, shown.joints)
     _against_bound(panels[1, 0], traces.t, {"$|e_2|$": traces.e2}, traces.e2_bound, "velocity error $|e_2|$", "rad/s")
     words = r"estimation error $|\tilde f|$"
     _against_bound(panels[1, 1], traces.t, {r"$|\tilde f|$": traces.f_tilde}, traces.f_tilde_bound, words, "N m")
@@ -106,12 +106,12 @@ def _inequality(axes: Axes, traces: Traces) -> None:
     axes.legend(loc="best", **LEGEND)
 
 
-def _relative_error(axes: Axes, traces: Traces) -> None:
+def _relative_error(axes: Axes, traces: Traces, joints: tuple[str, ...]) -> None:
     """The relative error xi of every joint between its bounds and the walls."""
     n = traces.xi.shape[1]
     for joint in range(n):
         look = _style.series(joint)
-        axes.plot(*thinned(traces.t, traces.xi[:, joint]), label=f"joint {joint}", **look)
+        axes.plot(*thinned(traces.t, traces.xi[:, joint]), label=plain(joints[joint]), **look)
         own = _limit() | ({"color": look["color"], "alpha": 0.45} if np.ptp(traces.xi_bound, axis=1).max(initial=0.0) > 1e-3 else {})
         for sign in (1, -1):
             text = "bound" if joint == 0 and sign == 1 else "_"

@@ -34,7 +34,7 @@ from iblf_jax.paths import get, why_inadmissible, with_parameters
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.status import Status
+from iblf_jax.status import Status, describe
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.draws import Cases, Target, draw, plan, sample_size
 from iblf_jax.studies.progress import bar
@@ -48,6 +48,10 @@ HALVINGS = 8
 """How often a step that leads out of what is admissible is halved before the attack stays where it is."""
 SMOOTHING = 1e-3
 """rad.  Of the smallest margin over time and joints."""
+
+
+NO_ANSWER = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
+"""Flags of runs that say nothing about the law: no law could keep the bounds, or the integrator is to blame."""
 
 
 class _Sizes(NamedTuple):
@@ -84,7 +88,7 @@ class Attack:
     status: int
     """Flags of `Status` of that run."""
     history: np.ndarray
-    """Margin of every attack at every step, (iterations + 1, starts) [rad]; NaN where the reference left the bounds."""
+    """Margin of every attack at every step, (iterations + 1, starts) [rad]; NaN for runs that are no answer (`NO_ANSWER`)."""
     runs: int
     """Rollouts with derivatives that were made."""
     timing: dict[str, Any]
@@ -101,6 +105,7 @@ class Attack:
     def __repr__(self) -> str:
         word = "FALSIFIED" if self.violated else "not falsified"
         lines = [f"Attack({word}: smallest margin {self.margin:.4g} rad, {self.first_margin:.4g} at random; {self.runs} runs)"]
+        lines += [f"  status: {describe(self.status)}"]
         lines += [f"  {path}: {np.array2string(np.asarray(x), precision=5)}" for path, x in self.values.items()]
         return "\n".join(lines)
 
@@ -169,7 +174,7 @@ def falsify(
     with bar(progress, iterations + 1, unit="steps") as shown:
         for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
             margin, slope, status = (np.asarray(x) for x in push(cases, step, jnp.asarray(u, dtype)))
-            fine = np.isfinite(margin) & (status & int(Status.INFEASIBLE_REFERENCE) == 0)
+            fine = np.isfinite(margin) & (status & int(NO_ANSWER) == 0)
             history.append(np.where(fine, margin, np.nan))
             s = int(np.argmin(np.where(fine, margin, np.inf)))
             if fine[s] and (best is None or margin[s] < best[0]):
@@ -185,7 +190,10 @@ def falsify(
             shown.update(1)
             shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} rad")
     if best is None:
-        mend = "Its reference leaves the bounds in every run that was tried (Assumption 2): narrow the sets, or widen the bounds."
+        mend = (
+            "In every run that was tried the reference leaves the bounds (Assumption 2) or the step is too large: narrow the sets, "
+            "widen the bounds, or take a smaller dt."
+        )
         raise none_admissible("sets", ranges, mend)
     values = {path: np.asarray(x) for path, x in made(jnp.asarray(best[1], dtype)).items()}
     timing = {"duration": duration, "dt": dt, "method": method}
