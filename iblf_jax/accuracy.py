@@ -52,9 +52,9 @@ class Accuracy(NamedTuple):
     """The estimate as it goes from step to step.  m numbers: positions, velocities, state of the observer."""
 
     rates: tuple[jax.Array, ...]
-    """The last rates, (m,) each, newest last."""
+    """The last rates, (2 n,) each, newest last: of the positions, and of where they end up, x'_q + R x'_y."""
     drift: jax.Array
-    """L, (m,)."""
+    """L of these, (2 n,)."""
     response: jax.Array
     """R, (n, m - n)."""
     error: jax.Array
@@ -96,20 +96,27 @@ def begin(method: str, rate_at: Callable[[jax.Array], jax.Array], state: LoopSta
     jacobian = (rates[1:, n:] - rates[0, n:]) / h[:, None]  # a row for each number that moves: J transposed
     response = solve(SLOWEST * jnp.eye(x.size - n, dtype=x.dtype) - jacobian, jnp.eye(x.size - n, n, dtype=x.dtype)).T
     response = jnp.where(jnp.isfinite(response), response, 0.0)
-    history = (jnp.zeros_like(x),) * (len(tableau(method).differences) - 1)
-    return Accuracy(history, jnp.zeros_like(x), response, jnp.zeros_like(x[:n]), jnp.zeros_like(x[0]))
+    none = jnp.zeros((2 * n,), x.dtype)
+    history = (none,) * (len(tableau(method).differences) - 1)
+    return Accuracy(history, none, response, none[:n], none[0])
+
+
+def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
+    """The rate of the positions, and of where they end up, (2 n,)."""
+    flat, n = jax.lax.stop_gradient(numbers(slope)), slope.q.size
+    return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
 
 
 def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array | int, slope: LoopState, width: jax.Array) -> Accuracy:
     """The estimate after one more instant, at which the rate of the state and the width of the tube, (n,) [rad], are known."""
     table, n = tableau(method), width.size
-    now, width = jax.lax.stop_gradient((numbers(slope), width))
-    rates = (*accuracy.rates, now)
+    width = jax.lax.stop_gradient(width)
+    rates = (*accuracy.rates, _rate(accuracy, slope))
     complete = index >= (len(rates) - 1) // (2 if table.halfway else 1)
     drift = (1.0 - SLOWEST * dt) * accuracy.drift
     for weight, rate in zip(table.differences, rates, strict=True):
         drift = drift + jnp.where(complete, weight * dt, 0.0) * rate
-    here = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[:n] + matvec(accuracy.response, drift[n:])))
+    here = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
     relative = jnp.maximum(accuracy.relative, jnp.max(here / width))
     return Accuracy(rates[1:], drift, accuracy.response, jnp.maximum(accuracy.error, here), relative)
 
@@ -119,7 +126,7 @@ def passed(accuracy: Accuracy, method: str, slopes: list[LoopState]) -> Accuracy
     halfway = tableau(method).halfway
     if not halfway:
         return accuracy
-    return accuracy._replace(rates=(*accuracy.rates[1:], jax.lax.stop_gradient(numbers(slopes[halfway]))))
+    return accuracy._replace(rates=(*accuracy.rates[1:], _rate(accuracy, slopes[halfway])))
 
 
 def between_stages(scenario: Scenario, accuracy: Accuracy, method: str, dt: jax.Array, steps: int | jax.Array) -> Accuracy:

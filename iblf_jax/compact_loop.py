@@ -32,7 +32,7 @@ def is_for(scenario: Scenario, dt) -> bool:
 def run_compactly(scenario: Scenario, folds, dt, *, steps: int, record_every: int | None, method: str, alone: bool = False) -> Outcome:
     """As `time_loop.scan_steps`, for a closed loop of so many operations that compiling is what takes the time.
 
-    The closed loop is there once, in a loop over the stages of the integrator, and once more where its modes are measured.  So the
+    The closed loop is there once, in a loop over the stages of the integrator, and where it is differentiated, start and end.  So the
     sample at the end is that of a step that is not made, and the accumulators begin with the first sample.  `alone` says that nobody
     will batch it from outside: then its pieces become machine functions.
     """

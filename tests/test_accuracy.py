@@ -85,7 +85,7 @@ def test_the_estimate_is_about_the_error(shaken, rng, method):
         flagged, good, alarms = flagged + np.sum(error > TOLERANCE), good + np.sum(fine_run), alarms + np.sum(fine_run & found)
     assert flagged > 0
     assert good > 0 or method == "euler"
-    assert alarms <= {"rk4": 0.05, "heun": 0.4, "euler": 1.0}[method] * good
+    assert alarms <= {"rk4": 0.1, "heun": 0.4, "euler": 1.0}[method] * good
 
 
 def test_a_good_run_says_how_good(short_run):
@@ -150,8 +150,9 @@ def test_the_two_runs_side_by_side(shaken):
     np.testing.assert_allclose(pair.coarse[:2], run.q[-1], atol=1e-9)
 
 
-def test_no_step_will_do(shaken):
+def test_no_step_will_do(shaken, monkeypatch):
     """A torque that no affordable step resolves: the advice of the loop's modes, and a warning."""
+    monkeypatch.setattr(step_size, "MOST_STEPS", 20_000)
     wild = ij.with_parameters(shaken, {"disturbance.frequency": 1e10, "disturbance.amplitude": 1e3})
     with pytest.warns(UserWarning, match="No step down to"):
         assert ij.recommended_dt(wild, duration=0.01) == 1e-3

@@ -321,7 +321,7 @@ def test_without_the_extra_the_message_says_how(monkeypatch, file):
         return plain(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(ImportError, match=r"iblf_jax\[robots\]"):
+    with pytest.raises(ImportError, match=r"\.\[robots\]"):
         ij.robots.load(ARMS / "ur5.urdf")
 
 

@@ -256,7 +256,7 @@ def test_the_paper_s_step_stays_in_registers(paper, tmp_path):
     found = re.search(r"function 'iblf_jax_advance'.*?(\d+) bytes spill stores.*?Used (\d+) registers", report, re.DOTALL)
     assert found, report
     assert int(found[1]) == 0
-    assert int(found[2]) <= 168, "three blocks of 128 threads fit a multiprocessor"
+    assert int(found[2]) <= 200, "two blocks of 128 threads fit a multiprocessor; the estimate of the error takes 25 registers"
 
 
 @needs_nvrtc

@@ -44,7 +44,7 @@ def test_integrals_and_peaks(short_run, recorded):
     }
     for name, value in expected.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-9, err_msg=name)
-    assert set(metrics) == {*expected, "settling_time", "overshoot"}
+    assert set(metrics) == {*expected, "settling_time", "overshoot", "numerical_error", "relative_numerical_error"}
 
 
 def test_every_metric_has_a_unit(short_run):
