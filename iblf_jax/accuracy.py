@@ -15,8 +15,8 @@ at the start.  So the error of the positions is about
     max_k max(|L_q|, |L_q + R L_y|).
 
 What the stages of a step cannot see, a reference or a disturbance that goes through whole periods between them, is looked for on its own
-(`between_stages`).  Against runs at a sixteenth of the step the estimate is 0.5 to 30 times the error where that matters, above 1e-4 of
-the tube, and larger below.
+(`between_stages`).  Against runs at a sixteenth of the step the estimate is a third to thirty times the error where that matters, above
+1e-4 of the tube, and larger below.
 """
 
 from __future__ import annotations

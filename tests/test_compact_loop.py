@@ -11,6 +11,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import compact_loop, one_function, rollout, stability, time_loop
+from iblf_jax.closed_loop import initial_state
 from iblf_jax.metrics import as_folds
 from iblf_jax.scenario import canonical
 from iblf_jax.status import Status
@@ -80,7 +81,7 @@ def test_long_loops_take_it(paper, monkeypatch):
 
 def test_the_two_ways_to_measure_a_mode_agree(paper):
     scenario = canonical(paper)
-    state = stability.initial_state(scenario)
+    state = initial_state(scenario)
     x, whole = jax.flatten_util.ravel_pytree(state)
 
     def rate(x):

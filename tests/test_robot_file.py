@@ -133,7 +133,7 @@ def test_a_reference_is_needed(folder):
 
 def test_without_the_extra_it_says_so(folder, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
-    with pytest.raises(ValueError, match=r"robot\.file: .*iblf_jax\[robots\]"):
+    with pytest.raises(ValueError, match=r"robot\.file: .*\.\[robots\]"):
         scenario_file.load_scenario(written(folder, ROBOT + REFERENCE))
 
 

@@ -58,7 +58,8 @@ def test_violation_with_joint_and_time(thrown):
 
 
 def test_the_guard_alone_is_not_a_failure(paper):
-    near = ij.with_parameters(paper, {"initial.q": [1.0399, 0.8]})  # the upper bound of joint 0 is 1.04
+    wide = ij.with_parts(paper, controller=dataclasses.replace(paper.controller, barrier=ij.barriers.Integral(guard=0.05)))
+    near = ij.with_parameters(wide, {"initial.q": [0.5 + 0.9505 * 0.54, 0.8], "initial.dq": [-2.0, 0.0]})  # xi is 0.9505, for an instant
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = ij.simulate(near, **SHORT)

@@ -24,7 +24,7 @@ from iblf_jax.status import Status, describe
 
 STRETCH = 1024
 """Steps that are looked at together: memory does not grow with the length of a run, and one program serves every length."""
-DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INACCURATE
+DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
 TORQUES = ("tau", "disturbance", "disturbance_estimate")
 
