@@ -125,6 +125,7 @@ def test_the_guard_beyond_the_first_instant_is_told(paper):
     assert int(run.status) & Status.GUARD_STAYED
 
 
+@pytest.mark.slow
 def test_the_recommended_step_is_one_that_the_run_itself_is_content_with(paper):
     """A start just outside the guard: the barrier is a thousand times stiffer there than along the reference."""
     near = ij.with_parameters(paper, {"initial.q": [1.04 - 2e-5, 0.9 - 1e-4]})
@@ -136,6 +137,7 @@ def test_the_recommended_step_is_one_that_the_run_itself_is_content_with(paper):
     assert not int(run.status) & (Status.INACCURATE | Status.STEP_TOO_LARGE)
 
 
+@pytest.mark.slow
 def test_the_two_runs_side_by_side(shaken):
     """The difference that decides is that between the run and one at a sixteenth of the step, but for what the third leaves."""
     scenario = canonical(shaken)
@@ -158,6 +160,7 @@ def test_no_step_will_do(shaken, monkeypatch):
         assert ij.recommended_dt(wild, duration=0.01) == 1e-3
 
 
+@pytest.mark.slow
 def test_a_study_names_the_step_that_its_runs_need(paper):
     perturbations = {"controller.K2": ij.factor(ij.uniform(0.5, 6.0))}
     with pytest.warns(UserWarning, match=r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12]; ij\.recommended_dt"):

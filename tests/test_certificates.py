@@ -283,6 +283,7 @@ def assert_alike(one: Certificate, other: Certificate):
         assert a.margin is None or a.margin == pytest.approx(b.margin, rel=1e-6, abs=1e-9), a.name
 
 
+@pytest.mark.slow
 def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     whole = certify(shaken.scenario, shaken)
     assert whole.numbers["F_d"] > 100
