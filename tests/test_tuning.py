@@ -98,9 +98,8 @@ def test_reverse_mode_remembers_few_states(paper):
         plan = _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3})
         compiled = problem.gradient.lower(plan.shared, plan.lanes(plan.box.z[None]), plan=plan.plan).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
-    state = sum(
-        x.nbytes for x in jax.tree.leaves(start(canonical(paper), problem.fold_of(plan.shared.objective, jnp.float64), plan.shared.dt))
-    )
+    folds = problem.fold_of(plan.shared.objective, jnp.float64)
+    state = sum(x.nbytes for x in jax.tree.leaves(start(canonical(paper), folds, "rk4", plan.shared.dt)))
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
