@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.closed_loop import LoopState, rate
-from iblf_jax.integrators import tableau
 from iblf_jax.one_function import as_one_function, is_long
 from iblf_jax.scenario import Scenario
 
@@ -91,11 +90,6 @@ def jacobian_by_differences(rate, x: jax.Array) -> jax.Array:
     h = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.abs(x))
     rates = jax.lax.map(lambda move: rate(x + move), jnp.concatenate([jnp.diag(h), -jnp.diag(h)]))
     return (rates[: x.size] - rates[x.size :]) / (2.0 * h[:, None])
-
-
-def stable_dt(mode: float, method: str) -> float:
-    """The largest stable step for a mode [1/s], [s]."""
-    return tableau(method).stability / mode
 
 
 @jax.jit
