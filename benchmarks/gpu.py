@@ -27,7 +27,8 @@ from _timing import compile_seconds, interleaved, report
 from throughput import GAINS, chain, draws, textbook
 
 import iblf_jax as ij
-from iblf_jax import lowering
+from iblf_jax.engine.execute import run_batch, run_batch_jvp
+from iblf_jax.engine.step import Run
 from iblf_jax.metrics import standard
 from iblf_jax.scenario import canonical
 
@@ -63,10 +64,10 @@ def candidates(scenario, dtype: str, is_paper: bool) -> dict:
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
 
     def on(backend, folds=folds):
-        return lambda v, dt, steps: lowering.run_batch(scenario, v, folds, dt, steps=steps, method="rk4", backend=backend)
+        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps), backend=backend)
 
     def tangents(v, dt, steps):
-        return lowering.run_batch_jvp(scenario, v, GAINS, folds[:1], dt, steps=steps, method="rk4", backend=compiled)
+        return run_batch_jvp(scenario, v, GAINS, folds[:1], dt, Run(steps), backend=compiled)
 
     compiled = "gpu" if on_a_gpu() else "native"
     rows = {"textbook": lambda v, dt, steps: textbook(v, dt, steps=steps)} if is_paper else {}
@@ -80,7 +81,7 @@ def check(scenario, dtype: str, steps: int) -> None:
     values = draws(scenario, 300, dtype)
 
     def outcome(backend):
-        return jax.jit(lambda v: lowering.run_batch(scenario, v, folds, dt, steps=steps, method="rk4", backend=backend))(values)
+        return jax.jit(lambda v: run_batch(scenario, v, folds, dt, Run(steps), backend=backend))(values)
 
     found, expected = outcome("gpu"), outcome("vmap")
     worst = 0.0

@@ -31,6 +31,8 @@ from _timing import compile_seconds, report
 
 import iblf_jax as ij
 from iblf_jax import lowering
+from iblf_jax.engine.execute import run_batch, run_batch_jvp
+from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
 from iblf_jax.metrics import standard
 from iblf_jax.scenario import canonical
@@ -196,10 +198,10 @@ def rows_of(scenario, dtype: str, loop: str) -> list[Row]:
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
 
     def on(backend, folds=folds):
-        return lambda v, dt, steps: lowering.run_batch(scenario, v, folds, dt, steps=steps, method="rk4", backend=backend)
+        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps), backend=backend)
 
     def sensitivities(folds):
-        return lambda v, dt, steps: lowering.run_batch_jvp(scenario, v, GAINS, folds, dt, steps=steps, method="rk4", backend="native")
+        return lambda v, dt, steps: run_batch_jvp(scenario, v, GAINS, folds, dt, Run(steps), backend="native")
 
     if loop == "arm":
         return [Row("vmap", on("vmap"), 2e4, batches=(1, 64)), Row("native", on("native"), 2e6, batches=(1, 64, 4096))]

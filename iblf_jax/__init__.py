@@ -23,11 +23,11 @@ from iblf_jax.distributions import normal as normal
 from iblf_jax.distributions import offset as offset
 from iblf_jax.distributions import uniform as uniform
 from iblf_jax.distributions import value as value
+from iblf_jax.engine.explain import explain as explain
 from iblf_jax.flat_loop import VectorField as VectorField
 from iblf_jax.flat_loop import vector_field as vector_field
 from iblf_jax.io import load_rollouts as load_rollouts
 from iblf_jax.io import save_rollouts as save_rollouts
-from iblf_jax.lowering.explain import explain as explain
 from iblf_jax.paths import parameters as parameters
 from iblf_jax.paths import with_parameters as with_parameters
 from iblf_jax.pytree import astype as astype

@@ -21,7 +21,6 @@ What the stages of a step cannot see, a reference or a disturbance that goes thr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -51,8 +50,9 @@ UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
 class Accuracy(NamedTuple):
     """The estimate as it goes from step to step.  m numbers: positions, velocities, state of the observer."""
 
-    rates: tuple[jax.Array, ...]
-    """The last rates, (2 n,) each, newest last: of the positions, and of where they end up, x'_q + R x'_y."""
+    pending: tuple[jax.Array, ...]
+    """What the rates so far add to the step errors of the next instants, (2 n,) each: of the positions, and of where they end up,
+    from x'_q + R x'_y."""
     drift: jax.Array
     """L of these, (2 n,)."""
     response: jax.Array
@@ -69,36 +69,36 @@ def numbers(state: LoopState) -> jax.Array:
     return jnp.concatenate([jnp.ravel(x) for x in leaves])
 
 
-def with_numbers(state: LoopState, flat: jax.Array) -> LoopState:
-    """The state with these numbers."""
-    leaves, structure = jax.tree.flatten((state.q, state.dq, state.observer))
-    used, new = 0, []
-    for x in leaves:
-        if jnp.issubdtype(x.dtype, jnp.floating):
-            x, used = flat[used : used + x.size].reshape(x.shape), used + x.size
-        new.append(x)
-    q, dq, observer = jax.tree.unflatten(structure, new)
-    return LoopState(q, dq, state.controller, observer)
+def places(state: LoopState) -> np.ndarray:
+    """Where these numbers stand in the whole state, flat."""
+    leaves, structure = jax.tree.flatten(state)
+    ends = np.cumsum([0, *(x.size for x in leaves)])
+    spans = [range(a, b) if jnp.issubdtype(x.dtype, jnp.floating) else () for x, a, b in zip(leaves, ends, ends[1:], strict=False)]
+    by_part = jax.tree.unflatten(structure, spans)
+    return np.concatenate([np.asarray(x, int) for x in jax.tree.leaves((by_part.q, by_part.dq, by_part.observer))])
 
 
-def begin(method: str, rate_at: Callable[[jax.Array], jax.Array], state: LoopState) -> Accuracy:
+def response(jacobian: jax.Array, n: int) -> jax.Array:
+    """R from the Jacobian by these numbers, (m, m) [1/s]; 0 where there is none."""
+    inner = jacobian[n:, n:]
+    size = len(inner)
+    found = solve(SLOWEST * jnp.eye(size, dtype=inner.dtype) - inner.T, jnp.eye(size, n, dtype=inner.dtype)).T
+    return jnp.where(jnp.isfinite(found), found, 0.0)
+
+
+def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     """The estimate before the first step.
 
     Args:
       method: the integrator.
-      rate_at: function of states (k, m) -> their rates (k, m), at the start.
+      jacobian: of the closed loop at the start, by its whole state, (., .) [1/s].
       state: the state at the start.
     """
-    x, n = numbers(state), state.q.size
-    h = jnp.sqrt(jnp.finfo(x.dtype).eps) * jnp.maximum(1.0, jnp.abs(x[n:]))
-    moves = jnp.concatenate([jnp.zeros((x.size - n, n), x.dtype), jnp.diag(h)], axis=1)
-    rates = rate_at(jnp.concatenate([x[None], x + moves]))
-    jacobian = (rates[1:, n:] - rates[0, n:]) / h[:, None]  # a row for each number that moves: J transposed
-    response = solve(SLOWEST * jnp.eye(x.size - n, dtype=x.dtype) - jacobian, jnp.eye(x.size - n, n, dtype=x.dtype)).T
-    response = jnp.where(jnp.isfinite(response), response, 0.0)
-    none = jnp.zeros((2 * n,), x.dtype)
-    history = (none,) * (len(tableau(method).differences) - 1)
-    return Accuracy(history, none, response, none[:n], none[0])
+    n, kept = state.q.size, places(state)
+    table = tableau(method)
+    none = jnp.zeros((2 * n,), jacobian.dtype)
+    pending = (none,) * ((len(table.differences) - 1) // (2 if table.halfway else 1))
+    return Accuracy(pending, none, response(jacobian[kept][:, kept], n), none[:n], none[0])
 
 
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
@@ -107,26 +107,31 @@ def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
 
 
-def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array | int, slope: LoopState, width: jax.Array) -> Accuracy:
-    """The estimate after one more instant, at which the rate of the state and the width of the tube, (n,) [rad], are known."""
+def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, slopes: list[LoopState], width: jax.Array) -> Accuracy:
+    """The estimate after one more instant.
+
+    Args:
+      accuracy: before it.
+      method: the integrator.
+      dt: time step, () [s].
+      index: number of the instant, () int.
+      slopes: of the stages of the step from it.
+      width: of the tube, (n,) [rad].
+    """
     table, n = tableau(method), width.size
+    weights, each = table.differences[::-1], 2 if table.halfway else 1
     width = jax.lax.stop_gradient(width)
-    rates = (*accuracy.rates, _rate(accuracy, slope))
-    complete = index >= (len(rates) - 1) // (2 if table.halfway else 1)
-    drift = (1.0 - SLOWEST * dt) * accuracy.drift
-    for weight, rate in zip(table.differences, rates, strict=True):
-        drift = drift + jnp.where(complete, weight * dt, 0.0) * rate
-    here = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
-    relative = jnp.maximum(accuracy.relative, jnp.max(here / width))
-    return Accuracy(rates[1:], drift, accuracy.response, jnp.maximum(accuracy.error, here), relative)
-
-
-def passed(accuracy: Accuracy, method: str, slopes: list[LoopState]) -> Accuracy:
-    """The estimate after a step with these slopes of its stages."""
-    halfway = tableau(method).halfway
-    if not halfway:
-        return accuracy
-    return accuracy._replace(rates=(*accuracy.rates[1:], _rate(accuracy, slopes[halfway])))
+    here = _rate(accuracy, slopes[0])
+    complete = index >= len(accuracy.pending)
+    error = accuracy.pending[0] + weights[0] * here
+    drift = (1.0 - SLOWEST * dt) * accuracy.drift + jnp.where(complete, dt, 0.0) * error
+    pending = [x + weights[each * (k + 1)] * here for k, x in enumerate((*accuracy.pending[1:], jnp.zeros_like(here)))]
+    if table.halfway:
+        middle = _rate(accuracy, slopes[table.halfway])
+        pending = [x + weights[2 * k + 1] * middle for k, x in enumerate(pending)]
+    size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
+    relative = jnp.maximum(accuracy.relative, jnp.max(size / width))
+    return Accuracy(tuple(pending), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
 def between_stages(scenario: Scenario, accuracy: Accuracy, method: str, dt: jax.Array, steps: int | jax.Array) -> Accuracy:

@@ -1,23 +1,22 @@
 """Explicit Runge-Kutta steps on pytrees, each method a Butcher table.
 
-A step is given the slope at its start, because the time loop has it already: the closed loop is evaluated there for the record
-and the metrics.  Fixed steps: the loop is sampled in practice, gradients are exact, and a batch stays in step.
+What is integrated may say more than its rate (the closed loop has a sample to record): a step hands on what was said at its start.
+Fixed steps: the loop is sampled in practice, gradients are exact, and a batch stays in step.  A new method is a new row of TABLEAUS.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from iblf_jax import checks
 
 
 class Tableau(NamedTuple):
-    """An explicit method: x + dt sum_i b_i k_i, with k_i = f(t + c_i dt, x + dt sum_j a_ij k_j).
-
-    In every method here a stage starts from the slope before it alone: a_ij = 0 for j < i - 1.
-    """
+    """An explicit method: x + dt sum_i b_i k_i, with k_i = f(t + c_i dt, x + dt sum_j a_ij k_j)."""
 
     c: tuple[float, ...]
     a: tuple[tuple[float, ...], ...]
@@ -52,10 +51,37 @@ def tableau(method: str) -> Tableau:
     return TABLEAUS[method]
 
 
-def stages(method: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """c_i, a_i,i-1 (0 for the first) and b_i of every stage, for a loop over the stages."""
+class Stepped(NamedTuple):
+    """A step that was made."""
+
+    state: Any
+    """The state one step later."""
+    slopes: list
+    """The slopes of the stages."""
+    first: Any
+    """What was said besides the slope at the start."""
+
+
+def step(method: str, evaluate, t: jax.Array, state, dt: jax.Array, *, rolled: bool = False) -> Stepped:
+    """One step.
+
+    Args:
+      method: a name in TABLEAUS.
+      evaluate: function (t, state) -> (rate of the state, same structure; anything else).
+      t, dt: time and step, () [s].
+      state: pytree of arrays.
+      rolled: the stages as a loop: `evaluate` is compiled once, not once a stage.
+    """
     table = tableau(method)
-    return table.c, (0.0, *(row[-1] for row in table.a[1:])), table.b
+    return (_rolled if rolled else _unrolled)(table, evaluate, t, state, dt)
+
+
+def _unrolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
+    slope, first = evaluate(t, state)
+    slopes = [slope]
+    for c, row in zip(table.c[1:], table.a[1:], strict=True):
+        slopes.append(evaluate(t + c * dt, _combine(state, dt, row, slopes))[0])
+    return Stepped(_combine(state, dt, table.b, slopes), slopes, first)
 
 
 def _combine(state, dt, weights, slopes):
@@ -69,28 +95,17 @@ def _combine(state, dt, weights, slopes):
     return jax.tree.map(one, state, *slopes)
 
 
-def step(method: str, slope, t: jax.Array, state, dt: jax.Array, first_slope):
-    """The state one step later.
+def _rolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
+    x, whole = ravel_pytree(state)
+    count = len(table.c)
+    rows = jnp.asarray([(*row, *[0.0] * (count - len(row))) for row in table.a], x.dtype)
 
-    Args:
-      method: "euler", "heun" or "rk4".
-      slope: function (t, state) -> rate of the state, same structure.
-      t, dt: time and step, () [s].
-      state: pytree of arrays.
-      first_slope: slope(t, state).
-    """
-    return combined(method, state, dt, stage_slopes(method, slope, t, state, dt, first_slope))
+    def stage(slopes, at):
+        index, c, row = at
+        slope, besides = evaluate(t + c * dt, whole(x + dt * jnp.sum(row[:, None] * slopes, axis=0)))
+        return jax.lax.dynamic_update_index_in_dim(slopes, ravel_pytree(slope)[0], index, 0), besides
 
-
-def stage_slopes(method: str, slope, t: jax.Array, state, dt: jax.Array, first_slope) -> list:
-    """The slopes of a step's stages; arguments as `step`."""
-    table = tableau(method)
-    slopes = [first_slope]
-    for c, row in zip(table.c[1:], table.a[1:], strict=True):
-        slopes.append(slope(t + c * dt, _combine(state, dt, row, slopes)))
-    return slopes
-
-
-def combined(method: str, state, dt: jax.Array, slopes: list):
-    """The state one step later, from the slopes of its stages."""
-    return _combine(state, dt, tableau(method).b, slopes)
+    stages = (jnp.arange(count), jnp.asarray(table.c, x.dtype), rows)
+    slopes, besides = jax.lax.scan(stage, jnp.zeros((count, x.size), x.dtype), stages)
+    total = jnp.sum(jnp.asarray(table.b, x.dtype)[:, None] * slopes, axis=0)
+    return Stepped(whole(x + dt * total), [whole(k) for k in slopes], jax.tree.map(lambda y: y[0], besides))

@@ -13,14 +13,16 @@ import numpy as np
 from iblf_jax import checks
 from iblf_jax.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.bounds import tube_at
-from iblf_jax.compact_loop import run
+from iblf_jax.engine import execute
+from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
+from iblf_jax.engine.step import Run
+from iblf_jax.engine.step_size import comfortable_dt, find_dt
 from iblf_jax.integrators import tableau
 from iblf_jax.metrics import Fold, as_folds, metric_units
 from iblf_jax.results import Metrics, Rollout
 from iblf_jax.robots import joint_names
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.status import FAILED, Status, describe
-from iblf_jax.step_size import comfortable_dt, find_dt
 
 MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""
@@ -34,19 +36,8 @@ class SimulationWarning(UserWarning):
     """A run whose result needs a second look."""
 
 
-_run_compiled = jax.jit(run, static_argnames=("steps", "record_every", "method", "alone"))
-
-
-@partial(jax.jit, static_argnames=("steps", "record_every", "method", "backend"))
-def _run_lowered(scenario, folds, dt, *, steps, record_every, method, backend):
-    """One run by the scalar program of its step, which is not differentiable in reverse; what is long or does not lower runs as it is."""
-    from iblf_jax.lowering import run_alone
-
-    return run_alone(scenario, folds, dt, steps=steps, record_every=record_every, method=method, backend=backend)
-
-
-SINGLE_RUN_BACKENDS = ("auto", "xla", "native", "gpu")
-"""How `simulate` can execute one run."""
+_run_one = jax.jit(execute.run_one, static_argnames=("run", "backend"))
+_run_plain = jax.jit(execute.run_plain, static_argnames="run")
 
 
 def simulate(
@@ -107,14 +98,14 @@ def simulate(
 
 def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "auto") -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
-    options = {"steps": steps, "record_every": record_every, "method": method}
+    run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds)):
-        outcome = _run_lowered(scenario, folds, dt, **options, backend=backend)
+        outcome = _run_one(scenario, folds, dt, run, backend=backend)
         if checks.is_concrete(outcome.status) and int(outcome.status) & int(Status.NOT_FINITE):
             # A lowered sine is NaN for an argument that is very large; the library's is not.
-            outcome = _run_compiled(scenario, folds, dt, alone=True, **options)
+            outcome = _run_plain(scenario, folds, dt, run)
     else:
-        outcome = _run_compiled(scenario, folds, dt, alone=False, **options)
+        outcome = _run_plain(scenario, folds, dt, run)
     arrays, controller_state, observer_state = outcome.records
     return Rollout(
         scenario=scenario,

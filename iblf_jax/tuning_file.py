@@ -34,8 +34,8 @@ import numpy as np
 
 from iblf_jax import checks, codec, distributions, metrics
 from iblf_jax.distributions import Distribution, Perturbation
+from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.integrators import tableau
-from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
 from iblf_jax.plain import Words, as_table, known_keys, numbers
 from iblf_jax.scenario_file import from_dict, read_toml, scenario_to_dict

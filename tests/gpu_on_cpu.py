@@ -8,7 +8,8 @@ from pathlib import Path
 
 import jax
 
-from iblf_jax.lowering import gpu, toolchain
+from iblf_jax.engine import gpu
+from iblf_jax.lowering import toolchain
 from iblf_jax.lowering.emit_c import CUDA, source
 
 FOLDER = Path(__file__).parent

@@ -12,10 +12,12 @@ import pytest
 from conftest import SHORT
 
 import iblf_jax as ij
-from iblf_jax import linalg, step_size
+from iblf_jax import linalg
 from iblf_jax.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.engine import step_size
+from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.step import Run
 from iblf_jax.integrators import TABLEAUS
-from iblf_jax.lowering import run_batch
 from iblf_jax.metrics import as_folds
 from iblf_jax.scenario import canonical
 from iblf_jax.status import Status
@@ -54,7 +56,7 @@ def positions(scenario, varied, dt, steps, method):
     """Positions of a batch and its verdicts, at the instants of a step dt * FINER."""
     folds = as_folds((), jnp.float64)
     every = FINER if steps > 500 else 1
-    run = jax.jit(lambda varied, dt: run_batch(scenario, varied, folds, dt, steps=steps, method=method, record_every=every))
+    run = jax.jit(lambda varied, dt: run_batch(scenario, varied, folds, dt, Run(steps, method, every)))
     found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
     arrays = found.records[0]
     return (

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import lowering
+from iblf_jax.engine import execute
+from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
 from iblf_jax.metrics import as_folds
 from iblf_jax.scenario import canonical
@@ -31,7 +32,7 @@ def draws(scenario, dtype):
 
 @partial(jax.jit, static_argnames="backend")
 def outcome_of(scenario, varied, folds, dt, backend):
-    return lowering.run_batch(scenario, varied, folds, dt, steps=STEPS, method="rk4", record_every=EVERY, backend=backend)
+    return execute.run_batch(scenario, varied, folds, dt, Run(STEPS, "rk4", EVERY), backend=backend)
 
 
 ONE_TYPE = {"ur5": "float32", "iiwa14": "float64"}
@@ -56,7 +57,7 @@ def test_backends_agree_with_the_reference(name, dtype):
     assert np.any(~ok), expected.status
     scenario, varied, folds, dt = arguments
     asked = ["xla", "native"] if has_compiler() else ["xla"]
-    taken = {lowering.settled(backend, scenario, varied, folds, dt, method="rk4") for backend in asked}
+    taken = {execute.settled(backend, scenario, varied, folds, dt, method="rk4") for backend in asked}
     for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap
         found = jax.tree.map(np.asarray, outcome_of(*arguments, backend=backend))
         np.testing.assert_array_equal(found.status, expected.status, err_msg=backend)

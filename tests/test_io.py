@@ -17,7 +17,7 @@ from conftest import SHORT
 
 import iblf_jax as ij
 from iblf_jax import io, scenario_file
-from iblf_jax.time_loop import RECORDED
+from iblf_jax.engine.step import RECORDED
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
     6 outside     presets  arms  robot_file  scenario_file  io  codec  plain  plotting/  cli/  testing/
     5 studies     studies/  tuning/  distributions  distributed
     4 judgement   certificates
-    3 the run     integrators  scenario  closed_loop  flat_loop  stability  metrics  results  paths  time_loop  rollout  lowering/
+    3 the run     integrators  scenario  closed_loop  flat_loop  stability  metrics  results  paths  rollout  engine/  lowering/
     2 the law     barriers/  observers/  controllers/
     1 the world   robots/  references  bounds  disturbances
     0 ground      pytree  linalg  checks  status  drafts  _start
@@ -23,7 +23,7 @@ from conftest import ROOT
 PACKAGE = ROOT / "iblf_jax"
 
 LAYERS = {
-    0: ("pytree", "linalg", "checks", "status", "one_function", "drafts", "_start"),
+    0: ("pytree", "linalg", "checks", "status", "drafts", "_start"),
     1: ("robots", "references", "bounds", "disturbances"),
     2: ("barriers", "observers", "controllers"),
     3: (
@@ -33,14 +33,11 @@ LAYERS = {
         "flat_loop",
         "stability",
         "accuracy",
-        "step_size",
         "metrics",
         "results",
         "paths",
-        "time_loop",
-        "compact_loop",
+        "engine",
         "rollout",
-        "derivatives",
         "lowering",
     ),
     4: ("certificates",),
@@ -140,9 +137,9 @@ def calls(source: str, name: str) -> list[int]:
 
 
 def test_time_is_scanned_in_one_place():
-    """lax.scan is a loop over time; `derivatives` steps the same `time_loop.advance` with tangents; the two runs side by side of
-    `step_size`, the power iteration of `stability`, the elimination of `linalg` and the checkers' own scans are not runs."""
-    allowed = {"time_loop", "compact_loop", "lowering", "derivatives", "stability", "step_size", "linalg", "testing"}
+    """lax.scan is a loop over time, which is the engine's; the stages of `integrators`, the steps that `certificates` makes again, the
+    power iteration of `stability`, the elimination of `linalg` and the checkers' own scans are not runs."""
+    allowed = {"engine", "integrators", "certificates", "stability", "linalg", "testing"}
     users = {module_of(p) for p, text in SOURCES.items() if calls(text, "jax.lax.scan") or calls(text, "lax.scan")}
     assert users <= allowed, users - allowed
 

@@ -12,11 +12,14 @@ import pytest
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax import lowering, time_loop
-from iblf_jax.lowering import batch, native, program
+from iblf_jax.engine import execute
+from iblf_jax.engine.batch import Batch, begin, carry_shapes
+from iblf_jax.engine.executors import program_of, scan
+from iblf_jax.engine.step import Inputs, Run, TimeStep
+from iblf_jax.lowering import program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.identities import FUNCTIONS
-from iblf_jax.lowering.step import Shapes, pack
+from iblf_jax.lowering.packed import Shapes, pack
 from iblf_jax.metrics import standard
 from iblf_jax.scenario import canonical
 
@@ -101,11 +104,12 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name):
     scenario = canonical(with_member(family, name, getattr(ij, family).MEMBERS[name]))
     dt, index = jnp.asarray(DT), jnp.int32(3)
     varied = {"initial.q": jnp.asarray([[0.8, 0.8]]), "plant.mass[1]": jnp.asarray([0.9])}
-    run = batch.batch_of(native.run, scenario, varied, STANDARD, dt)
-    carry = jax.tree.map(lambda x: x[0], run.start("heun"))
-    changed, _, dt = run.whole([x[0] for x in run.leaves.lane])
-    p, _, _ = run.program(batch.step_function, jax.tree.map(lambda x: x[None], carry), "heun", False)
-    expected = numbers(jax.tree.leaves(jax.jit(lambda c: time_loop.advance(changed, STANDARD, "heun", dt, c, index)[0])(carry)))
+    run, step = Batch.of(Inputs(scenario, STANDARD, dt, jnp.asarray(10.0)), varied), TimeStep("heun")
+    carries, _ = begin(scan, run, "heun")
+    carry = jax.tree.map(lambda x: x[0], carries)
+    inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.lane])
+    p, _ = program_of(step, run, carries)
+    expected = numbers(jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, rolled=True)[0])(carry)))
     found = evaluate(p, numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index)
     np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
 
@@ -194,15 +198,17 @@ def test_identities_keep_nan_and_infinity():
 def test_classes_of_a_program():
     scenario = canonical(PRESET)
     varied = {"plant.mass[1]": jnp.asarray([0.9])}
-    run = batch.batch_of(native.run, scenario, varied, STANDARD, jnp.asarray(DT))
-    p, shapes, _ = run.program(batch.step_function, run.start("rk4"), "rk4", False)
+    run = Batch.of(Inputs(scenario, STANDARD, jnp.asarray(DT), jnp.asarray(10.0)), varied)
+    p, _ = program_of(TimeStep("rk4"), run, carry_shapes(run, "rk4"))
+    flat = jax.tree.leaves(begin(scan, run, "rk4")[0])
+    shapes = Shapes.of(flat, 1)
     classes = p.classes()
     sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
     assert sines.count(program.LANE | program.TIME) <= 4 < sines.count(program.TIME), "signals of time belong to no run"
     assert len(p.carry) == shapes.size
-    packed = pack(jax.tree.leaves(run.start("rk4")), shapes, jnp.float64, 1)
+    packed = pack(flat, shapes, jnp.float64, 1)
     assert len(packed.floats) + len(packed.ints) == shapes.size
-    assert Shapes.of(jax.tree.leaves(run.start("rk4")), 1) == shapes
+    assert Shapes.of(jax.tree.leaves(carry_shapes(run, "rk4")), 1) == shapes
 
 
 @ij.component
@@ -214,12 +220,12 @@ class _Odd(ij.observers.NoObserver):
 def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
     scenario = canonical(dataclasses.replace(PRESET, observer=_Odd()))
     varied = {"plant.mass[1]": jnp.asarray([0.8, 0.9])}
-    lowering._told.clear()
+    execute._told.clear()
 
     def run():
-        return jax.jit(lambda: lowering.run_batch(scenario, varied, (), jnp.asarray(DT), steps=3, method="euler"))()
+        return jax.jit(lambda: execute.run_batch(scenario, varied, (), jnp.asarray(DT), Run(3, "euler")))()
 
-    with pytest.warns(lowering.BackendWarning, match="vmap.*'sort'"):
+    with pytest.warns(execute.BackendWarning, match="vmap.*'sort'"):
         outcome = run()
     assert outcome.status.shape == (2,)
     with warnings.catch_warnings():
@@ -229,4 +235,4 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
 
 def test_an_unknown_backend_is_refused():
     with pytest.raises(ValueError, match="backend"):
-        lowering.run_batch(PRESET, {"initial.q": jnp.ones((2, 2))}, (), jnp.asarray(DT), steps=1, method="rk4", backend="fpga")
+        execute.run_batch(PRESET, {"initial.q": jnp.ones((2, 2))}, (), jnp.asarray(DT), Run(1), backend="fpga")

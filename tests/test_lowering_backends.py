@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import lowering
-from iblf_jax.lowering import emit_c, native, toolchain
+from iblf_jax.engine import execute, native, plan
+from iblf_jax.engine.step import Run
+from iblf_jax.lowering import toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.metrics import as_folds, standard
 from iblf_jax.scenario import canonical
@@ -41,8 +42,8 @@ def batch(dtype="float64", backend="native", steps=400, values=None, record_ever
     varied = {k: jnp.asarray(v, dtype) for k, v in (values or draws(5)).items()}
     key = (dtype, backend, steps, record_every)
     if key not in COMPILED:
-        options = {"steps": steps, "method": "rk4", "record_every": record_every, "backend": backend}
-        COMPILED[key] = jax.jit(lambda s, v, f, dt: lowering.run_batch(s, v, f, dt, **options))
+        run = Run(steps, "rk4", record_every)
+        COMPILED[key] = jax.jit(lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run, backend=backend))
     return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, folds, jnp.asarray(dt, dtype)))
 
 
@@ -79,13 +80,13 @@ def test_xla_agrees_with_the_reference():
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [2, 30])
 def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
-    monkeypatch.setattr(lowering.xla, "BLOCK", 2)
-    monkeypatch.setattr(lowering.xla, "STRETCH", 4)
+    monkeypatch.setattr(plan, "XLA_BLOCK", 2)
+    monkeypatch.setattr(plan, "XLA_STRETCH", 4)
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
-    options = {"steps": 11, "method": "euler", "record_every": every}
+    run = Run(11, "euler", every)
     varied = {k: jnp.asarray(v) for k, v in draws(7).items()}
     found, expected = (
-        jax.jit(lambda s, v, b=b: lowering.run_batch(s, v, (), dt, backend=b, **options))(scenario, varied) for b in ("xla", "vmap")
+        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied) for b in ("xla", "vmap")
     )
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
@@ -96,10 +97,10 @@ def test_a_spline_is_looked_up(backend):
     times = np.linspace(0.0, 0.04, 9)
     spline = ij.references.WaypointSpline(tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1)))
     scenario, dt = canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)), jnp.asarray(1e-3)
-    options = {"steps": 50, "method": "heun", "record_every": 10}
+    run = Run(50, "heun", 10)
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    assert lowering.settled(backend, scenario, varied, (), dt, method="heun") == backend
-    found, expected = (lowering.run_batch(scenario, varied, (), dt, backend=b, **options) for b in (backend, "vmap"))
+    assert execute.settled(backend, scenario, varied, (), dt, method="heun") == backend
+    found, expected = (execute.run_batch(scenario, varied, (), dt, run, backend=b) for b in (backend, "vmap"))
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
 
@@ -173,8 +174,8 @@ def test_one_run_and_threads():
 def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
     """Cut into pieces of fifty operations, the numbers stay: only the places of some products with sums differ."""
     whole = batch(record_every=record_every)
-    monkeypatch.setattr(emit_c, "LONG", 0)
-    monkeypatch.setattr(emit_c, "SEGMENT", 50)
+    monkeypatch.setattr(plan, "NATIVE_LONG", 0)
+    monkeypatch.setattr(plan, "NATIVE_SEGMENT", 50)
     native.kernel.cache_clear()
     monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
     del COMPILED["float64", "native", 400, record_every]
@@ -192,9 +193,7 @@ def test_forward_sensitivities():
     folds = (*standard()[:1], *as_folds((Quantities((Integral(), Peak(10.0))),), jnp.float64))
 
     def pushed(backend):
-        return jax.jit(lambda s, v: lowering.run_batch_jvp(s, v, directions, folds, dt, steps=60, method="euler", backend=backend))(
-            scenario, varied
-        )
+        return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, Run(60, "euler"), backend=backend))(scenario, varied)
 
     outcome, tangents, products = pushed("native")
     reference, expected, exact = pushed("vmap")
@@ -207,21 +206,21 @@ def test_forward_sensitivities():
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(lowering, "_told", set())
+    monkeypatch.setattr(execute, "_told", set())
     native.kernel.cache_clear()
     called = []
-    with pytest.warns(lowering.BackendWarning, match="no-such-compiler.*xla"):
-        lowering.with_fallback("auto", lambda executor: called.append(executor) or fail_if_native(executor), lambda: None)
+    with pytest.warns(execute.BackendWarning, match="no-such-compiler.*xla"):
+        execute.with_fallback("auto", lambda name: called.append(name) or fail_if_native(name), lambda: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lowering.with_fallback("auto", fail_if_native, lambda: None)
-    assert called == [native.run, lowering.xla.run]
+        execute.with_fallback("auto", fail_if_native, lambda: None)
+    assert called == ["native", "xla"]
 
 
-def fail_if_native(executor):
-    if executor is native.run:
+def fail_if_native(name):
+    if name == "native":
         toolchain.compiler()
-    return executor
+    return name
 
 
 @needs_compiler

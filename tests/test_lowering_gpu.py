@@ -16,11 +16,14 @@ from test_lowering import DT, MEMBERS, STANDARD, evaluate, with_member
 from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
-from iblf_jax import lowering
-from iblf_jax.lowering import batch, gpu, nvrtc
+from iblf_jax.engine import execute, gpu, plan
+from iblf_jax.engine.batch import Batch, begin
+from iblf_jax.engine.derivatives import Directions, run_with_tangents
+from iblf_jax.engine.executors import lowered_on, program_of, scan
+from iblf_jax.engine.step import Inputs, Run, TimeStep
+from iblf_jax.lowering import nvrtc
 from iblf_jax.lowering.emit_c import CUDA, Layout, source
-from iblf_jax.lowering.sensitivities import Directions, lowered_jvp
-from iblf_jax.lowering.step import pack
+from iblf_jax.lowering.packed import Shapes, pack
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.metrics import standard
 from iblf_jax.scenario import canonical
@@ -34,7 +37,7 @@ def _has_nvrtc() -> bool:
     return True
 
 
-pytestmark = pytest.mark.filterwarnings("error::iblf_jax.lowering.BackendWarning")
+pytestmark = pytest.mark.filterwarnings("error::iblf_jax.execute.BackendWarning")
 needs_nvrtc = pytest.mark.skipif(not _has_nvrtc(), reason="no NVRTC")
 
 
@@ -43,12 +46,13 @@ def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
     scenario = canonical(ij.astype(scenario, dtype))
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), folds)
     varied = {path: jnp.asarray(x, dtype) for path, x in varied.items()}
-    of = batch.batch_of(gpu.run, scenario, varied, folds, jnp.asarray(DT, dtype))
-    carry = of.start(method)
-    program, shapes, _ = of.program(batch.step_function, carry, method, False)
+    of = Batch.of(Inputs(scenario, folds, *jnp.asarray([DT, 1e3], dtype)), varied)
+    carry, _ = begin(scan, of, method)
+    program, _ = program_of(TimeStep(method), of, carry)
     shared = jnp.concatenate([jnp.ravel(x) for x in of.leaves.shared])
-    lane = pack(of.leaves.lane, batch.Shapes.of(of.leaves.lane, 1), dtype, of.runs).floats
-    return program, shared, lane, pack(jax.tree.leaves(carry), shapes, dtype, of.runs)
+    lane = pack(of.leaves.lane, Shapes.of(of.leaves.lane, 1), dtype, of.runs).floats
+    flat = jax.tree.leaves(carry)
+    return program, shared, lane, pack(flat, Shapes.of(flat, 1), dtype, of.runs)
 
 
 def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
@@ -77,9 +81,9 @@ def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
 def on_cpu(monkeypatch):
     """The gpu backend runs here, in blocks of 32 threads and stretches of 64 steps."""
     monkeypatch.setattr(gpu, "run", gpu_on_cpu.run)
-    monkeypatch.setattr(gpu, "STRETCH", 64)
-    monkeypatch.setattr(lowering, "COMPILED", {"cpu": gpu})
-    monkeypatch.setattr(lowering, "_told", set())
+    monkeypatch.setattr(plan, "GPU_STRETCH", 64)
+    monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
+    monkeypatch.setattr(execute, "_told", set())
 
 
 def outcome(dtype, backend, values, steps=200, record_every=None):
@@ -87,8 +91,8 @@ def outcome(dtype, backend, values, steps=200, record_every=None):
     scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
     varied, dt = {k: jnp.asarray(v, dtype) for k, v in values.items()}, jnp.asarray(DT, dtype)
-    options = {"steps": steps, "method": "rk4", "record_every": record_every, "backend": backend}
-    return jax.tree.map(np.asarray, jax.jit(lambda s, v: lowering.run_batch(s, v, folds, dt, **options))(scenario, varied))
+    run = Run(steps, "rk4", record_every)
+    return jax.tree.map(np.asarray, jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run, backend=backend))(scenario, varied))
 
 
 def spoiled(runs):
@@ -142,20 +146,17 @@ def test_forward_sensitivities(paper):
     scenario, dt = canonical(paper), jnp.asarray(DT)
     along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    pushed = jax.jit(lambda v: lowered_jvp(gpu_on_cpu.run, scenario, v, along, standard()[:1], dt, steps=60, method="euler"))(varied)
-    expected = jax.jit(
-        lambda v: lowering.run_batch_jvp(
-            scenario, v, {path: np.reshape(x, shape) for path, shape, x in along.items}, standard()[:1], dt, steps=60, method="euler",
-            backend="vmap",
-        )
-    )(varied)  # fmt: skip
+    inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), Run(60, "euler")
+    executor, numbers = lowered_on(gpu_on_cpu.run), {path: np.reshape(x, shape) for path, shape, x in along.items}
+    pushed = jax.jit(lambda v: run_with_tangents(executor, Batch.of(inputs, v), along, run))(varied)
+    expected = jax.jit(lambda v: execute.run_batch_jvp(scenario, v, numbers, inputs.folds, dt, run, backend="vmap"))(varied)
     for x, y in zip(pushed, expected, strict=True):
         assert_same(jax.tree.map(np.asarray, x), jax.tree.map(np.asarray, y), 1e-10)
 
 
 @needs_compiler
 def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkeypatch):
-    monkeypatch.setattr(gpu, "STRETCH", 4)
+    monkeypatch.setattr(plan, "GPU_STRETCH", 4)
     program, shared, lane, carry = step_of(paper, draws(2))
     sizes = program, shared.size, lane.shape[0]
     for calls in (1, 2):
@@ -180,24 +181,24 @@ def test_what_the_driver_refuses_is_an_error_of_jax(paper):
 
 @pytest.mark.parametrize(("runs", "threads"), [(1, 32), (4096, 32), (10_000, 96), (65_536, 128), (10**7, 128)])
 def test_threads_in_a_block(runs, threads):
-    assert gpu.threads_in_block(runs, 132) == threads
+    assert plan.gpu_threads(runs, 132) == threads
 
 
 def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
-    monkeypatch.setattr(lowering, "_told", set())
+    monkeypatch.setattr(execute, "_told", set())
     called = []
-    with pytest.warns(lowering.BackendWarning, match="gpu backend is not for the default device, cpu: running on xla"):
-        lowering.with_fallback("gpu", called.append, lambda: None)
+    with pytest.warns(execute.BackendWarning, match="gpu backend is not for the default device, cpu: running on xla"):
+        execute.with_fallback("gpu", called.append, lambda: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lowering.with_fallback("gpu", called.append, lambda: None)
-    assert called == [lowering.xla.run] * 2
+        execute.with_fallback("gpu", called.append, lambda: None)
+    assert called == ["xla"] * 2
 
 
 @needs_compiler
 def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     assert repr(ij.explain(paper)).endswith("a batch runs on native")
-    monkeypatch.setattr(lowering, "COMPILED", {"cpu": gpu})
+    monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
     assert repr(ij.explain(paper)).endswith("a batch runs on xla: it needs an NVIDIA GPU, not cpu")
 
 
@@ -205,16 +206,16 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     def missing(*_):
         raise ToolchainError("there is no NVRTC")
 
-    monkeypatch.setattr(lowering, "_told", set())
+    monkeypatch.setattr(execute, "_told", set())
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(nvrtc, "library", missing)
-    assert lowering.automatic() == ("xla", "there is no NVRTC")
-    with pytest.warns(lowering.BackendWarning, match="gpu backend is not available .there is no NVRTC.: running on xla"):
-        assert lowering.with_fallback("auto", lambda f: missing() if f is gpu.run else f, lambda: None) is lowering.xla.run
+    assert execute.automatic() == ("xla", "there is no NVRTC")
+    with pytest.warns(execute.BackendWarning, match="gpu backend is not available .there is no NVRTC.: running on xla"):
+        assert execute.with_fallback("auto", lambda name: missing() if name == "gpu" else name, lambda: None) == "xla"
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
-    assert lowering.automatic() == ("gpu", None)
+    assert execute.automatic() == ("gpu", None)
 
 
 @pytest.mark.parametrize(
@@ -271,12 +272,12 @@ def test_what_nvrtc_refuses_is_reported_in_one_line():
 @needs_compiler
 def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper, monkeypatch):
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
-    monkeypatch.setattr(lowering, "COMPILED", {"cpu": gpu})
+    monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
     scenario, dt, varied = canonical(paper), jnp.asarray(DT), {k: jnp.asarray(v) for k, v in draws(2).items()}
-    call = jax.jit(lambda v: lowering.run_batch(scenario, v, STANDARD, dt, steps=20_000, method="rk4", record_every=10, backend="gpu"))
+    call = jax.jit(lambda v: execute.run_batch(scenario, v, STANDARD, dt, Run(20_000, "rk4", 10), backend="gpu"))
     text = call.trace(varied).lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("custom_call @iblf_jax_") == 2, "the steps and the power iteration"
-    assert "every = 10 : i64, steps = 20000 : i64, threads = 32 : i64" in text
+    assert text.count("custom_call @iblf_jax_") == 3, "the rates around the start, the steps, the rates around two more instants"
+    assert "every = 10 : i64, steps = 20001 : i64, threads = 32 : i64" in text
 
 
 @pytest.mark.skipif(jax.default_backend() != "gpu", reason="no GPU")

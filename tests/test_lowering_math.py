@@ -11,7 +11,8 @@ import pytest
 import scipy.special
 from test_lowering_backends import needs_compiler
 
-from iblf_jax.lowering import emit_c, toolchain, vector_math
+from iblf_jax.engine import vector_math
+from iblf_jax.lowering import emit_c, toolchain
 
 LINE = np.linspace(-30, 30, 4001)
 UNIT = np.linspace(-0.999, 0.999, 4001)

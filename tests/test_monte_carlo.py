@@ -13,7 +13,7 @@ import study_cases as cases
 from scipy import stats
 
 import iblf_jax as ij
-from iblf_jax.lowering import batch
+from iblf_jax.engine import execute
 from iblf_jax.status import FAILED, Status
 from iblf_jax.studies import blocks, statistics
 
@@ -72,7 +72,7 @@ def test_a_study_compiles_once_whatever_its_numbers(study):
 
 def test_a_repeated_study_lowers_nothing(study, monkeypatch):
     """Else its second of tracing is longer than many a study, and no second device helps."""
-    monkeypatch.setattr(batch, "run", lambda *_, **__: pytest.fail("lowered again"))
+    monkeypatch.setattr(execute, "run_all", lambda *_, **__: pytest.fail("lowered again"))
     cases.study(ways=cases.perturbations(0.2, 0.01), seed=8)
 
 

@@ -66,7 +66,7 @@ def test_the_momentum_observer_finds_a_constant_torque():
             from iblf_jax.integrators import step
 
             t = i * 1e-3
-            return step("rk4", slope, t, x, 1e-3, slope(t, x)), f - observer.estimate(t, x[0], x[1], model, x[2])
+            return step("rk4", lambda t, x: (slope(t, x), None), t, x, 1e-3).state, f - observer.estimate(t, x[0], x[1], model, x[2])
 
         q, dq = jnp.asarray([0.3, 0.2]), jnp.asarray([1.0, -0.5])
         return jax.lax.scan(one, (q, dq, observer.init(q, dq, model)), jnp.arange(400))[1]

@@ -266,14 +266,14 @@ TIMED = ("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "
 def no_runs(monkeypatch):
     """Whatever would run raises Entered."""
     for place in (
-        "rollout._run_lowered",
+        "rollout._run_one",
         "studies.blocks._execute",
         "studies.setup._execute",
         "tuning._tune.slope",
         "tuning._tune.gradient",
         "tuning.problem.slope",
         "tuning._falsify._push",
-        "lowering.explain.instructions",
+        "engine.explain.instructions",
         "certificates._certify._one",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)

@@ -11,7 +11,8 @@ import pytest
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax import rollout, time_loop
+from iblf_jax import rollout
+from iblf_jax.engine import execute, step
 from iblf_jax.status import Status
 
 PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")
@@ -150,9 +151,9 @@ def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
 def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     """Once a structure, a length and a method are compiled, every other value runs the same program."""
     traces = []
-    original = time_loop.advance
-    monkeypatch.setattr(time_loop, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
-    before = rollout._run_lowered._cache_size()
+    original = step.advance
+    monkeypatch.setattr(step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
+    before = rollout._run_one._cache_size()
     for changes in (
         {"controller.K2": 30.0},
         {"plant.mass[1]": 1},
@@ -165,13 +166,13 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     ij.simulate(fresh, **PAPER)
     ij.simulate(fresh, **PAPER, throw=True)
     assert traces == []
-    assert rollout._run_lowered._cache_size() == before
+    assert rollout._run_one._cache_size() == before
 
 
 def test_a_new_structure_does_recompile(paper, monkeypatch):
     """So that the test above can fail: another number of steps is another program."""
     traces = []
-    monkeypatch.setattr(time_loop, "start", lambda *args, **options: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(execute, "run_all", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         ij.simulate(paper, duration=0.037, dt=1e-3)
     assert traces == [1]

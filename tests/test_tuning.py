@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.compact_loop import run as plain_run
+from iblf_jax.engine.batch import Batch, carry_shapes
+from iblf_jax.engine.execute import run_plain
+from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.metrics import standard
 from iblf_jax.scenario import canonical
-from iblf_jax.time_loop import start
 from iblf_jax.tuning import _tune, problem
 from iblf_jax.tuning.newton import box_step
 from iblf_jax.tuning.optimise import Evaluator, Loop, load_checkpoint, save_checkpoint
@@ -99,7 +100,8 @@ def test_reverse_mode_remembers_few_states(paper):
         compiled = problem.gradient.lower(plan.shared, plan.lanes(plan.box.z[None]), plan=plan.plan).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
     folds = problem.fold_of(plan.shared.objective, jnp.float64)
-    state = sum(x.nbytes for x in jax.tree.leaves(start(canonical(paper), folds, "rk4", plan.shared.dt)))
+    inputs = Inputs(canonical(paper), folds, plan.shared.dt, plan.shared.dt)
+    state = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(carry_shapes(Batch.of(inputs, None), "rk4")))
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
@@ -245,7 +247,7 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
 
 
 def plain_status(scenario):
-    return jax.jit(lambda s: plain_run(s, standard(), jnp.asarray(1e-3), steps=300, record_every=None, method="euler").status)(scenario)
+    return jax.jit(lambda s: run_plain(s, standard(), jnp.asarray(1e-3), Run(300, "euler")).status)(scenario)
 
 
 class Cliff:

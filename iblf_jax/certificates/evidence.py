@@ -27,8 +27,8 @@ import jax.numpy as jnp
 
 from iblf_jax.certificates.claims import law_of
 from iblf_jax.closed_loop import LoopState, Sample, evaluate, rate
-from iblf_jax.compact_loop import stepped
 from iblf_jax.controllers import Backstepping
+from iblf_jax.integrators import step
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
 from iblf_jax.scenario import Scenario
@@ -190,9 +190,13 @@ def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, me
 
     With it the envelopes can be held against a run in which V2 has fallen below what the integrator resolves.
     """
-    first = jax.vmap(lambda size: stepped(scenario, t, state, size, method))(jnp.stack([dt, 0.5 * dt]))
+
+    def stepped(t, state, size):
+        return step(method, partial(evaluate, scenario), t, state, size, rolled=True).state
+
+    first = jax.vmap(partial(stepped, t, state))(jnp.stack([dt, 0.5 * dt]))
     whole, half = (jax.tree.map(lambda x, i=i: x[i], first) for i in (0, 1))
-    ends = jax.tree.map(lambda *x: jnp.stack(x), whole, stepped(scenario, t + 0.5 * dt, half, 0.5 * dt, method))
+    ends = jax.tree.map(lambda *x: jnp.stack(x), whole, stepped(t + 0.5 * dt, half, 0.5 * dt))
     V = jax.vmap(lambda state: evaluate(scenario, t + dt, state)[1].V)(ends)
     return 2.0 * jnp.abs(V[0] - V[1])
 

@@ -10,6 +10,7 @@ A run that is not to be believed is not made again: its recorded samples are loo
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +19,9 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.certificates.evidence import along_run
-from iblf_jax.closed_loop import LoopState, initial_state
-from iblf_jax.compact_loop import onward
+from iblf_jax.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.integrators import step
+from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status, describe
 
 STRETCH = 1024
@@ -112,7 +114,7 @@ def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopSt
         states = jax.tree.map(lambda x, rows=rows: x[rows], recorded)
         for offset in range(0, every, length):
             first = rows * every + offset
-            path, states = onward(run.scenario, jnp.asarray(first, jnp.int32), states, run.dt, length=length, method=run.method)
+            path, states = _onward(run.scenario, jnp.asarray(first, jnp.int32), states, run.dt, length=length, method=run.method)
             index = first[:, None] + np.arange(length)
             keep = (np.arange(at, at + together) < count)[:, None] & (np.arange(offset, offset + length) < every) & (index <= last)
             if not keep.any():
@@ -125,6 +127,21 @@ def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopSt
         come = np.arange(at, at + together) < count - 1
         arrived = jax.tree.map(lambda x, come=come: x[come], arrived)
         _check_arrival(run, jax.tree.map(lambda x, rows=rows, come=come: x[rows[come] + 1], recorded), arrived, rows[come] + 1)
+
+
+@partial(jax.jit, static_argnames=("length", "method"))
+def _onward(scenario: Scenario, first: jax.Array, states: LoopState, dt: jax.Array, *, length: int, method: str):
+    """The states before each of `length` steps, (R, length, ...), and after the last, from R states at the steps `first`, (R,)."""
+
+    def one(state, index):
+        t = index.astype(dt.dtype) * dt
+        return step(method, partial(evaluate, scenario), t, state, dt, rolled=True).state, state
+
+    def row(first, state):
+        last, before = jax.lax.scan(one, state, first + jnp.arange(length, dtype=first.dtype))
+        return before, last
+
+    return jax.vmap(row)(first, states)
 
 
 def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> Stretch:

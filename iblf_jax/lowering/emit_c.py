@@ -25,10 +25,6 @@ CALLS = (
     "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "pow", "atan2", "erf", "erfc", "logistic",
     "rem", "is_finite",
 )  # fmt: skip
-
-
-SEGMENT, LONG = 5000, 20_000
-"""Operations of a function of the native backend, where a step has more than LONG: slower by a third, but built three times as fast."""
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
@@ -167,14 +163,15 @@ def sizes(program: Program, shared_leaves: int, lane_leaves: int) -> str:
     return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
-def source(program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE) -> str:
-    """The whole C source of a program's kernel for a target, NATIVE or CUDA."""
+def source(
+    program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE, segment: int | None = None
+) -> str:
+    """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of `segment` operations if given."""
     e, layout = _Emitter(program), Layout.of(program)
     before, after = target
     parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before), e.definitions]
-    is_long = target is NATIVE and len(program.nodes) > LONG
     parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
-    parts += [(_advance_in_segments if is_long else _advance)(e, *layout)]
+    parts += [_advance_in_segments(e, segment, *layout) if segment else _advance(e, *layout)]
     return "\n".join([*parts, *map(header, after)])
 
 
@@ -238,7 +235,7 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
 
 
 class _Segments:
-    """The statements of a long step, cut into functions of at most SEGMENT; a number that one hands to another has a place in memory."""
+    """The statements of a long step, cut into functions of `size` operations; a number that one hands to another has a place in memory."""
 
     head = (
         "static __attribute__((noinline)) void {}(const word *constants, const F *leaves, const F *floats, const I *ints,\n"
@@ -246,8 +243,8 @@ class _Segments:
     )
     arguments = "(constants, leaves, floats, ints, row, x, y)"
 
-    def __init__(self, e: _Emitter, names: dict[int, str]):
-        self.e, self.names = e, names
+    def __init__(self, e: _Emitter, names: dict[int, str], size: int):
+        self.e, self.names, self.size = e, names, size
         self.functions: list[str] = []
         self.free: dict[str, list[str]] = {"x": [], "y": []}
         self.sizes = {"x": 0, "y": 0}
@@ -256,18 +253,18 @@ class _Segments:
         """Cuts `wanted` and what it needs; returns the calls.  `kept`: their places are never given to other numbers."""
         nodes, needed = self.e.program.nodes, self.e.needed(self.names, wanted)
         computed = [i for i in needed if nodes[i].op != "const"]
-        part = {i: k // SEGMENT for k, i in enumerate(computed)}
+        part = {i: k // self.size for k, i in enumerate(computed)}
         last = dict.fromkeys(computed, -1) | dict.fromkeys(wanted, len(computed))
         for i in computed:
             for a in nodes[i].args:
                 if a in part and a not in wanted:
                     last[a] = max(last[a], part[i])
         calls = []
-        for k in range(0, len(computed), SEGMENT):
-            here = computed[k : k + SEGMENT]
+        for k in range(0, len(computed), self.size):
+            here = computed[k : k + self.size]
             calls.append(self._one(here, {i: last[i] for i in here if last[i] > part[i]}))
             if not kept:
-                for i in (i for i in computed if i in self.names and last[i] == k // SEGMENT):
+                for i in (i for i in computed if i in self.names and last[i] == k // self.size):
                     self.free[self.names[i][0]].append(self.names[i])
         return calls
 
@@ -293,7 +290,7 @@ def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> 
     return sorted(computed & {*e.program.samples, *(a for i in alone for a in e.program.nodes[i].args)})
 
 
-def _advance_in_segments(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
+def _advance_in_segments(e: _Emitter, segment: int, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
     """`_advance` for long steps, over which a compiler would take minutes: its time grows with the square of a function's length."""
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
@@ -301,7 +298,7 @@ def _advance_in_segments(e: _Emitter, constants: list[int], columns: list[int], 
     names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
-    segments = _Segments(e, names)
+    segments = _Segments(e, names, segment)
     before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
     outputs = sorted({o for _, o in program.carry})
     within = segments.add(sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False)

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.lowering import run_batch, settled
+from iblf_jax.engine.execute import run_batch, settled
+from iblf_jax.engine.step import Run
 from iblf_jax.status import Status, flag
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
@@ -103,9 +104,8 @@ def with_settled_backend(program: Program, shared: Shared, lanes: Lanes) -> Prog
 def _block(program: Program, shared: Shared, lanes: Lanes) -> Results:
     """Draws and runs one block."""
     varied, drawn, admissible = _draws(program, shared, lanes)
-    outcome = run_batch(
-        shared.cases.scenario, varied, shared.folds, shared.dt, steps=program.steps, method=program.method, backend=program.backend
-    )
+    run = Run(program.steps, program.method)
+    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=program.backend)
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
     return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
@@ -114,16 +114,8 @@ def _block(program: Program, shared: Shared, lanes: Lanes) -> Results:
 def _record_block(program: Program, shared: Shared, lanes: Lanes, record_every: int):
     """Positions of a block's runs, (B, T, n), and their status."""
     varied, _, admissible = _draws(program, shared, lanes)
-    outcome = run_batch(
-        shared.cases.scenario,
-        varied,
-        shared.folds,
-        shared.dt,
-        steps=program.steps,
-        method=program.method,
-        backend=program.backend,
-        record_every=record_every,
-    )
+    run = Run(program.steps, program.method, record_every)
+    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=program.backend)
     arrays = outcome.records[0]
     return {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}, arrays["t"], outcome.status, admissible
 

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.lowering import native
 from iblf_jax.lowering.toolchain import built_for
 from iblf_jax.paths import get, parameters, unit_at
 from iblf_jax.pytree import is_leaf_field
@@ -91,7 +90,7 @@ def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, 
         "dtype": str(scenario.initial.q.dtype),
         "backend": program.backend,
         "platform": jax.default_backend(),
-        **({"kernel": built_for()} if program.backend == native.NAME else {}),
+        **({"kernel": built_for()} if program.backend == "native" else {}),
         "block": block_size(),
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__, "jaxlib": jaxlib.__version__},
         "program": program_digest(setup),

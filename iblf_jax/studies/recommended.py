@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import step_size
 from iblf_jax.accuracy import RELATIVE, TOLERANCE
 from iblf_jax.distributions import Perturbation
+from iblf_jax.engine import step_size
 from iblf_jax.integrators import tableau
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.derivatives import Outer
+from iblf_jax.engine.derivatives import Outer
 from iblf_jax.presets import zhang_yan_2024
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario
@@ -94,7 +94,7 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
         return
     outer = shape_of(findings, "curvature(acc, sample)" + kind, quantity.curvature, acc, first)
     if outer is not None and findings.require(
-        isinstance(outer, Outer), f"curvature(acc, sample) gives {type(outer).__name__}", "It must be an iblf_jax.derivatives.Outer"
+        isinstance(outer, Outer), f"curvature(acc, sample) gives {type(outer).__name__}", "It must be an iblf_jax.engine.derivatives.Outer"
     ):
         size = getattr(outer.vector, "shape", ())
         findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")

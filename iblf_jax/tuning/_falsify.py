@@ -28,8 +28,9 @@ import numpy as np
 from iblf_jax import checks
 from iblf_jax.certificates.box import admissible_points, none_admissible
 from iblf_jax.distributions import Perturbation
+from iblf_jax.engine.plan import BACKENDS
+from iblf_jax.engine.step import Run
 from iblf_jax.integrators import tableau
-from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import get, why_inadmissible, with_parameters
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
@@ -233,6 +234,6 @@ def _push(cases: Cases, dt, u, *, targets, sizes, steps, method, backend):
     made = partial(_made, cases, targets, sizes)
     varied = jax.vmap(made)(u)
     slopes = jax.vmap(jax.jacfwd(made))(u)
-    found = by_coordinates(cases.scenario, varied, slopes, (fold,), dt, steps=steps, method=method, backend=backend)
+    found = by_coordinates(cases.scenario, varied, slopes, (fold,), dt, Run(steps, method), backend=backend)
     margin = -found.outcome.metrics["tuning_exact"][:, 0]
     return margin, -found.tangents["tuning_smooth"][:, :, 0], found.outcome.status

@@ -14,8 +14,8 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.distributions import Perturbation
+from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.integrators import tableau
-from iblf_jax.lowering import BACKENDS
 from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MOST_RUNS, check_seed

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.derivatives import run_checkpointed
-from iblf_jax.lowering import run_batch
+from iblf_jax.engine.execute import run_batch, run_for_reverse
+from iblf_jax.engine.step import Run
 from iblf_jax.paths import with_parameters
 from iblf_jax.status import Status
 from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
@@ -51,6 +51,8 @@ class Plan(NamedTuple):
     """"sum" of weighted terms, or "log": sum of weighted logarithms."""
     backend: str = "auto"
     """What values and forward mode run on; reverse mode is plain XLA."""
+    nested: bool = False
+    """Whether they are called from a loop of JAX's."""
 
 
 class Shared(NamedTuple):
@@ -184,7 +186,9 @@ def value(shared: Shared, lanes: Lane, *, plan: Plan) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
     fold = fold_of(shared.objective, shared.dt.dtype)
     varied = _flat(_of_lanes(plan, shared, lanes))
-    outcome = run_batch(shared.cases.scenario, varied, fold, shared.dt, steps=plan.steps, method=plan.method, backend=plan.backend)
+    outcome = run_batch(
+        shared.cases.scenario, varied, fold, shared.dt, Run(plan.steps, plan.method), backend=plan.backend, nested=plan.nested
+    )
     smooth, exact, _ = (outcome.metrics[name].reshape(*lanes.index.shape, -1) for name in Quantities.units)
     status = outcome.status.reshape(lanes.index.shape)
     return jax.vmap(partial(_value, plan, shared))(lanes, smooth, exact, status)
@@ -199,8 +203,10 @@ def slope(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
     moving = {path: x for path, x in _flat(jacobian).items() if any(overlap(path, block.path) for block in plan.blocks)}
     tied = [b.path for b in plan.blocks if b.size == 1 and not any(overlap(b.path, t.path) for t in plan.targets)]
     varied = _flat(_of_lanes(plan, shared, lanes))
-    options: dict[str, Any] = {"steps": plan.steps, "method": plan.method, "backend": plan.backend, "together": tied}
-    found = by_coordinates(shared.cases.scenario, varied, moving, fold, shared.dt, **options)
+    run = Run(plan.steps, plan.method)
+    found = by_coordinates(
+        shared.cases.scenario, varied, moving, fold, shared.dt, run, backend=plan.backend, nested=plan.nested, together=tied
+    )
     parts = jax.tree.map(lambda x: x.reshape(*lanes.index.shape, *x.shape[1:]), (found.outcome, found.tangents, found.products))
     return jax.vmap(partial(_slope, plan, shared))(lanes, *parts)
 
@@ -212,7 +218,7 @@ def gradient(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
     def one_run(lane: Lane, index):
         scenario = with_parameters(shared.cases.scenario, _varied(plan, shared, lane.z, index))
         fold = fold_of(shared.objective, shared.dt.dtype)
-        outcome = run_checkpointed(scenario, fold, shared.dt, steps=plan.steps, method=plan.method)
+        outcome = run_for_reverse(scenario, fold, shared.dt, Run(plan.steps, plan.method))
         return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
 
     def loss(z, lane: Lane):

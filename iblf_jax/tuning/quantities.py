@@ -24,7 +24,7 @@ import jax.numpy as jnp
 
 from iblf_jax import checks
 from iblf_jax.closed_loop import Sample
-from iblf_jax.derivatives import Outer
+from iblf_jax.engine.derivatives import Outer
 from iblf_jax.metrics import Fold
 from iblf_jax.pytree import component, leaf, static
 

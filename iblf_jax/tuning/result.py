@@ -13,7 +13,8 @@ import numpy as np
 
 from iblf_jax import checks, paths
 from iblf_jax.distributions import Perturbation
-from iblf_jax.lowering import run_batch
+from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.step import Run
 from iblf_jax.metrics import as_folds
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import trajectory
@@ -43,7 +44,7 @@ class AtLimit(NamedTuple):
 
 @partial(jax.jit, static_argnames=("steps", "method", "backend"))
 def _slice(scenario, changes, folds, dt, *, steps, method, backend):
-    return run_batch(scenario, changes, folds, dt, steps=steps, method=method, backend=backend)
+    return run_batch(scenario, changes, folds, dt, Run(steps, method), backend=backend)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.derivatives import Tangents
-from iblf_jax.lowering import run_batch_jvp
+from iblf_jax.engine.derivatives import Tangents
+from iblf_jax.engine.execute import run_batch_jvp
+from iblf_jax.engine.step import Run
 from iblf_jax.scenario import Scenario
 
 
@@ -25,10 +26,10 @@ def by_coordinates(
     slopes: Mapping[str, jax.Array],
     folds,
     dt: jax.Array,
+    run: Run,
     *,
-    steps: int,
-    method: str,
     backend: str,
+    nested: bool = False,
     together: Collection[str] = (),
 ) -> Tangents:
     """Runs a batch with its tangents along the coordinates; call it inside `jit`.
@@ -39,7 +40,7 @@ def by_coordinates(
       slopes: path -> dx/dz, (B, ..., D), for the paths that depend on the coordinates.
       folds: the metrics.
       dt: time step, () [s].
-      steps, method, backend: static, as `run_batch`.
+      run, backend, nested: static, as `run_batch`.
       together: paths all of whose entries have the same slope: one pattern instead of one an entry.
 
     Returns:
@@ -52,7 +53,7 @@ def by_coordinates(
         path: np.concatenate([np.zeros((before, *x.shape[1:])), x, np.zeros((counts[-1] - before - len(x), *x.shape[1:]))])
         for (path, x), before in zip(patterns.items(), counts, strict=False)
     }
-    found = run_batch_jvp(scenario, varied, directions, folds, dt, steps=steps, method=method, backend=backend)
+    found = run_batch_jvp(scenario, varied, directions, folds, dt, run, backend=backend, nested=nested)
     flat = [x.reshape(len(x), -1, x.shape[-1])[:, : len(patterns[path])] for path, x in slopes.items()]
     C = jnp.concatenate(flat, axis=1)
     tangents = jax.tree.map(lambda x: jnp.einsum("bpd,bp...->bd...", C, x), found.tangents)

@@ -1,4 +1,4 @@
-"""Compiling a time loop as one machine function on CPU.
+"""Machine functions: a time loop, or a piece of one, compiled as one function of the processor instead of many of XLA's operations.
 
 XLA dispatches every operation of a CPU loop by itself, which costs microseconds a step, more than the arithmetic of a robot.  Two
 attributes on a call make it compile the whole callee as one function: two to five times faster for one run and for small batches, with
@@ -18,18 +18,7 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
-SMALL = 64
-"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
-
-LARGEST = 1 << 13
-"""Entries of the largest array of floating-point numbers that is computed inside.  (Records may be of any length: they are stacked and
-copied, not computed.)"""
-
-LONG = 2500
-"""Operations of one evaluation of the closed loop from which on it is a piece of its own."""
-
-LONGEST = 60_000
-"""Operations of a function above which the compiler takes minutes over it as one machine function."""
+from iblf_jax.engine.plan import LARGEST_ARRAY, LONGEST_FUNCTION
 
 REFUSED = frozenset(
     {
@@ -66,7 +55,7 @@ COPIES = frozenset(
 """Operations that compute nothing; their size does not matter."""
 
 
-def as_one_function(function: Callable) -> Callable:
+def machine_function(function: Callable) -> Callable:
     """`function`, compiled as one machine function where that is known to work; else as it is.
 
     Args:
@@ -77,16 +66,16 @@ def as_one_function(function: Callable) -> Callable:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         call = jaxpr_as_fun(closed)
         operations = list(_operations(closed.jaxpr))
-        if jax.default_backend() == "cpu" and len(operations) <= LONGEST and all(map(_is_trusted, operations)):
+        if jax.default_backend() == "cpu" and len(operations) <= LONGEST_FUNCTION and all(map(_is_trusted, operations)):
             call = set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(call))
         return jax.tree.unflatten(jax.tree.structure(shapes), call(*jax.tree.leaves(args)))
 
     return traced
 
 
-def is_long(function: Callable, *args) -> bool:
-    """Whether a function has so many operations that it had better be compiled once, and as a piece of its own."""
-    return sum(1 for _ in _operations(jax.make_jaxpr(function)(*args).jaxpr)) > LONG
+def length(function: Callable, *args) -> int:
+    """How many operations a function has."""
+    return sum(1 for _ in _operations(jax.make_jaxpr(function)(*args).jaxpr))
 
 
 def _operations(jaxpr: Jaxpr) -> Iterator:
@@ -103,5 +92,5 @@ def _operations(jaxpr: Jaxpr) -> Iterator:
 def _is_trusted(operation) -> bool:
     name = operation.primitive.name
     computed = [v.aval for v in operation.outvars if jax.numpy.issubdtype(v.aval.dtype, jax.numpy.floating)]
-    small = name in COPIES or all(aval.size <= LARGEST for aval in computed)
+    small = name in COPIES or all(aval.size <= LARGEST_ARRAY for aval in computed)
     return small and name not in REFUSED

@@ -1,7 +1,7 @@
-"""The xla backend: a scalar program with one array of runs a number, in `lax.scan`.  Needs nothing but jax and runs on any device.
+"""The xla executor: a scalar program with one array of runs a number, in `lax.scan`.  Needs nothing but jax and runs on any device.
 
 What time decides is tabulated for a stretch of steps at once.  On CPU a block of runs goes through a stretch of steps as one machine
-function (`one_function`), its numbers in the first-level cache.
+function (`machine_function`), its numbers in the first-level cache.
 """
 
 from __future__ import annotations
@@ -16,20 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from iblf_jax.lowering.evaluator import Entry, Evaluator, Table, on_cpu
+from iblf_jax.engine import plan
+from iblf_jax.engine.evaluator import Entry, Evaluator, Table, on_cpu
+from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.lowering.packed import Packed
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program, UnsupportedError, frontier
-from iblf_jax.lowering.step import Packed
-from iblf_jax.one_function import as_one_function
-
-BLOCK = 64
-"""Runs that go through a stretch of steps together on CPU."""
-LONG = 10_000
-"""Operations of a step from which a block on CPU is always BLOCK wide: loops over fewer runs would be unrolled, and LLVM takes up to 20 GB
-over a long step without loops."""
-LONGEST = 20_000
-"""Operations of a step above which XLA would take many minutes over it."""
-STRETCH = 4096
-"""Steps whose signals are tabulated at once, at most."""
 
 
 def run(
@@ -40,11 +31,10 @@ def run(
     Raises:
       UnsupportedError: the step is too long for XLA.
     """
-    if len(program.nodes) > LONGEST:
+    if len(program.nodes) > plan.XLA_LONGEST:
         raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
     runs = carry.floats.shape[1]
-    narrow = runs < BLOCK and len(program.nodes) < LONG
-    width = runs if narrow or not on_cpu() else BLOCK
+    width = plan.xla_width(jax.default_backend(), len(program.nodes), runs)
     blocks = -(-runs // width)
 
     def apart(rows):
@@ -69,13 +59,13 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
     def block(once, table, lane, carry):
         return _block(program, once, columns, table, lane, carry, every)
 
-    call = as_one_function(block) if on_cpu() else block
+    call = machine_function(block) if on_cpu() else block
 
     def stretch(carry, first, count):
         table = _table(program, once, columns, first, count)
         return lax.map(lambda part: call(once, table, *part), (lane, carry))
 
-    length = _stretch_length(steps, every or 1)
+    length = plan.xla_stretch(steps, every or 1)
     whole, rest = divmod(steps, length)
     parts = []
     if whole:
@@ -85,18 +75,7 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
     if rest:
         carry, arrays = stretch(carry, jnp.int32(whole * length), rest)
         parts.append(arrays)
-    if every and steps % every == 0:
-        parts.append([jnp.zeros_like(x[:, :1]) for x in parts[0]])
     return carry, [jnp.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)]
-
-
-def _stretch_length(steps: int, every: int) -> int:
-    """Steps of a stretch, a multiple of `every`: so that one length does for all where there is such a length, as each is compiled."""
-    most = max(STRETCH // every, 1) * every
-    if steps <= most:
-        return steps
-    exact = next((d for d in range(most, 0, -every) if steps % d == 0), 0)
-    return exact if exact > most // 16 else most
 
 
 def _block(

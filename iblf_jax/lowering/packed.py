@@ -1,12 +1,8 @@
-"""The step of a scenario as a scalar program, and the arrays that go in and out of it.
-
-A kernel maps carry to carry over many steps.  What comes before (`time_loop.start`) and after (`time_loop.finish`) is done once a run
-and stays in jnp.  The leaves of scenario and metrics are inputs of the kernel, never constants: new gains do not recompile.
-"""
+"""A step as a scalar program, and the arrays that go in and out of it: one row a number, one column a run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,41 +13,6 @@ import numpy as np
 from iblf_jax.lowering.from_jaxpr import closed, kind_of
 from iblf_jax.lowering.passes import with_reciprocals
 from iblf_jax.lowering.program import Builder, Program, UnsupportedError, finished
-from iblf_jax.paths import with_parameters
-
-
-class Leaves(NamedTuple):
-    """The leaves of a pytree, told apart by whether they differ between runs."""
-
-    treedef: Any
-    is_lane: tuple[bool, ...]
-    shared: list[jax.Array]
-    lane: list[jax.Array]
-    """With a leading batch axis."""
-
-    def together(self, shared: Sequence, lane: Sequence):
-        """The pytree again, from one run's leaves."""
-        one, other = iter(shared), iter(lane)
-        return jax.tree.unflatten(self.treedef, [next(other) if lane else next(one) for lane in self.is_lane])
-
-
-def split(scenario, varied: Mapping[str, jax.Array], folds, dt) -> Leaves:
-    """The leaves of (scenario, folds, dt): those that `varied` replaces become one value a run."""
-    before, treedef = jax.tree.flatten((scenario, folds, dt))
-
-    def replaced(values):
-        return jax.tree.leaves((with_parameters(scenario, values), folds, dt))
-
-    touched: list[bool] = []
-
-    def look(values):
-        after = replaced(values)
-        touched[:] = [new is not old for new, old in zip(after, before, strict=True)]
-        return [new for new, yes in zip(after, touched, strict=True) if yes]
-
-    lane = jax.vmap(look)(dict(varied)) if varied else []
-    touched = touched or [False] * len(before)
-    return Leaves(treedef, tuple(touched), [x for x, yes in zip(before, touched, strict=True) if not yes], list(lane))
 
 
 class Shapes(NamedTuple):
@@ -78,9 +39,17 @@ class Shapes(NamedTuple):
         return sum(int(np.prod(shape)) for shape, _ in self.items)
 
 
+class Lowered(NamedTuple):
+    """A step as a program."""
+
+    program: Program
+    records: Any
+    """Shapes and types of what a step gives besides its carry, for one run."""
+
+
 @lru_cache(maxsize=64)
-def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes, sparse: bool = False) -> Program:
-    """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, samples)`.
+def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes, sparse: bool = False) -> Lowered:
+    """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, records)`.
 
     `sparse`: for steps that hold derivatives, see `Builder`.
 
@@ -88,12 +57,12 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
       UnsupportedError: the step holds something that a scalar program cannot express.
     """
     index = jax.ShapeDtypeStruct((), jnp.int32)
-    jaxpr, shapes = jax.make_jaxpr(step, return_shape=True)(shared.structs(), lane.structs(), carry.structs(), index)
+    jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(shared.structs(), lane.structs(), carry.structs(), index)
     b = Builder(dtype, sparse=sparse)
     operands, read = [], []
     for op, group in (("shared", shared), ("lane", lane), ("carry", carry)):
         count = 0
-        for (shape, array_dtype), _ in zip(group.items, group.structs(), strict=True):
+        for shape, array_dtype in group.items:
             kind = _accepted(kind_of(array_dtype), array_dtype, op, dtype)
             size = int(np.prod(shape))
             ids = [b.input(op, count + i, kind) for i in range(size)]
@@ -102,12 +71,12 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
             read += ids if op == "carry" else []
     operands.append(np.asarray(b.input("index", 0, "i"), np.int64))
     out = closed(b, jaxpr, operands)
-    n_carry = len(shapes[0])
-    carry_out = [int(i) for ids in out[:n_carry] for i in ids.ravel()]
-    samples = [_as_float(b, int(i)) for ids in out[n_carry:] for i in ids.ravel()]
-    if Shapes.of(shapes[0]).kinds() != carry.kinds():
+    carry_out = [int(i) for ids in out[: len(after)] for i in ids.ravel()]
+    samples = [_as_float(b, int(i)) for ids in out[len(after) :] for i in ids.ravel()]
+    if Shapes.of(after).kinds() != carry.kinds():
         raise UnsupportedError("the step changes the types of what it carries")
-    return with_reciprocals(finished(b, read, carry_out, samples, tuple(ids.size for ids in out[n_carry:])))
+    program = finished(b, read, carry_out, samples, tuple(ids.size for ids in out[len(after) :]))
+    return Lowered(with_reciprocals(program), records)
 
 
 def _accepted(kind: str, array_dtype, op: str, dtype) -> str:
@@ -156,5 +125,12 @@ def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
 
 
 def record_shapes(program: Program, runs: int, steps: int, every: int | None) -> list[jax.ShapeDtypeStruct]:
-    """(samples, numbers * runs) of each recorded array, the sample at the end included if it is one; none without `every`."""
-    return [jax.ShapeDtypeStruct((steps // every + 1, size * runs), program.dtype) for size in program.recorded] if every else []
+    """(rows, numbers * runs) of each recorded array: a row for every `every`-th of the steps, from the first on."""
+    return [jax.ShapeDtypeStruct((-(-steps // every), size * runs), program.dtype) for size in program.recorded] if every else []
+
+
+def unpacked_records(records: Any, arrays: Sequence[jax.Array]) -> Any:
+    """What a step gives besides its carry, run axis first, then time, from arrays (rows, numbers, runs) and its shapes for one run."""
+    shapes, treedef = jax.tree.flatten(records)
+    rows = [a.transpose(2, 0, 1).reshape(a.shape[2], len(a), *x.shape).astype(x.dtype) for a, x in zip(arrays, shapes, strict=True)]
+    return jax.tree.unflatten(treedef, rows)

@@ -11,8 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
+from iblf_jax.engine.batch import Batch, carry_shapes
+from iblf_jax.engine.execute import automatic
+from iblf_jax.engine.executors import program_of
+from iblf_jax.engine.step import Inputs, TimeStep
 from iblf_jax.integrators import tableau
-from iblf_jax.lowering import automatic, batch, native
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
 from iblf_jax.lowering.toolchain import threads
 from iblf_jax.metrics import as_folds
@@ -78,8 +81,8 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
-    one = batch.batch_of(native.run, scenario, leaves, folds, jnp.asarray(1e-3, dtype))
-    program, _, _ = one.program(batch.step_function, one.start(method), method, False)
+    one = Batch.of(Inputs(scenario, folds, *jnp.asarray([1e-3, 1.0], dtype)), leaves)
+    program, _ = program_of(TimeStep(method), one, carry_shapes(one, method))
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}

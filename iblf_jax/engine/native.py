@@ -1,4 +1,4 @@
-"""The native backend: a program's C, built by the system's compiler and called from within jit.
+"""The native executor: a program's C, built by the system's compiler and called from within jit.
 
 A kernel is registered with XLA under a name that holds the hash of its content, so a program that JAX keeps in its persistent
 cache finds the same kernel in another process.
@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.engine import plan
 from iblf_jax.lowering.emit_c import source
+from iblf_jax.lowering.packed import Packed, record_shapes
 from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.step import Packed, record_shapes
 from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded, threads
-
-NAME = "native"
 
 _registered: set[str] = set()
 
@@ -44,7 +43,9 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
       ToolchainError: no compiler, or an error from it.
       UnsupportedError: an operation that C has no word for.
     """
-    library, key = built(source(program, shared, lane), ("-DVECTOR_BYTES=16",) if narrow else ())
+    library, key = built(
+        source(program, shared, lane, segment=plan.native_segment(len(program.nodes))), ("-DVECTOR_BYTES=16",) if narrow else ()
+    )
     name = f"iblf_jax_{key}"
     if name not in _registered:
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="cpu")
@@ -66,8 +67,7 @@ def run(
       every: sample every so-many-th step, or None.
 
     Returns:
-      The rows after the last step, and the recorded arrays, (samples, numbers, runs): of every `every`-th step, and a last row for whoever
-      looks at the end, if the end is such a step.
+      The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every `every`-th step.
     """
     runs = carry.floats.shape[1]
     narrow = runs * program.dtype.itemsize <= 16

@@ -15,13 +15,11 @@ import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from iblf_jax.lowering import vector_math
+from iblf_jax.engine import plan, vector_math
 from iblf_jax.lowering.program import Node, Program
 
 STORED = 8
 """Cost from which a number with several uses is stored on CPU.  XLA would compute it again for each use."""
-SEGMENT = 2000
-"""Operations in one XLA computation, on CPU: its passes take more than linear time."""
 
 FUNCTIONS: dict[str, Callable] = {
     "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "rem": lax.rem, "neg": lax.neg, "abs": lax.abs, "max": lax.max,
@@ -81,7 +79,7 @@ class Evaluator:
         known |= {i: np.asarray(nodes[i].value, self.types[nodes[i].kind]) for i in needed if nodes[i].op == "const"}
         order = sorted(i for i in needed if nodes[i].op != "const")
         stored = self._stored(order, wanted)
-        size = SEGMENT if self.bordered else max(len(order), 1)
+        size = plan.XLA_SEGMENT if self.bordered else max(len(order), 1)
         for start in range(0, len(order), size):
             self._segment(known, order[start : start + size], order[start + size :], stored, row)
 

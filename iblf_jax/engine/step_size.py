@@ -19,9 +19,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax import accuracy, checks
-from iblf_jax.closed_loop import LoopState, evaluate, initial_state, rate
-from iblf_jax.integrators import stages, tableau
-from iblf_jax.one_function import as_one_function
+from iblf_jax.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.integrators import step as one_step
+from iblf_jax.integrators import tableau
 from iblf_jax.scenario import Initial, Scenario, canonical
 from iblf_jax.stability import SLOWEST, jacobian
 from iblf_jax.status import VELOCITY_LIMIT
@@ -75,8 +76,8 @@ def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> P
 def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
-    rate_at = jax.vmap(lambda y: accuracy.numbers(rate(scenario, zero, accuracy.with_numbers(start, y))))
-    estimate = accuracy.between_stages(scenario, accuracy.begin(method, rate_at, start), method, dt, steps)
+    estimate = accuracy.begin(method, jacobian(scenario, zero, start), start)
+    estimate = accuracy.between_stages(scenario, estimate, method, dt, steps)
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
 
@@ -84,10 +85,10 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
 def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str) -> Pair:
     """The pair up to CHUNK steps later: one machine function, as XLA's own loops take longer to go round than a small arm to compute."""
     whole = ravel_pytree(initial_state(scenario))[1]
-    n, halfway = scenario.n, tableau(method).halfway
+    n = scenario.n
 
     def chunk(scenario, dt, steps, pair):
-        weights, cuts = (jnp.asarray(table, dt.dtype) for table in (np.stack(stages(method), axis=1), CUTS))
+        cuts = jnp.asarray(CUTS, dt.dtype)
 
         def one(pair, _):
             begin = pair.step.astype(dt.dtype) * dt
@@ -97,21 +98,15 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
                 whole_step, t, h = cut[1] == 1.0, begin + cut[0] * dt, cut[1] * dt
                 x = jnp.where(whole_step, coarse, fine)
 
-                def stage(slope_and_sum, row):
-                    k, total = slope_and_sum
-                    slope, sample = evaluate(scenario, t + row[0] * h, whole(x + h * (row[1] * k)))
-                    k = ravel_pytree(slope)[0]
-                    return (k, total + row[2] * k), (k, sample.upper - sample.lower, sample.xi)
-
-                (_, total), seen = jax.lax.scan(stage, (jnp.zeros_like(x), jnp.zeros_like(x)), weights)
-                new = x + h * total
+                stepped = one_step(method, partial(evaluate, scenario), t, whole(x), h, rolled=True)
+                new, sample = ravel_pytree(stepped.state)[0], stepped.first
+                seen = (stepped.slopes, sample.upper - sample.lower, sample.xi)
                 return (jnp.where(whole_step, new, coarse), jnp.where(whole_step, fine, new)), seen
 
             (coarse, fine), (slopes, widths, xis) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
-            width = widths[0, 0]
-            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, whole(slopes[0, 0]), width)
-            estimate = accuracy.passed(estimate, method, [whole(slopes[0, i]) for i in range(halfway + 1)])
-            near = jnp.max(jnp.abs(xis[1, 0]))
+            width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], slopes)
+            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, of_coarse, width)
+            near = jnp.max(jnp.abs(xis[1]))
             nearest = jax.tree.map(partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest)
             off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
             going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
@@ -121,7 +116,7 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
 
         return jax.lax.scan(one, pair, None, CHUNK)[0]
 
-    return as_one_function(chunk)(scenario, dt, steps, pair)
+    return machine_function(chunk)(scenario, dt, steps, pair)
 
 
 @jax.jit

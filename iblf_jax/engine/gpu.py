@@ -1,4 +1,4 @@
-"""The gpu backend: a whole rollout in one CUDA kernel, one run a thread, its numbers in registers.
+"""The gpu executor: a whole rollout in one CUDA kernel, one run a thread, its numbers in registers.
 
 The kernel is the C that `native` has, from the same emitter, in which a name stands for one run's number rather than for a vector of
 runs.  NVRTC compiles it for the GPU at hand; the system's C++ compiler builds the few lines that launch it from within jit
@@ -17,20 +17,12 @@ from functools import lru_cache
 import jax
 import numpy as np
 
+from iblf_jax.engine import plan
 from iblf_jax.lowering import nvrtc
 from iblf_jax.lowering.emit_c import CUDA, Layout, header, sizes, source
+from iblf_jax.lowering.packed import Packed, record_shapes
 from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.step import Packed, record_shapes
 from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded
-
-NAME = "gpu"
-STRETCH = 8192
-"""Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
-WARP = 32
-MOST_THREADS = 128
-"""Threads in a block, at most; `c/kernels.h` promises the compiler no more."""
-PROCESSORS = 100
-"""Multiprocessors of a GPU that JAX does not know the number of."""
 
 _registered: set[str] = set()
 
@@ -94,16 +86,11 @@ def kernel(program: Program, shared: int, lane: int, target: str) -> str:
     return name
 
 
-def threads_in_block(runs: int, processors: int) -> int:
-    """Threads in a block: few enough that every multiprocessor gets a block, in whole warps."""
-    return min(max(-(-runs // (processors * WARP)) * WARP, WARP), MOST_THREADS)
-
-
 def call(name: str, program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None, threads: int):
     """`run` by the launcher of a name, with so many threads in a block."""
     layout = Layout.of(program)
     runs = carry.floats.shape[1]
-    room = [(1, len(layout.constants)), (max(min(steps, STRETCH), 1), len(layout.columns))]
+    room = [(1, len(layout.constants)), (max(min(steps, plan.GPU_STRETCH), 1), len(layout.columns))]
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + [jax.ShapeDtypeStruct(shape, program.dtype) for shape in room]
     outputs += record_shapes(program, runs, steps, every)
     attributes = {"steps": np.int64(steps), "every": np.int64(every or 0), "threads": np.int64(threads)}
@@ -116,5 +103,5 @@ def run(
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs; arguments and results as `native.run`."""
     name = kernel(program, shared.size, lane.shape[0], architecture())
-    processors = getattr(jax.local_devices()[0], "core_count", PROCESSORS)
-    return call(name, program, shared, lane, carry, steps, every, threads_in_block(carry.floats.shape[1], processors))
+    processors = getattr(jax.local_devices()[0], "core_count", plan.GPU_PROCESSORS)
+    return call(name, program, shared, lane, carry, steps, every, plan.gpu_threads(carry.floats.shape[1], processors))

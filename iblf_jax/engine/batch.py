@@ -1,0 +1,148 @@
+"""A batch of runs, or one: which leaves differ between the runs, and the way from the start to the outcome, whatever steps them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.closed_loop import initial_state
+from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.engine.plan import Shape
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Run, TimeStep, jacobians, probed, start, verdict
+from iblf_jax.paths import with_parameters
+from iblf_jax.stability import spectral_radius
+
+
+class Leaves(NamedTuple):
+    """The leaves of a pytree, told apart by whether they differ between runs."""
+
+    treedef: Any
+    is_lane: tuple[bool, ...]
+    shared: list[jax.Array]
+    lane: list[jax.Array]
+    """With a leading batch axis."""
+
+    def together(self, shared: Sequence, lane: Sequence):
+        """The pytree again, from one run's leaves."""
+        one, other = iter(shared), iter(lane)
+        return jax.tree.unflatten(self.treedef, [next(other) if lane else next(one) for lane in self.is_lane])
+
+
+def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
+    """The leaves of what runs are made from: those that `varied` replaces in the scenario become one value a run."""
+    before, treedef = jax.tree.flatten(inputs)
+
+    def replaced(values):
+        return jax.tree.leaves(inputs._replace(scenario=with_parameters(inputs.scenario, values)))
+
+    touched: list[bool] = []
+
+    def look(values):
+        after = replaced(values)
+        touched[:] = [new is not old for new, old in zip(after, before, strict=True)]
+        return [new for new, yes in zip(after, touched, strict=True) if yes]
+
+    lane = jax.vmap(look)(dict(varied)) if varied else []
+    touched = touched or [False] * len(before)
+    return Leaves(treedef, tuple(touched), [x for x, yes in zip(before, touched, strict=True) if not yes], list(lane))
+
+
+PLAIN = Shape("together", "none")
+
+
+class Batch(NamedTuple):
+    """Runs that are stepped together."""
+
+    leaves: Leaves
+    """Of their `Inputs`."""
+    runs: int | None
+    """None: one run, and no array has a run axis."""
+    shape: Shape = PLAIN
+    """How its parts are compiled."""
+
+    @staticmethod
+    def of(inputs: Inputs, varied: Mapping[str, jax.Array] | None, shape: Shape = PLAIN) -> Batch:
+        """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
+        runs = jax.tree.leaves(dict(varied))[0].shape[0] if varied else None
+        return Batch(split(inputs, varied or {}), runs, shape)
+
+    @property
+    def dtype(self):
+        """The floating-point type."""
+        return self.leaves.shared[-1].dtype
+
+    def each(self, function: Callable, *args: Any) -> Any:
+        """function(inputs, *args) for every run; arguments and results have the run axis first."""
+
+        def one(lane, *rest):
+            return function(self.leaves.together(self.leaves.shared, lane), *rest)
+
+        if self.runs is None:
+            return one([], *args)
+        if self.shape.runs == "in turn":
+            return jax.lax.map(lambda each: one(*each), (self.leaves.lane, *args))
+        together = jax.vmap(one, axis_size=self.runs)
+        return (machine_function(together) if self.shape.function == "parts" else together)(self.leaves.lane, *args)
+
+
+Executor = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
+"""(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step recorded, from the first on).
+
+All arrays have the run axis first, records then the time axis; `every` is None where nothing is recorded."""
+
+
+def jacobians_at(executor: Executor, batch: Batch, at: Callable, *args: Any) -> jax.Array:
+    """The closed loop's Jacobians, (runs, 2, m, m) [1/s], at the two states `at(inputs, *args)` of every run."""
+    leaves = batch.leaves
+    shared, lane = jax.lax.stop_gradient((leaves.shared, leaves.lane))
+    batch = batch._replace(leaves=leaves._replace(shared=shared, lane=lane))
+    carry = batch.each(at, *jax.lax.stop_gradient(args))
+    _, rates = executor(Probe(), batch, carry, 4 * carry.states.shape[-1], 1)
+    return batch.each(lambda _, carry, rates: jacobians(carry, rates), carry, rates)
+
+
+def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, jax.Array]:
+    """The carry before the first step, and the mode at the start [1/s]."""
+
+    def at_start(inputs):
+        state = initial_state(inputs.scenario)
+        return probed([jnp.zeros_like(inputs.dt)] * 2, [state] * 2)
+
+    def one(inputs, jacobian):
+        return start(inputs, method, jacobian[0]), spectral_radius(jacobian[0])
+
+    return batch.each(one, jacobians_at(executor, batch, at_start))
+
+
+def carry_shapes(batch: Batch, method: str) -> Carry:
+    """Shapes and types of the carry."""
+
+    def one(inputs):
+        size = sum(x.size for x in jax.tree.leaves(initial_state(inputs.scenario)))
+        return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+
+    return jax.eval_shape(lambda: batch.each(one))
+
+
+def end(executor: Executor, batch: Batch, run: Run, carry: Carry, mode: jax.Array) -> Outcome:
+    """The outcome after the last step, without records; `mode` is that at the start."""
+
+    def critical(inputs, carry):
+        return probed([carry.nearest.t, inputs.dt * run.steps], [carry.nearest.state, carry.state])
+
+    def one(inputs, carry, mode, jacobian):
+        return verdict(inputs, run, carry, jnp.stack([mode, *jax.vmap(spectral_radius)(jacobian)]))
+
+    return batch.each(one, carry, mode, jacobians_at(executor, batch, critical, carry))
+
+
+def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:
+    """All runs, from the start to the outcome."""
+    carry, mode = begin(executor, batch, run.method)
+    step = TimeStep(run.method, run.record_every is not None)
+    carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)
+    outcome = end(executor, batch, run, carry, mode)
+    return outcome if run.record_every is None else outcome._replace(records=records)

@@ -1,0 +1,235 @@
+"""Values and forward sensitivities of a batch, in one pass: several tangents a run, stepped beside it.
+
+Every direction u of the parameters has a tangent x_u of the state; gains are few, so forward mode beats reverse mode and needs no memory
+along time.  A fold may offer `curvature(acc, sample)`, a tuple of `curvatures` many `Outer`: vectors y with weights w, whose
+Gauss-Newton matrices
+
+    N_uv = sum_k w(t_k) y_u(t_k) . y_v(t_k),      y_u = tangent of y,
+
+are summed up along the way, at next to no cost.  With w = 2 dt that is the second-order information of every integral of squares.
+
+The step with its tangents is a step as any other: every executor steps it.  As a scalar program it holds what all tangents share once,
+because equal nodes are one node.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax import accuracy
+from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
+from iblf_jax.engine.batch import Batch, Executor, begin, end
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Run, advance
+from iblf_jax.paths import get, with_parameters
+
+FLAGS = ("guard_active", "saturated")
+"""Fields of a sample that are no numbers."""
+
+
+class Outer(NamedTuple):
+    """What one sample adds to a curvature matrix: N <- decay N + sum_i weight_i y_iu y_iv, y_u the tangent of `vector`."""
+
+    vector: jax.Array
+    """y, (m,)."""
+    weight: jax.Array
+    """(m,) or ()."""
+    decay: jax.Array | float = 1.0
+    """()."""
+
+
+class Tangents(NamedTuple):
+    """Values and tangents of a batch; B runs, D directions."""
+
+    outcome: Outcome
+    """Metrics and status, (B, ...)."""
+    tangents: dict[str, jax.Array]
+    """Of the real-valued metrics, (B, D, ...)."""
+    products: tuple[jax.Array, ...]
+    """Curvature matrix of each `Outer` of each fold, (B, D, D)."""
+
+
+class Directions(NamedTuple):
+    """Tangents of leaves by path; hashable, the numbers are part of what is compiled."""
+
+    items: tuple[tuple[str, tuple[int, ...], tuple[float, ...]], ...]
+
+    @staticmethod
+    def of(directions: Mapping[str, Any]) -> Directions:
+        """From path -> (P, *shape of the leaf)."""
+        arrays = {path: np.asarray(x, float) for path, x in directions.items()}
+        return Directions(tuple((path, x.shape, tuple(x.ravel().tolist())) for path, x in arrays.items()))
+
+    @property
+    def tangents(self) -> int:
+        """P."""
+        return self.items[0][1][0]
+
+    def moved(self, scenario, eps: jax.Array):
+        """The scenario, its leaves moved by eps (P,) along the directions."""
+        values = {}
+        for path, shape, numbers in self.items:
+            change = np.asarray(numbers, eps.dtype).reshape(shape)
+            values[path] = get(scenario, path) + jnp.tensordot(eps, change, 1)
+        return with_parameters(scenario, values)
+
+
+class Differentiated(NamedTuple):
+    """What goes from step to step: the carry, P tangents of state and accumulators, the products of each `Outer`."""
+
+    carry: Carry
+    tangents: list[jax.Array]
+    products: list[jax.Array]
+    """Upper triangles, row by row, (P (P + 1) / 2,) each."""
+
+
+def _floats(carry: Carry) -> tuple[list[jax.Array], Callable]:
+    """The numbers of a carry that have tangents, and the function that puts others in their place."""
+    leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
+    places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+    def replaced(floats):
+        new = list(leaves)
+        for i, x in zip(places, floats, strict=True):
+            new[i] = x
+        state, accumulators = jax.tree.unflatten(treedef, new)
+        return carry._replace(state=state, accumulators=accumulators)
+
+    return [leaves[i] for i in places], replaced
+
+
+def pushed(function: Callable, directions: Directions, scenario, before: Differentiated | None, dtype):
+    """function(scenario, carry, eps) and its derivative along every direction.
+
+    Args:
+      function: of a scenario, a carry and how far it is moved along the directions; gives a list of floats and anything else.
+      directions: P of them.
+      scenario: where.
+      before: carry and tangents, or None where the function takes no carry.
+      dtype: of the tangents.
+    """
+    floats, replaced = _floats(before.carry) if before else ([], lambda _: None)
+
+    def of(eps, floats):
+        return function(directions.moved(scenario, eps), replaced(floats), eps)
+
+    def along(unit, tangents):
+        value, tangent, rest = jax.jvp(of, (jnp.zeros_like(unit), floats), (unit, tangents), has_aux=True)
+        return value, tangent, rest
+
+    units = np.eye(directions.tangents, dtype=dtype)
+    return jax.vmap(along, out_axes=(None, 0, None))(units, before.tangents if before else [])
+
+
+def without_flags(sample: Sample) -> Any:
+    """The numbers of a sample; its flags have no derivative."""
+    return {name: x for name, x in sample._asdict().items() if name not in FLAGS}
+
+
+def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopState) -> Callable:
+    """`closed_loop.evaluate`, its Jacobian by state and directions worked out once and applied to every tangent.
+
+    One tangent through the law costs as much as the law; applying the Jacobian costs a tenth of it.
+    """
+    if not all(jnp.issubdtype(x.dtype, jnp.floating) for x in jax.tree.leaves(like)):
+        return lambda moved, t, state, dt=0.0: evaluate(moved, t, state, dt)
+    unravel = ravel_pytree(like)[1]
+
+    def numbers(flat, eps, t, dt):
+        slope, sample = evaluate(directions.moved(scenario, eps), t, unravel(flat), dt)
+        flags = {name: getattr(sample, name) for name in FLAGS}
+        return ravel_pytree((slope, without_flags(sample)))[0], flags
+
+    @jax.custom_jvp
+    def floats(flat, eps, t, dt):
+        return numbers(flat, eps, t, dt)[0]
+
+    @floats.defjvp
+    def _(primals, tangents):
+        flat, eps, t, dt = primals
+        units = np.eye(flat.size + eps.size, dtype=flat.dtype)
+        value = lambda x: numbers(x[: flat.size], x[flat.size :], t, dt)[0]  # noqa: E731
+        here = jnp.concatenate([flat, eps])
+        columns = jax.vmap(lambda unit: jax.jvp(value, (here,), (unit,))[1])(units)
+        return floats(*primals), jnp.concatenate(tangents[:2]) @ columns
+
+    def loop(moved, t, state, dt=0.0):
+        dt = jnp.asarray(dt, t.dtype)
+        slope, sample = jax.eval_shape(lambda: evaluate(scenario, t, state, dt))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (slope, without_flags(sample)))
+        flat = ravel_pytree(state)[0]
+        slope, values = ravel_pytree(zeros)[1](floats(flat, eps, t, dt))
+        return slope, Sample(**values, **numbers(*jax.lax.stop_gradient((flat, eps, t, dt)))[1])
+
+    return loop
+
+
+def _outer_of(folds, accumulators, sample) -> tuple[Outer, ...]:
+    """What a sample adds to the curvature matrices of the folds that have them."""
+    found: tuple[Outer, ...] = ()
+    for fold, acc in zip(folds, accumulators, strict=True):
+        if hasattr(fold, "curvatures"):
+            found += tuple(fold.curvature(acc, sample))
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class DerivativeStep:
+    """One step of a run and of its tangents."""
+
+    method: str
+    directions: Directions
+    is_derivative: ClassVar[bool] = True
+
+    def __call__(self, inputs: Inputs, carry: Differentiated, index: jax.Array, *, rolled: bool, piece: Callable = lambda f: f):
+        """The carry after the step; nothing is recorded."""
+        rows, columns = np.triu_indices(self.directions.tangents)
+
+        def one(scenario, before, eps):
+            # In a loop over the stages a Jacobian for a few tangents would cost more than the tangents.
+            loop = evaluate if rolled else preaccumulated(inputs.scenario, self.directions, eps, before.state)
+            after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, rolled, piece, loop)
+            outer = _outer_of(inputs.folds, begun, sample)
+            return (_floats(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
+
+        _, (tangents, vectors), (after, factors) = pushed(one, self.directions, inputs.scenario, carry, inputs.dt.dtype)
+        terms = zip(carry.products, vectors, factors, strict=True)
+        products = [decay * N + jnp.sum(weight * y[rows] * y[columns], axis=-1) for N, y, (weight, decay) in terms]
+        return Differentiated(after, tangents, products), ()
+
+
+def run_with_tangents(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
+    """All runs with their tangents, from the start to the outcome; `run` records nothing."""
+    rows, columns = np.triu_indices(directions.tangents)
+
+    def at_start(inputs, carry):
+        def state(scenario, _, eps):
+            return _floats(carry._replace(state=initial_state(scenario)))[0], ()
+
+        count = sum(getattr(fold, "curvatures", 0) for fold in inputs.folds)
+        _, tangents, _ = pushed(state, directions, inputs.scenario, None, inputs.dt.dtype)
+        return Differentiated(carry, tangents, [jnp.zeros((len(rows),), inputs.dt.dtype)] * count)
+
+    def at_end(inputs, before):
+        def metrics(scenario, carry, eps):
+            found: dict[str, jax.Array] = dict.fromkeys((name for name, _ in accuracy.UNITS), jnp.zeros_like(inputs.dt))
+            found[accuracy.ERROR] = jnp.zeros_like(carry.accuracy.error)
+            for fold, acc in zip(inputs.folds, carry.accumulators, strict=True):
+                found |= {name: x for name, x in fold.finish(acc).items() if jnp.issubdtype(x.dtype, jnp.floating)}
+            return found, ()
+
+        _, tangents, _ = pushed(metrics, directions, inputs.scenario, before, inputs.dt.dtype)
+        full = jnp.zeros((directions.tangents,) * 2, inputs.dt.dtype)
+        return tangents, tuple(full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products)
+
+    carry, mode = begin(executor, batch, run.method)
+    before = batch.each(at_start, carry)
+    after, _ = executor(DerivativeStep(run.method, directions), batch, before, run.steps + 1, None)
+    tangents, products = batch.each(at_end, after)
+    return Tangents(end(executor, batch, run, after.carry, mode), tangents, products)

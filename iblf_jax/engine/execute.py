@@ -1,0 +1,271 @@
+"""Runs, batches and their derivatives, executed as `plan` decides.  The physics is written once, for one run.
+
+    scan     the step as it is: any scenario, any device; a user calls it "vmap"
+    xla      the step's scalar program, one (batch,) array a number: any device, nothing needed but jax
+    native   the same program as C, built by the system's compiler, SIMD over runs and threads: CPU
+    gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs (not yet measured on one)
+
+All give the same results.  What a scalar program cannot express runs on scan, and what has no compiler, or is for another device, on xla;
+a `BackendWarning` says why, once.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax import checks
+from iblf_jax.closed_loop import evaluate, initial_state
+from iblf_jax.engine import gpu, native, plan, xla
+from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
+from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
+from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
+from iblf_jax.engine.machine_function import length, machine_function
+from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
+from iblf_jax.lowering.program import UnsupportedError
+from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.scenario import Scenario
+
+LOWERED = {"native": native, "gpu": gpu, "xla": xla}
+"""What runs scalar programs."""
+
+
+class BackendWarning(UserWarning):
+    """A batch runs on another backend than was asked for, and why."""
+
+
+_told: set[str] = set()
+
+
+def _tell(text: str) -> None:
+    if text not in _told:
+        _told.add(text)
+        warnings.warn(text, BackendWarning, stacklevel=4)
+
+
+def automatic() -> tuple[str, str | None]:
+    """The backend that "auto" takes for what lowers, and why it is not a compiled one, in one line (None if it is)."""
+    best = plan.order("auto", jax.default_backend())[0]
+    if best == "xla":
+        return best, f"no kernels are compiled for {jax.default_backend()}"
+    reason = LOWERED[best].unavailable()
+    return ("xla", reason) if reason else (best, None)
+
+
+def with_fallback(backend: str, run_on: Callable, plain: Callable):
+    """`run_on(name)` on the executor that was asked for, or the next one that can; `plain()` is scan.
+
+    Args:
+      backend: one of `plan.BACKENDS`.
+      run_on: function of a name in LOWERED.
+      plain: function without arguments.
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    checks.one_of("backend", backend, plan.BACKENDS)
+    platform = jax.default_backend()
+    if backend in plan.COMPILED.values() and plan.COMPILED.get(platform) != backend:
+        _tell(f"The {backend} backend is not for the default device, {platform}: running on xla.")
+        backend = "xla"
+    try:
+        for name in plan.order(backend, platform):
+            try:
+                return run_on(name)
+            except ToolchainError as error:
+                _tell(f"The {name} backend is not available ({error}): running on xla.")
+    except UnsupportedError as reason:
+        _tell(f"This scenario runs on the vmap backend, several times slower: {reason}.")
+    return plain()
+
+
+def _inputs(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
+    return Inputs(scenario, folds, dt, jnp.asarray(run.steps, dt.dtype))
+
+
+def _executor(name: str) -> Executor:
+    return lowered_on(LOWERED[name].run)
+
+
+def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], nested: bool = False) -> Batch:
+    return Batch.of(inputs, varied, plan.lowered_shape(jax.default_backend(), len(next(iter(varied.values()))), nested))
+
+
+def _shape(inputs: Inputs, runs: int | None, nested: bool) -> plan.Shape:
+    """How the scan executor runs them."""
+    platform, zero = jax.default_backend(), jnp.zeros_like(inputs.dt)
+    if platform != "cpu" or nested:
+        return plan.scan_shape(platform, 0, runs, nested)
+    operations = length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
+    return plan.scan_shape(platform, operations, runs, nested)
+
+
+def _scanned(inputs: Inputs, varied: Mapping[str, jax.Array] | None, nested: bool, run: Callable) -> Any:
+    """`run(batch)` by the scan executor, as one machine function where that pays."""
+    shape = _shape(inputs, len(next(iter(varied.values()))) if varied else None, nested)
+
+    def whole(inputs, varied):
+        return run(Batch.of(inputs, varied, shape))
+
+    return (machine_function(whole) if shape.function == "whole" else whole)(inputs, dict(varied or {}))
+
+
+def run_batch(
+    scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    folds: Any,
+    dt: jax.Array,
+    run: Run,
+    *,
+    backend: str = "auto",
+    nested: bool = False,
+) -> Outcome:
+    """Runs a scenario once for every entry of `varied`; call it inside `jit`.
+
+    Args:
+      scenario: the scenario that all runs share, canonical.
+      varied: path -> values, batch axis first; each run replaces these leaves.
+      folds: the metrics.
+      dt: time step, () [s].
+      run: what to run, static.
+      backend: one of `plan.BACKENDS`, static.
+      nested: whether it is called from a loop or a branch of JAX's.
+
+    Returns:
+      An `Outcome` with a leading batch axis on every array.
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    inputs = _inputs(scenario, folds, dt, run)
+
+    def run_on(name):
+        return run_all(_executor(name), _lowered_batch(inputs, varied, nested), run)
+
+    def plain():
+        return _scanned(inputs, varied, nested, lambda batch: run_all(scan, batch, run))
+
+    return with_fallback(backend, run_on, plain)
+
+
+def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto") -> Outcome:
+    """One run; call it inside `jit`, and do not batch or differentiate it from outside.
+
+    Args:
+      scenario, folds, dt, run: as `run_batch`, of one run.
+      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native for short steps where there is a
+        compiler.  What is long or does not lower is, on these two, on scan, without a warning.
+    """
+    inputs = _inputs(scenario, folds, dt, run)
+    batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]})
+
+    def run_on(name):
+        return jax.tree.map(lambda x: x[0], run_all(_executor(name), batch, run))
+
+    def plain():
+        return _scanned(inputs, None, False, lambda batch: run_all(scan, batch, run))
+
+    if backend in plan.COMPILED.values():
+        return with_fallback(backend, run_on, plain)
+    if jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
+        return plain()
+    name = "native" if backend == "auto" and not native.unavailable() else "xla"
+    try:
+        step = TimeStep(run.method, run.record_every is not None)
+        program, _ = program_of(step, batch, carry_shapes(batch, run.method))
+        return run_on(name) if plan.lowers_alone(len(program.nodes)) else plain()
+    except (UnsupportedError, ToolchainError):
+        return plain()
+
+
+def run_plain(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
+    """One run that may be batched and differentiated from outside; arguments as `run_one`."""
+    return run_all(scan, Batch.of(_inputs(scenario, folds, dt, run), None), run)
+
+
+def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
+    """As `run_plain`, for reverse mode: few states are in memory at a time; `run` records nothing."""
+    return run_all(checkpointed, Batch.of(_inputs(scenario, folds, dt, run), None), run)
+
+
+def run_batch_jvp(
+    scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    directions: Mapping[str, Any],
+    folds: Any,
+    dt: jax.Array,
+    run: Run,
+    *,
+    backend: str = "auto",
+    nested: bool = False,
+) -> Tangents:
+    """Values of a batch and their derivatives along P directions in the space of leaves, in one pass; call it inside `jit`.
+
+    Args:
+      scenario, varied, folds, dt, run, nested: as `run_batch`.
+      backend: as `run_batch`; "auto" runs long programs (many joints and directions), which take minutes to compile, on scan.
+      directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run: direction p moves each of these
+        leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
+
+    Returns:
+      The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton matrices (batch, P, P) of the
+      folds that offer `curvature`.
+
+    Raises:
+      ValueError: an unknown backend or path.
+    """
+    inputs, along = _inputs(scenario, folds, dt, run), Directions.of(directions)
+
+    def run_on(name):
+        batch = _lowered_batch(inputs, varied, nested)
+        if backend == "auto":
+            program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
+            if not plan.lowers_derivatives(name, len(program.nodes), along.tangents):
+                return plain()
+        return run_with_tangents(_executor(name), batch, along, run)
+
+    def plain():
+        return _scanned(inputs, varied, nested, lambda batch: run_with_tangents(scan, batch, along, run))
+
+    return with_fallback(backend, run_on, plain)
+
+
+def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds: Any, dt: jax.Array, *, method: str) -> str:
+    """The backend that a batch will run on, fallbacks and their warnings included; builds the kernels if it is a compiled one.
+
+    Args:
+      backend, scenario, folds, dt, method: as `run_batch`.
+      varied: path -> values or their shapes, batch axis first.
+
+    Returns:
+      "gpu", "native", "xla" or "vmap".
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    flat, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
+    return _settled(backend, method, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
+
+
+@lru_cache(maxsize=64)
+def _settled(backend: str, method: str, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
+    """`settled` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
+
+    def trace(leaves):
+        scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
+        run = Run(1, method)
+
+        def run_on(name):
+            run_all(_executor(name), _lowered_batch(_inputs(scenario, folds, dt, run), varied), run)
+            return name
+
+        found.append(with_fallback(backend, run_on, lambda: "vmap"))
+
+    found: list[str] = []
+    jax.eval_shape(trace, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    return found[-1]

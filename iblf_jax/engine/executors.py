@@ -1,0 +1,118 @@
+"""What steps a batch: loops of XLA over the step as it is (`scan`, `checkpointed`), or over its scalar program (`lowered_on`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.engine import plan
+from iblf_jax.engine.batch import Batch, Executor, Leaves
+from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.engine.step import keep_if
+from iblf_jax.lowering.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
+
+
+def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    """All steps of all runs in `jax.lax.scan`: any scenario, any device, and differentiable in either mode."""
+    piece = machine_function if batch.shape.function == "parts" else lambda function: function
+
+    def one(inputs, carry):
+        return _scanned(partial(step, inputs, rolled=True, piece=piece), carry, steps, every)
+
+    return batch.each(one, carry)
+
+
+def _scanned(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    """One run's steps; the step is compiled once, so what is not to be kept is made and thrown away."""
+    if every is None:
+        return jax.lax.scan(lambda carry, index: (step(carry, index)[0], None), carry, jnp.arange(steps))
+    if every == 1:
+        return jax.lax.scan(step, carry, jnp.arange(steps))
+    every = min(every, steps)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, carry, jnp.int32(0))[1])
+
+    def one(carried, index):
+        before, record = carried
+        after, new = step(before, index)
+        return (keep_if(index < steps, after, before), keep_if(index % every == 0, new, record)), None
+
+    def block(carried, first):
+        carried, _ = jax.lax.scan(one, carried, first + jnp.arange(every))
+        return carried, carried[1]
+
+    (carry, _), records = jax.lax.scan(block, (carry, blank), every * jnp.arange(-(-steps // every)))
+    return carry, records
+
+
+def checkpointed(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    """As `scan` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
+
+    Only every T^(2/3)-th state is kept; the others are computed again, in three nested loops.
+    """
+    if every is not None:
+        return scan(step, batch, carry, steps, every)
+    inner, blocks = plan.checkpoint_edge(steps)
+
+    def one(inputs, carry):
+        @jax.checkpoint
+        def single(carry, index):
+            return keep_if(index < steps, step(inputs, carry, index, rolled=True)[0], carry), None
+
+        @jax.checkpoint
+        def few(carry, first):
+            return jax.lax.scan(single, carry, first + jnp.arange(inner))
+
+        @jax.checkpoint
+        def many(carry, first):
+            return jax.lax.scan(few, carry, first + inner * jnp.arange(inner))
+
+        return jax.lax.scan(many, carry, inner * inner * jnp.arange(blocks))
+
+    return batch.each(one, carry)
+
+
+@lru_cache(maxsize=64)
+def _on_leaves(step: Any, treedef, is_lane: tuple[bool, ...], carry_treedef) -> Callable:
+    """A step as a function of lists of leaves, for `lowered`; the same object for the same structure."""
+
+    def on_leaves(shared, lane, carry, index):
+        inputs = Leaves(treedef, is_lane, [], []).together(shared, lane)
+        after, records = step(inputs, jax.tree.unflatten(carry_treedef, carry), index, rolled=False)
+        return jax.tree.leaves(after), records
+
+    return on_leaves
+
+
+def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
+    """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes).
+
+    Raises:
+      UnsupportedError: it does not lower.
+    """
+    flat, treedef = jax.tree.flatten(carry)
+    leaves = batch.leaves
+    function = _on_leaves(step, leaves.treedef, leaves.is_lane, treedef)
+    # A derivative's literal zero says "does not depend".
+    sparse = getattr(step, "is_derivative", False)
+    return lowered(function, np.dtype(batch.dtype), Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), Shapes.of(flat, 1), sparse)
+
+
+def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]]) -> Executor:
+    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`, `xla.run`)."""
+
+    def executor(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+        found, runs, dtype = program_of(step, batch, carry), batch.runs or 1, batch.dtype
+        flat, treedef = jax.tree.flatten(carry)
+        shapes = Shapes.of(flat, 1)
+        shared = jnp.concatenate([*(jnp.ravel(x).astype(dtype) for x in batch.leaves.shared), jnp.zeros((0,), dtype)])
+        lane = pack(batch.leaves.lane, Shapes.of(batch.leaves.lane, 1), dtype, runs).floats
+        after, arrays = run_program(found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every)
+        records = unpacked_records(found.records, arrays) if every else ()
+        return jax.tree.unflatten(treedef, unpack(after, shapes, runs)), records
+
+    return executor

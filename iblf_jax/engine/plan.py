@@ -1,0 +1,133 @@
+"""How a run, a batch or its derivatives are executed: the one place that decides, from sizes, the number of runs and the platform.
+
+Three things are decided: the executor (scan, xla, native, gpu), what the plain executor makes of the closed loop (`Shape`), and how
+long a piece of code a compiler gets at a time.  Every threshold stands in the table below, with the measurement behind it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
+"""How a user may ask for a batch to be executed; "vmap" is the scan executor."""
+SINGLE_RUN_BACKENDS = ("auto", "xla", "native", "gpu")
+"""How a user may ask for one run to be executed."""
+COMPILED = {"cpu": "native", "gpu": "gpu"}
+"""The executor that builds kernels, by platform."""
+
+# One machine function (`machine_function`), on CPU: numbers of operations are those of a jaxpr.
+SMALL_BATCH = 64
+"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
+LARGEST_ARRAY = 1 << 13
+"""Entries of the largest array that is computed inside: XLA shares larger ones out over threads, which it cannot do there."""
+LONG_EVALUATION = 2500
+"""Operations of one evaluation of the closed loop from which it is a machine function of its own, called from a loop of XLA's: LLVM's
+time grows faster than a function.  Two joints take some 700, three 1,500, an arm of seven 10,000."""
+LONGEST_FUNCTION = 60_000
+"""Operations over which LLVM takes minutes as one machine function."""
+
+# Scalar programs: numbers of operations are nodes of a step.
+LONGEST_ALONE = 2500
+"""Nodes up to which one run is lowered unasked: a longer one gains less by it than it takes to compile."""
+XLA_BLOCK = 64
+"""Runs that go through a stretch of steps together on CPU: their numbers stay in the first-level cache."""
+XLA_BLOCK_ALWAYS = 10_000
+"""Nodes from which a block is always that wide: loops over fewer runs would be unrolled, and LLVM takes up to 20 GB over that."""
+XLA_LONGEST = 20_000
+"""Nodes above which XLA takes many minutes."""
+XLA_STRETCH = 4096
+"""Steps whose signals are tabulated at once, at most."""
+XLA_SEGMENT = 2000
+"""Nodes in one XLA computation on CPU: its passes take more than linear time."""
+NATIVE_LONG, NATIVE_SEGMENT = 20_000, 5000
+"""Nodes above which the C of a step is cut into functions, and of how many each: a third slower, but built three times as fast."""
+GPU_STRETCH = 8192
+"""Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
+GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100
+"""Threads of a warp and of a block, at most (`c/kernels.h` promises the compiler no more); multiprocessors where JAX does not know."""
+JVP_LARGEST, JVP_LARGEST_IN_SEGMENTS = 60_000, 150_000
+"""Nodes of a step, times one and its tangents, up to which "auto" lowers its derivatives: compilers take minutes over longer ones, the
+native one, which cuts a step into segments, half a minute.  Equal numbers are computed once, so about a third is left of them."""
+
+
+class Shape(NamedTuple):
+    """How XLA is given a batch of runs."""
+
+    runs: str
+    """"together": in lock step, by vmap; "in turn": one after the other."""
+    function: str
+    """"whole": all is one machine function; "parts": its parts are one each (closed loop, record and metrics, start, end); "none"."""
+
+
+def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -> Shape:
+    """How the scan executor runs a batch.
+
+    Args:
+      platform: as JAX names it.
+      operations: of one evaluation of the closed loop.
+      runs: in the batch; None for one run.
+      nested: whether a caller may batch, differentiate or loop over the result: XLA refuses machine functions there, or aborts.
+    """
+    is_long = operations > LONG_EVALUATION
+    if platform != "cpu" or nested:
+        return Shape("together", "none")
+    if is_long:
+        return Shape("in turn", "parts")
+    return Shape("together", "whole" if (runs or 1) <= SMALL_BATCH else "none")
+
+
+def lowered_shape(platform: str, runs: int, nested: bool) -> Shape:
+    """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time; for 48 runs XLA refuses a fusion."""
+    return Shape("together", "parts" if platform == "cpu" and runs == 1 and not nested else "none")
+
+
+def order(backend: str, platform: str) -> tuple[str, ...]:
+    """The executors that lower a step, best first, for what the user asked for; after them comes scan."""
+    compiled = COMPILED.get(platform)
+    wanted = {"native": ("native",), "gpu": ("gpu",), "auto": (compiled,) if compiled else ()}.get(backend, ())
+    return () if backend == "vmap" else (*wanted, "xla")
+
+
+def lowers_alone(nodes: int) -> bool:
+    """Whether one run is lowered unasked."""
+    return nodes <= LONGEST_ALONE
+
+
+def lowers_derivatives(executor: str, nodes: int, tangents: int) -> bool:
+    """Whether derivatives are lowered unasked."""
+    return nodes * (1 + tangents) <= (JVP_LARGEST_IN_SEGMENTS if executor == "native" else JVP_LARGEST)
+
+
+def xla_width(platform: str, nodes: int, runs: int) -> int:
+    """Runs in a block of the xla executor."""
+    narrow = runs < XLA_BLOCK and nodes < XLA_BLOCK_ALWAYS
+    return runs if narrow or platform != "cpu" else XLA_BLOCK
+
+
+def xla_stretch(steps: int, every: int) -> int:
+    """Steps of a stretch, a multiple of `every`: so that one length does for all where there is such a length, as each is compiled."""
+    most = max(XLA_STRETCH // every, 1) * every
+    if steps <= most:
+        return steps
+    exact = next((d for d in range(most, 0, -every) if steps % d == 0), 0)
+    return exact if exact > most // 16 else most
+
+
+def native_segment(nodes: int) -> int | None:
+    """Nodes of a function of the generated C; None for one function."""
+    return NATIVE_SEGMENT if nodes > NATIVE_LONG else None
+
+
+def gpu_threads(runs: int, processors: int) -> int:
+    """Threads in a block: few enough that every multiprocessor gets a block, in whole warps."""
+    return min(max(-(-runs // (processors * GPU_WARP)) * GPU_WARP, GPU_WARP), GPU_MOST_THREADS)
+
+
+def checkpoint_edge(steps: int) -> tuple[int, int]:
+    """Steps of an inner loop and blocks of the outer one, for reverse mode: inner^2 blocks >= steps, with few steps too many.
+
+    About 3 steps^(1/3) states are in memory at a time.
+    """
+    edge = max(1, round(steps ** (1 / 3)))
+    inner = min(range(edge, 0, -1)[: max(1, edge // 3)], key=lambda i: -(-steps // (i * i)) * i * i)
+    return inner, -(-steps // (inner * inner))

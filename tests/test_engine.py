@@ -1,0 +1,124 @@
+"""One time loop for all: the executors and shapes of XLA's loop give the same run, and the plan decides between them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import rollout
+from iblf_jax.engine import execute, machine_function, plan
+from iblf_jax.engine.batch import Batch, run_all
+from iblf_jax.engine.executors import checkpointed, scan
+from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.metrics import as_folds
+from iblf_jax.scenario import canonical
+from iblf_jax.status import Status
+
+DRAWS = {"controller.K2": jnp.asarray([[20.0, 20.0], [30.0, 25.0], [12.0, 14.0]])}
+
+
+def inputs_of(scenario, steps=50, dt=1e-3):
+    scenario, step = canonical(scenario), jnp.asarray(dt)
+    return Inputs(scenario, as_folds(None, step.dtype), step, jnp.asarray(float(steps)))
+
+
+def outcome(inputs, run, shape=None, varied=None, executor=scan):
+    batch = Batch.of(inputs, varied, *([shape] if shape else []))
+    return jax.tree.map(np.asarray, jax.jit(lambda: run_all(executor, batch, run))())
+
+
+def assert_same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "run", [Run(50, "rk4", 7), Run(50, "heun", 1), Run(50, "euler")], ids=lambda run: f"{run.method}-{run.record_every}"
+)
+def test_every_shape_is_the_same_run(paper, run):
+    """Runs together and in turn, as one machine function, in parts and left to XLA; alone and in a batch."""
+    inputs = inputs_of(ij.with_parameters(paper, {"initial.dq": [0.3, -0.2]}))
+    alone = outcome(inputs, run)
+    together = outcome(inputs, run, varied=DRAWS)
+    first = outcome(inputs._replace(scenario=ij.with_parameters(inputs.scenario, {"controller.K2": DRAWS["controller.K2"][0]})), run)
+    assert_same(jax.tree.map(lambda x: x[0], together), first)
+    for shape in (plan.Shape("together", "parts"), plan.Shape("in turn", "parts")):
+        assert_same(outcome(inputs, run, shape, DRAWS), together)
+    whole = jax.jit(lambda inputs: execute._scanned(inputs, None, False, lambda batch: run_all(scan, batch, run)))(inputs)
+    assert_same(jax.tree.map(np.asarray, whole), alone)
+    if run.record_every is None:
+        assert_same(outcome(inputs, run, executor=checkpointed), alone)
+
+
+@pytest.mark.slow
+def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
+    """The step from the last instant, which is not made, says nothing."""
+    fast = inputs_of(ij.with_parameters(paper, {"controller.K2": 1e4}), steps=1)
+    assert not outcome(fast, Run(1, "euler")).status & Status.NOT_FINITE
+    assert outcome(fast._replace(steps=jnp.asarray(40.0)), Run(40, "euler")).status & Status.NOT_FINITE
+
+
+@pytest.mark.slow
+def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
+    """By their length alone; a batch from outside and derivatives work as ever."""
+    before = ij.simulate(paper, duration=0.011, dt=1e-3)
+    monkeypatch.setattr(plan, "LONG_EVALUATION", 0)
+    rollout._run_one.clear_cache()
+    try:
+
+        def ise(K2):
+            return ij.simulate(ij.with_parameters(paper, {"controller.K2": K2}), duration=0.011, dt=1e-3).metrics.ise.sum()
+
+        compact = ij.simulate(paper, duration=0.011, dt=1e-3)
+        K2 = jnp.array([20.0, 30.0])
+        slope = jax.grad(ise)(K2)
+        values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
+    finally:
+        rollout._run_one.clear_cache()
+    np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
+    step = 1e-3
+    for i in range(2):
+        move = step * np.eye(2)[i]
+        assert float(slope[i]) == pytest.approx(float(ise(K2 + move) - ise(K2 - move)) / (2 * step), rel=1e-5)
+    assert float(values[0]) == pytest.approx(float(before.metrics.ise.sum()), rel=1e-9)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 100, 501, 4001, 20_001])
+def test_checkpoints_cover_the_run_with_few_steps_too_many(steps):
+    inner, blocks = plan.checkpoint_edge(steps)
+    made = inner * inner * blocks
+    assert steps <= made <= 1.25 * steps + 1
+    assert 2 * inner + blocks <= 5 * steps ** (1 / 3) + 3
+
+
+@pytest.mark.parametrize("steps", [5, 4096, 5000, 5001, 20_001])
+@pytest.mark.parametrize("every", [1, 10])
+def test_stretches_are_whole_records(steps, every):
+    length = plan.xla_stretch(steps, every)
+    assert length <= max(plan.XLA_STRETCH, steps if steps <= plan.XLA_STRETCH else 0)
+    assert length == steps or length % every == 0
+
+
+def test_what_the_plan_says():
+    """A short loop alone is one machine function, a long one goes in parts and in turn, and a caller's own batch is XLA's."""
+    assert plan.scan_shape("cpu", 700, None, False) == ("together", "whole")
+    assert plan.scan_shape("cpu", 700, 1000, False) == ("together", "none")
+    assert plan.scan_shape("cpu", 10_000, 1000, False) == ("in turn", "parts")
+    assert plan.scan_shape("cpu", 10_000, None, True) == ("together", "none")
+    assert plan.scan_shape("gpu", 10_000, None, False) == ("together", "none")
+    assert plan.order("auto", "cpu") == plan.order("native", "cpu") == ("native", "xla")
+    assert plan.order("auto", "gpu") == ("gpu", "xla")
+    assert plan.order("auto", "tpu") == plan.order("xla", "cpu") == ("xla",)
+    assert plan.order("vmap", "cpu") == ()
+
+
+def test_the_length_of_a_function_is_that_of_its_inner_ones():
+    inner = jax.jit(lambda x: jnp.sin(x) + jnp.cos(x))
+    closed = jax.make_jaxpr(lambda x: inner(x) * inner(2.0 * x))(1.0)
+    assert sum(1 for _ in machine_function._operations(closed.jaxpr)) == 8
+    assert machine_function.length(inner, 1.0) == 3
