@@ -243,7 +243,7 @@ ENTRIES = {
         ij.pareto,
         {"scenario": None, "parameters": ["controller.K2"], "objectives": (GOAL, GOAL), "points": 2, "iterations": 2, "tolerance": 1e-5},
     ),
-    "falsify": (ij.falsify, {"scenario": None, "sets": WAYS, "starts": 2, "iterations": 2, "seed": 0, "progress": False}),
+    "falsify": (ij.falsify, {"scenario": None, "perturbations": WAYS, "starts": 2, "iterations": 2, "seed": 0, "progress": False}),
     "certify": (ij.certify, {"scenario": None, "run": None, "worst": 3}),
     "explain": (ij.explain, {"scenario": None, "varied": (), "metrics": ()}),
     "load_scenario": (ij.load_scenario, {"path": "x.toml"}),

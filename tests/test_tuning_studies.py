@@ -72,7 +72,7 @@ def test_falsify_returns_what_can_be_run(paper, sets):
 
 
 def test_falsify_refuses_sets_without_an_admissible_run(paper):
-    with pytest.raises(ValueError, match=r"sets: got \{'initial.q': .*start inside the bounds .*Narrow"):
+    with pytest.raises(ValueError, match=r"perturbations: got \{'initial.q': .*start inside the bounds .*Narrow"):
         ij.falsify(paper, {"initial.q": ij.value(ij.uniform(1.1, 1.2))}, starts=2, **SHORT)
 
 
