@@ -248,7 +248,7 @@ ENTRIES = {
     "explain": (ij.explain, {"scenario": None, "varied": (), "metrics": ()}),
     "load_scenario": (ij.load_scenario, {"path": "x.toml"}),
     "load_rollouts": (ij.load_rollouts, {"path": "x.npz"}),
-    "load_sweep": (ij.load_sweep, {"store": "x.zarr"}),
+    "load_sweep": (ij.load_sweep, {"path": "x.zarr"}),
     "load_tuning": (ij.load_tuning, {"path": "x.json"}),
     "tune_file": (ij.tune_file, {"path": "x.toml"}),
     "robots.load": (robots.load, {"path": "x.urdf", "base": None, "tip": None, "locked": None}),

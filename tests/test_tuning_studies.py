@@ -119,7 +119,7 @@ weight = 0.5
 kind = "margin_above"
 limit = 0.02
 [perturbations]
-"plant.mass[1]" = { factor = { uniform = [0.7, 1.3] } }
+"plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
 """
 
 
