@@ -53,16 +53,21 @@ if TYPE_CHECKING:
     from iblf_jax import distributed as distributed
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
+    from iblf_jax.certificates import Certificate as Certificate
+    from iblf_jax.certificates import Counterexample as Counterexample
     from iblf_jax.certificates import certify as certify
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
     from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
     from iblf_jax.studies.recommended import recommended_dt as recommended_dt
+    from iblf_jax.studies.sensitivity import Sensitivity as Sensitivity
     from iblf_jax.studies.sensitivity import sensitivity as sensitivity
     from iblf_jax.studies.store import StoreError as StoreError
     from iblf_jax.studies.study import Study as Study
     from iblf_jax.studies.sweep import load_sweep as load_sweep
     from iblf_jax.studies.sweep import sweep as sweep
+    from iblf_jax.tuning import Attack as Attack
+    from iblf_jax.tuning import Front as Front
     from iblf_jax.tuning import TuneResult as TuneResult
     from iblf_jax.tuning import cvar as cvar
     from iblf_jax.tuning import falsify as falsify
@@ -71,16 +76,21 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import tunable as tunable
     from iblf_jax.tuning import tune as tune
     from iblf_jax.tuning_file import load_tuning as load_tuning
+    from iblf_jax.tuning_file import save_tuning as save_tuning
     from iblf_jax.tuning_file import tune_file as tune_file
 
 _ON_FIRST_USE = {
+    "Attack": ("iblf_jax.tuning", "Attack"),
+    "Certificate": ("iblf_jax.certificates", "Certificate"),
     "certificates": ("iblf_jax.certificates", None),
     "certify": ("iblf_jax.certificates", "certify"),
     "compare": ("iblf_jax.studies.compare", "compare"),
     "Comparison": ("iblf_jax.studies.comparison", "Comparison"),
+    "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "distributed": ("iblf_jax.distributed", None),
     "falsify": ("iblf_jax.tuning", "falsify"),
+    "Front": ("iblf_jax.tuning", "Front"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
     "load_tuning": ("iblf_jax.tuning_file", "load_tuning"),
     "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),
@@ -88,6 +98,8 @@ _ON_FIRST_USE = {
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
     "recommended_dt": ("iblf_jax.studies.recommended", "recommended_dt"),
+    "save_tuning": ("iblf_jax.tuning_file", "save_tuning"),
+    "Sensitivity": ("iblf_jax.studies.sensitivity", "Sensitivity"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),
     "StoreError": ("iblf_jax.studies.store", "StoreError"),
     "Study": ("iblf_jax.studies.study", "Study"),

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
 import numbers
 import os
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+F = TypeVar("F", bound=Callable)
 
 MOST_STEPS = 2**31 - 1
 """Steps are counted in int32 inside the compiled loop."""
@@ -88,6 +91,23 @@ def shown(value: Any) -> str:
 def fail(field: str, got: Any, expected: str, mend: str = "") -> ValueError:
     """The one form of error message: field, value, expectation and mend, in one line."""
     return ValueError(f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}." + (f" {line(mend)}" if mend else ""))
+
+
+def renamed(**names: str) -> Callable[[F], F]:
+    """Of a function whose keywords have new names, old=new: who uses an old one is told the new one (ValueError)."""
+
+    def decorated(function: F) -> F:
+        @functools.wraps(function)
+        def called(*args: Any, **options: Any) -> Any:
+            for old, new in names.items():
+                if old in options:
+                    call = f"{function.__name__}(..., {new}=...)"
+                    raise fail(f"{function.__name__}: {old}", options[old], f"it as {new}", f"The keyword has a new name: {call}.")
+            return function(*args, **options)
+
+        return cast(F, called)
+
+    return decorated
 
 
 def inside(where: str | os.PathLike, error: Exception) -> ValueError:

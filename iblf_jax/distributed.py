@@ -295,3 +295,10 @@ def bounded(call: Callable[[], Any], seconds: float) -> Any:
         raise box["error"]
     why = str(box["error"]).splitlines()[0] if "error" in box else f"it did not answer for {seconds:.0f} s"
     raise ProcessLostError(f"Another process of this job was lost: {why}. Start the job again; a sweep with a store goes on where it was.")
+
+
+__all__ = ["ProcessLostError", "initialize", "rank", "size"]
+
+
+def __dir__() -> list[str]:
+    return __all__

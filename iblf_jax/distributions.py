@@ -329,3 +329,7 @@ def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
     Source: design of this package.
     """
     return Perturbation(distribution, "value", shared)
+
+
+MEMBERS = {"uniform": Uniform, "normal": Normal, "log_uniform": LogUniform, "choice": Choice}
+"""Every distribution by the name that files give it."""

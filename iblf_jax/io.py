@@ -22,6 +22,7 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.paths import parameters
+from iblf_jax.plain import Words
 from iblf_jax.results import Rollout
 from iblf_jax.scenario_file import scenario_to_toml
 from iblf_jax.status import Status, describe
@@ -89,17 +90,19 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
     return xarray.Dataset(variables | varying | more, coordinates, attributes)
 
 
-def save_rollouts(path: str | os.PathLike, runs: Mapping[str, Rollout] | Rollout) -> None:
+def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike) -> None:
     """Writes runs to one file.
 
     Args:
-      path: the file; its ending decides, ".nc" for netCDF or ".npz" for NumPy.
       runs: runs by name (letters, digits, "_", "-" and blanks), or one Rollout, which is then called "run".
+      path: the file; its ending decides, ".nc" for netCDF or ".npz" for NumPy.
 
     Raises:
       ValueError: another ending, no runs, a bad name, or something that is not a Rollout.
       OSError: the file cannot be written.
     """
+    if isinstance(path, Mapping | Rollout):
+        raise checks.fail("path", Words(type(path).__name__), "a path, after the runs", "The order is save_rollouts(runs, path).")
     ending = _ending(checks.file_to_write("path", path, "a file that ends in .nc or .npz"))
     runs = {"run": runs} if isinstance(runs, Rollout) else runs
     if not isinstance(runs, Mapping) or not runs:

@@ -6,6 +6,7 @@ Every refusal is a ValueError that names the dotted key, what came, what was exp
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import tomllib
 import types
@@ -45,6 +46,19 @@ def toml_tables(text: str) -> dict[str, Any]:
     if checks.is_deep(tables):
         raise ValueError(problem)
     return tables
+
+
+def inline_table(table: dict[str, Any]) -> str:
+    """A table of numbers, strings, booleans and lists of these as one writes it in a file, { factor = "uniform", low = 0.7 }."""
+
+    def written(value: Any) -> str:
+        if isinstance(value, list):
+            return f"[{', '.join(map(written, value))}]"
+        if isinstance(value, dict):
+            return inline_table(value)
+        return json.dumps(value) if isinstance(value, bool) or type(value) is str else str(value)
+
+    return f"{{ {', '.join(f'{key} = {written(value)}' for key, value in table.items())} }}"
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:

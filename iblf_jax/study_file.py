@@ -16,11 +16,13 @@ A study file is a scenario file (`scenario_file`) with more tables:
     "controller.K2" = [10.0, 20.0, 40.0]
 
 A draw names its kind (factor, offset or value), its distribution (uniform, normal, log_uniform or choice), that one's numbers, and
-`shared = true` where all entries of a vector leaf get the same.  Every refusal is a ValueError that names file and key.
+`shared = true` where all entries of a vector leaf get the same.  [perturbations] is the same table in tuning files.  Every refusal is a
+ValueError that names file and key.
 """
 
 from __future__ import annotations
 
+import inspect
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,17 +30,9 @@ from typing import Any, NamedTuple
 from iblf_jax import checks, distributions
 from iblf_jax.codec import construct
 from iblf_jax.distributions import KINDS, Perturbation
-from iblf_jax.plain import Words, as_table, did_you_mean, known_keys, numbers
+from iblf_jax.plain import Words, as_table, did_you_mean, inline_table, known_keys, numbers
 from iblf_jax.scenario import Scenario
 from iblf_jax.scenario_file import from_dict, read_toml
-
-DISTRIBUTIONS = {
-    "uniform": (distributions.uniform, ("low", "high")),
-    "normal": (distributions.normal, ("mean", "std")),
-    "log_uniform": (distributions.log_uniform, ("low", "high")),
-    "choice": (distributions.choice, ("values", "weights")),
-}
-"""Name -> function and what it takes."""
 
 OPTIONS: dict[str, dict[str, type]] = {
     "study": {"runs": int, "seed": int, "sampler": str, "replicates": int},
@@ -46,7 +40,7 @@ OPTIONS: dict[str, dict[str, type]] = {
 }
 """Table -> key -> type."""
 
-_WORDS = {*KINDS, "shared", *(word for _, words in DISTRIBUTIONS.values() for word in words)}
+SUCH_AS = 'Such as { factor = "uniform", low = 0.9, high = 1.1 }.'
 
 
 class StudyFile(NamedTuple):
@@ -85,7 +79,7 @@ def study_from_dict(data: dict[str, Any], kind: str, source: str = "", folder: s
         if "duration" not in file.run:
             raise checks.fail("run.duration", Words("nothing"), "the length of a run [s]", "Add [run] with duration = ...")
         options = file.run | _options(data.get(kind), kind)
-        ways = {path: _perturbation(table, f"perturbations.{path}") for path, table in _by_path(data, "perturbations").items()}
+        ways = perturbations_of(data)
         grid = {path: _axis(entry, f"grid.{path}") for path, entry in _by_path(data, "grid").items()} if kind == "sweep" else {}
         return StudyFile(file.scenario, ways, grid, options)
     except ValueError as error:
@@ -104,18 +98,34 @@ def _options(table: Any, kind: str) -> dict[str, Any]:
     return dict(table)
 
 
+def perturbations_of(data: dict[str, Any]) -> dict[str, Perturbation]:
+    """The [perturbations] of any file of this package: path -> perturbation; ValueError for what is none."""
+    return {path: _perturbation(table, f"perturbations.{path}") for path, table in _by_path(data, "perturbations").items()}
+
+
 def _by_path(data: dict[str, Any], name: str) -> dict[str, Any]:
     """Path -> entry: `"plant.mass" = {...}` and `plant.mass = {...}` mean the same."""
+    words = {*KINDS, "shared", *distributions.MEMBERS, *(word for member in distributions.MEMBERS for word in _taken(member))}
 
     def flat(table: dict[str, Any], prefix: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for key, value in table.items():
             path = f"{prefix}.{key}" if prefix else key
-            nested = isinstance(value, dict) and not _WORDS & set(value) and not any(isinstance(x, str) for x in value.values())
+            nested = isinstance(value, dict) and not words & set(value) and not any(isinstance(x, str) for x in value.values())
             found |= flat(value, path) if nested else {path: value}
         return found
 
     return flat(as_table(data.get(name, {}), name), "")
+
+
+def _made_by(name: str) -> Any:
+    """The function that makes a distribution, which knows its defaults; the class itself if a user has named one of his own."""
+    return getattr(distributions, name, distributions.MEMBERS[name])
+
+
+def _taken(name: str) -> dict[str, bool]:
+    """What a distribution takes, and whether it has to be given."""
+    return {word: x.default is x.empty for word, x in inspect.signature(_made_by(name)).parameters.items()}
 
 
 def _axis(entry: Any, path: str) -> Any:
@@ -124,20 +134,37 @@ def _axis(entry: Any, path: str) -> Any:
 
 
 def _perturbation(table: Any, path: str) -> Perturbation:
-    kinds = [kind for kind in KINDS if kind in as_table(table, path)]
+    if not isinstance(table, dict):
+        raise checks.fail(path, table, "how the draw acts on the leaf, and its distribution", SUCH_AS)
+    kinds = [kind for kind in KINDS if kind in table]
     if len(kinds) != 1:
         came = Words(" and ".join(kinds) if kinds else "none of them")
-        raise checks.fail(path, came, f"one of {', '.join(KINDS)}", 'Such as { factor = "uniform", low = 0.9, high = 1.1 }.')
-    name = table[kinds[0]]
-    if not isinstance(name, str) or name not in DISTRIBUTIONS:
-        raise checks.fail(f"{path}.{kinds[0]}", name, "the name of a distribution", did_you_mean(name, DISTRIBUTIONS))
-    make, words = DISTRIBUTIONS[name]
-    known_keys(table, path, (kinds[0], "shared", *words))
+        raise checks.fail(path, came, f"one of {', '.join(KINDS)}", SUCH_AS)
+    (kind,) = kinds
+    name = table[kind]
+    if isinstance(name, dict):
+        raise checks.fail(f"{path}.{kind}", name, "the name of a distribution", _said_as_now(kind, name, table))
+    if not isinstance(name, str) or name not in distributions.MEMBERS:
+        raise checks.fail(f"{path}.{kind}", name, "the name of a distribution", did_you_mean(name, distributions.MEMBERS))
+    taken = _taken(name)
+    known_keys(table, path, (kind, "shared", *taken))
     shared = table.get("shared", False)
     if not isinstance(shared, bool):
         raise checks.fail(f"{path}.shared", shared, "true or false")
-    values = {key: numbers(value, f"{path}.{key}") for key, value in table.items() if key in words}
-    for word in words:
-        if word not in values and name != "normal" and word != "weights":
+    values = {word: numbers(table[word], f"{path}.{word}") for word in taken if word in table}
+    for word, needed in taken.items():
+        if needed and word not in values:
             raise checks.fail(f"{path}.{word}", Words("nothing"), "a number or a list of numbers", f"{name} needs it.")
-    return getattr(distributions, kinds[0])(construct(make, values, path), shared=shared)
+    return getattr(distributions, kind)(construct(_made_by(name), values, path), shared=shared)
+
+
+def _said_as_now(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:
+    """The mend for the spelling that tuning files once had, { factor = { uniform = [0.7, 1.3] } }, with the user's own numbers."""
+    name, given = next(iter(old.items()), ("", None))
+    if len(old) != 1 or name not in distributions.MEMBERS:
+        return SUCH_AS
+    values = given if isinstance(given, list) and name != "choice" else [given]
+    said = given if isinstance(given, dict) else dict(zip(_taken(name), values, strict=False))
+    missing = {word: Words("...") for word, needed in _taken(name).items() if needed}
+    rest = {key: value for key, value in table.items() if key != kind}
+    return f"This is now written {inline_table({kind: name} | missing | said | rest)}."

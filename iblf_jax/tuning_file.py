@@ -1,6 +1,6 @@
 """Tuning files: what to tune, as typed, validated TOML; and saved results, from which the report can be made again.
 
-A tuning file is a scenario file (`scenario_file`) with four more tables:
+A tuning file is a scenario file (`scenario_file`) with four more tables, of which [perturbations] is that of a study file (`study_file`):
 
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
@@ -12,12 +12,15 @@ A tuning file is a scenario file (`scenario_file`) with four more tables:
     [[objective]]
     kind = "effort"
     weight = 0.5
+    [[objective]]                           # any metric by its name; `fold` only for one with thresholds of one's own
+    kind = "metric"
+    name = "iae"
     [[requirement]]
     kind = "margin_above"
     limit = 0.05
     [perturbations]
-    "plant.mass[1]" = { factor = { uniform = [0.7, 1.3] } }
-    "initial.q" = { offset = { normal = [0.0, 0.02] }, shared = true }
+    "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
+    "initial.q" = { offset = "normal", mean = 0.0, std = 0.02, shared = true }
 
 Everything is checked; each refusal is a ValueError that names the dotted key.  A saved result is JSON with all its numbers in full.
 """
@@ -37,11 +40,12 @@ from iblf_jax.distributions import Distribution, Perturbation
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.integrators import tableau
 from iblf_jax.paths import with_parameters
-from iblf_jax.plain import Words, as_table, known_keys, numbers
+from iblf_jax.plain import Words, as_table, did_you_mean, known_keys, numbers
 from iblf_jax.scenario_file import from_dict, read_toml, scenario_to_dict
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.draws import plan
 from iblf_jax.studies.statistics import check_confidence
+from iblf_jax.study_file import perturbations_of
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
@@ -49,17 +53,11 @@ from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import Setup, TuneResult
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
 
-DISTRIBUTIONS = {
-    "uniform": distributions.Uniform,
-    "normal": distributions.Normal,
-    "log_uniform": distributions.LogUniform,
-    "choice": distributions.Choice,
-}
 codec.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
 codec.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
-codec.FAMILIES.setdefault(Distribution, ("distributions", DISTRIBUTIONS))
+codec.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
 
-OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin")
+OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin", "metric")
 REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "violation_probability_below")
 TABLES = ("tune", "objective", "requirement", "perturbations")
 HISTORY = dict.fromkeys(("loss", "objective", "terms", "excess", "margin", "gradient_norm", "z", "x"), "f") | {
@@ -89,8 +87,7 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
         goal = _objective(data.get("objective", []), data.get("requirement", []))
-        table = as_table(data.get("perturbations", {}), "perturbations")
-        drawn = {key: _perturbation(value, f"perturbations.{key}") for key, value in table.items()}
+        drawn = perturbations_of(data)
     except ValueError as error:
         raise checks.inside(source, error) from error
     timing = {"duration": 5.0} | {key: x for key, x in dict(file.run or {}).items() if key in ("duration", "dt", "method")}
@@ -134,12 +131,32 @@ def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, besides
     table = as_table(entry, key)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
     function = getattr(module, table["kind"])
+    if function is objectives.metric and "fold" not in table:
+        table = table | {"fold": _fold_of(table.get("name", Words("nothing")), f"{key}.name")}
     taken = inspect.signature(function).parameters
     known_keys(table, key, ("kind", *besides, *taken))
     for name, parameter in taken.items():
         if parameter.default is parameter.empty and name not in table:
-            raise checks.fail(f"{key}.{name}", Words("nothing"), f"a number; {table['kind']} needs it")
-    return codec.construct(function, {name: numbers(table[name], f"{key}.{name}") for name in taken if name in table}, key)
+            raise checks.fail(f"{key}.{name}", Words("nothing"), f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it")
+    return codec.construct(function, {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table}, key)
+
+
+_NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
+"""Arguments of objectives that are something else."""
+
+
+def _argument(name: str, value: Any, key: str) -> Any:
+    if name == "fold":
+        return codec.decode({"kind": value} if isinstance(value, str) else value, metrics.Fold, key)
+    return checks.word(key, value, _NO_NUMBERS[name]) if name in _NO_NUMBERS else numbers(value, key)
+
+
+def _fold_of(result: Any, key: str) -> str:
+    """The metric that returns a result."""
+    owners = {name: kind for kind, fold in metrics.MEMBERS.items() for name in getattr(fold, "units", ())}
+    if not isinstance(result, str) or result not in owners:
+        raise checks.fail(key, result, "the name of a metric", did_you_mean(result, owners))
+    return owners[result]
 
 
 def _objective(terms: Any, requirements: Any) -> Objective:
@@ -155,28 +172,6 @@ def _objective(terms: Any, requirements: Any) -> Objective:
     for i, entry in enumerate(requirements):
         total += _called(objectives, REQUIREMENTS, entry, f"requirement[{i}]")
     return total
-
-
-def _perturbation(entry: Any, key: str) -> Perturbation:
-    table = dict(as_table(entry, key))
-    shared = table.pop("shared", False)
-    if len(table) != 1 or next(iter(table)) not in distributions.KINDS:
-        raise checks.fail(key, entry, "one of factor, offset, value", "Such as { factor = { uniform = [0.7, 1.3] } }.")
-    if not isinstance(shared, bool):
-        raise checks.fail(f"{key}.shared", shared, "true or false")
-    kind, inner = next(iter(table.items()))
-    inner = as_table(inner, f"{key}.{kind}")
-    if len(inner) != 1 or next(iter(inner)) not in DISTRIBUTIONS:
-        raise checks.fail(f"{key}.{kind}", inner, "one of " + ", ".join(DISTRIBUTIONS), "Such as { uniform = [0.7, 1.3] }.")
-    name, arguments = next(iter(inner.items()))
-    where, make = f"{key}.{kind}.{name}", getattr(distributions, name)
-    if not isinstance(arguments, list):
-        raise checks.fail(where, arguments, "a list of its arguments")
-    arguments = [arguments] if name == "choice" else arguments
-    values = dict(zip(inspect.signature(make).parameters, numbers(arguments, where), strict=False))
-    if name != "choice" and (len(values) < len(arguments) or (len(values) < 2 and name != "normal")):
-        raise checks.fail(where, arguments, "a list of two numbers")
-    return getattr(distributions, kind)(codec.construct(make, values, where), shared=shared)
 
 
 # ------------------------------------------------------------------------------------------------------------- saved results

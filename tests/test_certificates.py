@@ -19,6 +19,13 @@ from iblf_jax.certificates.evidence import evidence_at, rounding
 from iblf_jax.certificates.facts import look, starts_of
 from iblf_jax.closed_loop import LoopState, initial_state
 from iblf_jax.scenario import canonical
+from iblf_jax.studies.cube import bounded
+
+
+def between(low, high):
+    """Any value between two ends."""
+    return ij.value(ij.uniform(low, high))
+
 
 READINGS = (
     ("corrected", "momentum", "float64"),
@@ -465,9 +472,11 @@ def test_wrong_arguments_are_named(paper, corrected_run):
     with pytest.raises(ValueError, match="a Rollout, a study or None"):
         certify(paper, 3)
     with pytest.raises(ValueError, match="claim"):
-        falsify(dataclasses.replace(paper, observer=ij.observers.NoObserver()), {"initial.q": (0.4, 0.7)})
-    with pytest.raises(ValueError, match="low <= high"):
-        falsify(paper, {"initial.q": (0.7, 0.4)})
+        falsify(dataclasses.replace(paper, observer=ij.observers.NoObserver()), {"initial.q": between(0.4, 0.7)})
+    with pytest.raises(ValueError, match="low < high"):
+        falsify(paper, {"initial.q": between(0.7, 0.4)})
+    with pytest.raises(ValueError, match="bounded"):
+        falsify(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.1))})
 
 
 # ---------------------------------------------------------------------------------------------------- many runs
@@ -546,33 +555,56 @@ def test_printed_breaks_its_claim_where_corrected_keeps_it():
 
 @pytest.mark.slow
 def test_search_finds_the_gap_of_the_printed_law_only():
-    ranges = {
-        "initial.q": (0.4, 0.75),
-        "initial.dq": (-4.0, 4.0),
-        "observer.eta0": (-80.0, 80.0),
-        "controller.K2": (0.6, 20.0),
-        "observer.kf": (1.1, 40.0),
+    perturbations = {
+        "initial.q": between(0.4, 0.75),
+        "initial.dq": between(-4.0, 4.0),
+        "observer.eta0": between(-80.0, 80.0),
+        "controller.K2": between(0.6, 20.0),
+        "observer.kf": between(1.1, 40.0),
     }
-    found = falsify(ij.presets.printed_gap(), ranges, starts=8)
+    found = falsify(ij.presets.printed_gap(), perturbations, starts=8)
     assert found.growth > 0.3
-    for path, (low, high) in ranges.items():
+    for path, perturbation in perturbations.items():
+        low, high = perturbation.distribution.support()
         assert np.all((found.parameters[path] >= low) & (found.parameters[path] <= high))
-    none = falsify(ij.presets.printed_gap(reading="corrected"), ranges, starts=8)
+    none = falsify(ij.presets.printed_gap(reading="corrected"), perturbations, starts=8)
     assert none.growth < -1.0 + 1e-9
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ranges", [{"initial.q": (0.2, 1.2), "initial.dq": (-4.0, 4.0)}, {"robot.mass": (-1.0, 2.0)}])
-def test_search_returns_what_can_be_run(ranges):
-    found = falsify(ij.presets.printed_gap(), ranges, starts=3)
+@pytest.mark.parametrize(
+    "perturbations", [{"initial.q": between(0.2, 1.2), "initial.dq": between(-4.0, 4.0)}, {"robot.mass": between(-1.0, 2.0)}]
+)
+def test_search_returns_what_can_be_run(perturbations):
+    found = falsify(ij.presets.printed_gap(), perturbations, starts=3)
     assert np.isfinite(found.growth)
     assert not certify(found.scenario, ij.simulate(found.scenario, **SHORT)).traces.held[0]
 
 
-def test_search_refuses_ranges_without_a_start(paper):
-    for ranges, words in (({"initial.q": (1.1, 1.2)}, "start inside the bounds"), ({"robot.mass": (-2.0, -1.0)}, "positive")):
-        with pytest.raises(ValueError, match=rf"ranges: got .*{next(iter(ranges))}.*{words}.*Narrow"):
-            falsify(paper, ranges, starts=2)
+def test_search_refuses_perturbations_without_a_start(paper):
+    cases = ({"initial.q": between(1.1, 1.2)}, "start inside the bounds"), ({"robot.mass": between(-2.0, -1.0)}, "positive")
+    for perturbations, words in cases:
+        with pytest.raises(ValueError, match=rf"perturbations: got .*{next(iter(perturbations))}.*{words}.*Narrow"):
+            falsify(paper, perturbations, starts=2)
+
+
+def test_search_takes_the_perturbations_of_a_study(paper):
+    """Around the nominal value, one draw for all joints where it is shared, and plant and model alike under `robot`."""
+    ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1), shared=True), "robot.mass": ij.factor(ij.log_uniform(0.8, 1.25))}
+    cube = bounded(canonical(paper), ways)
+    values = cube.values(jnp.array([0.25, 0.5, 1.0]))
+    np.testing.assert_allclose(values["controller.K2"], 0.95 * paper.controller.K2)
+    np.testing.assert_allclose(values["robot.mass"], np.array([1.0, 1.25]) * paper.plant.mass)
+    assert cube.size == 3 and not cube.refused(np.ones(3))
+
+
+@pytest.mark.parametrize(("search", "old"), [(falsify, "ranges"), (ij.falsify, "sets")])
+def test_old_names_and_tuples_are_told_the_new_ones(paper, search, old):
+    timing = {} if old == "ranges" else {"duration": 0.01}
+    with pytest.raises(ValueError, match=rf"{old}: got .*falsify\(\.\.\., perturbations=\.\.\.\)"):
+        search(paper, **{old: {"initial.q": (0.4, 0.7)}}, **timing)
+    with pytest.raises(ValueError, match=r"perturbations\['initial\.q'\].*ij\.value\(ij\.uniform\(0\.4, \[0\.7, 0\.8\]\)\)"):
+        search(paper, {"initial.q": (0.4, np.array([0.7, 0.8]))}, **timing)
 
 
 # ---------------------------------------------------------------------------------------------------- what a user sees

@@ -84,7 +84,7 @@ def test_batches_of_batches_and_of_different_steps(paper):
 @pytest.mark.parametrize("ending", [".nc", ".npz", ".NC"])
 def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
     runs = {"integral BLF": short_run, "b-2": batch}
-    ij.save_rollouts(tmp_path / f"runs{ending}", runs)
+    ij.save_rollouts(runs, tmp_path / f"runs{ending}")
     found = ij.load_rollouts(tmp_path / f"runs{ending}")
     assert list(found) == list(runs)
     for name, run in runs.items():
@@ -92,7 +92,7 @@ def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
 
 
 def test_a_single_run_is_called_run(short_run, tmp_path):
-    ij.save_rollouts(tmp_path / "a.nc", short_run)
+    ij.save_rollouts(short_run, tmp_path / "a.nc")
     assert list(ij.load_rollouts(str(tmp_path / "a.nc"))) == ["run"]
 
 
@@ -104,7 +104,7 @@ def test_states_of_any_structure(short_run, tmp_path):
     assert data.controller_state_weights.shape == (T, 3, 4)
     assert data.controller_state_rest_0.dims == ("time", "joint")
     assert data.controller_state_rest_1.dims == ("time",)
-    ij.save_rollouts(tmp_path / "a.nc", run)
+    ij.save_rollouts(run, tmp_path / "a.nc")
     xarray.testing.assert_identical(ij.load_rollouts(tmp_path / "a.nc")["run"], data)
 
 
@@ -137,17 +137,20 @@ def test_a_users_law_is_kept_by_its_parameters(short_run):
 
 def test_bad_arguments(short_run, tmp_path):
     with pytest.raises(ValueError, match=r"ends in \.nc"):
-        ij.save_rollouts(tmp_path / "a.csv", short_run)
+        ij.save_rollouts(short_run, tmp_path / "a.csv")
     with pytest.raises(ValueError, match=r"ends in \.nc"):
         ij.load_rollouts(tmp_path / "a")
     for runs in ({}, [short_run], None):
         with pytest.raises(ValueError, match="dict of at least one Rollout"):
-            ij.save_rollouts(tmp_path / "a.nc", runs)  # type: ignore[arg-type]
+            ij.save_rollouts(runs, tmp_path / "a.nc")  # type: ignore[arg-type]
     for name in ("a.b", "", "a/b", 3, "attributes"):
         with pytest.raises(ValueError, match="name of a run"):
-            ij.save_rollouts(tmp_path / "a.nc", {name: short_run})  # type: ignore[dict-item]
+            ij.save_rollouts({name: short_run}, tmp_path / "a.nc")  # type: ignore[dict-item]
     with pytest.raises(ValueError, match="expected a Rollout"):
-        ij.save_rollouts(tmp_path / "a.nc", {"a": 3})  # type: ignore[dict-item]
+        ij.save_rollouts({"a": 3}, tmp_path / "a.nc")  # type: ignore[dict-item]
+    for runs in (short_run, {"a": short_run}):
+        with pytest.raises(ValueError, match=r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)"):
+            ij.save_rollouts(tmp_path / "a.nc", runs)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="jit"):
         jax.jit(lambda run: io.rollout_to_xarray(run) and 0)(short_run)
 

@@ -1,8 +1,8 @@
 """The layers of the package, held by its imports: they go down only.
 
     6 outside     presets  arms  robot_file  scenario_file  io  codec  plain  plotting/  cli/  testing/
-    5 studies     studies/  tuning/  distributions  distributed
-    4 judgement   certificates
+    5 judgement   certificates/  tuning/
+    4 studies     studies/  distributions  distributed
     3 the run     integrators  scenario  closed_loop  flat_loop  stability  metrics  results  paths  rollout  engine/  lowering/
     2 the law     barriers/  observers/  controllers/
     1 the world   robots/  references  bounds  disturbances
@@ -40,8 +40,8 @@ LAYERS = {
         "rollout",
         "lowering",
     ),
-    4: ("certificates",),
-    5: ("studies", "tuning", "distributions", "distributed"),
+    4: ("studies", "distributions", "distributed"),
+    5: ("certificates", "tuning"),
     6: (
         *("presets", "arms", "robot_file", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain"),
         *("plotting", "cli", "testing", "__main__"),

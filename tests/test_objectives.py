@@ -14,6 +14,7 @@ from iblf_jax.testing import ContractError
 from iblf_jax.testing.metrics import folded, samples
 from iblf_jax.tuning import quantities
 from iblf_jax.tuning.quantities import MetricResult, Quantities
+from iblf_jax.tuning_file import load_tuning_file
 
 TUNING = {"duration": 0.5, "dt": 1e-3, "report_runs": 1}
 
@@ -47,6 +48,43 @@ def test_a_result_of_a_metric_is_weighted_and_summed(rng):
     expected = [tracking["iae"].sum(), swing["swing"] @ np.array([2.0, 0.5]), torque["effort"]]
     np.testing.assert_allclose(found["tuning_exact"], expected, rtol=1e-12)
     np.testing.assert_array_equal(found["tuning_smooth"], found["tuning_exact"])
+
+
+FILE = 'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n[[objective]]\nkind = "metric"\n'
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ('name = "iae"', ij.objectives.metric(ij.metrics.Tracking(), "iae")),
+        ('name = "effort_above_gravity"\nweight = 2.0', 2.0 * ij.objectives.metric(ij.metrics.AboveGravity(), "effort_above_gravity")),
+        (
+            'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 }\njoints = [1.0, 0.0]\nscale = 0.1',
+            ij.objectives.metric(ij.metrics.Settling(tolerance=0.02), "overshoot", joints=[1.0, 0.0], scale=0.1),
+        ),
+    ],
+)
+def test_a_tuning_file_names_any_metric(words, expected, tmp_path):
+    (tmp_path / "tune.toml").write_text(FILE + words)
+    found = load_tuning_file(tmp_path / "tune.toml")["objective"]
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ('name = "iaee"', r"objective\[0\].name: got 'iaee'.*Did you mean iae"),
+        ("weight = 2.0", r"objective\[0\].name: got nothing"),
+        ('fold = "tracking"', r"objective\[0\].name: got nothing, expected the name of one of its results"),
+        ('fold = "traking"\nname = "iae"', r"objective\[0\].fold.kind.*Did you mean tracking"),
+        ('fold = "margin"\nname = "iae"', "got 'iae', expected one of 'margin'"),
+    ],
+)
+def test_a_tuning_file_with_a_wrong_metric_is_refused(words, message, tmp_path):
+    (tmp_path / "tune.toml").write_text(FILE + words)
+    with pytest.raises(ValueError, match=message):
+        load_tuning_file(tmp_path / "tune.toml")
 
 
 def test_what_it_refuses():

@@ -28,6 +28,7 @@ PROMISED = [
         "presets",
         "testing",
     ),
+    *("distributed", "certificates", "Study", "TuneResult", "Sensitivity", "Certificate", "Counterexample", "Attack", "Front"),
 ]
 
 HEAVY = ("matplotlib", "optax", "xarray", "pandas", "scipy", "zarr", "tqdm", "mujoco", "IPython", "hypothesis")
@@ -95,6 +96,22 @@ def test_every_leaf_has_a_unit():
     assert all(p.unit for p in table)
     assert "controller.K2" in repr(table)
     assert "<table>" in table._repr_html_()
+
+
+def test_what_is_kept_comes_first_and_then_the_path():
+    """save_x(x, path), load_x(path)."""
+    for name in (name for name in dir(ij) if re.match("save_|load_", name)):
+        first, *rest = inspect.signature(getattr(ij, name)).parameters
+        if name.startswith("save_"):
+            assert rest[0] == "path" and hasattr(ij, name.replace("save_", "load_")), name
+        else:
+            assert first == "path", name
+    with pytest.raises(ValueError, match=r"store: got 'x.zarr', expected it as path"):
+        ij.load_sweep(store="x.zarr")
+
+
+def test_distributed_shows_what_users_call():
+    assert dir(ij.distributed) == ["ProcessLostError", "initialize", "rank", "size"]
 
 
 def test_an_unknown_name_is_an_attribute_error():

@@ -14,8 +14,9 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax import cli, study_file
+from iblf_jax import cli, distributions, study_file
 from iblf_jax.studies import store
+from iblf_jax.tuning_file import load_tuning_file
 
 STUDY, SWEEP = cases.STUDY, cases.SWEEP
 CALM = SWEEP.replace("std = 0.05", "std = 0.001").replace("300", "3")
@@ -170,6 +171,77 @@ def test_bad_files_are_refused(kind, change, message, tmp_path):
     path.write_text(text.replace(*change))
     with pytest.raises(ValueError, match=rf"bad.toml: .*{message}"):
         study_file.load_study_file(path, kind)
+
+
+WAYS = """
+[perturbations]
+"plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
+initial.q = { offset = "normal", std = 0.02, shared = true }
+"plant.payload" = { value = "choice", values = [0.0, 0.5], weights = [3.0, 1.0] }
+disturbance.phase = { value = "log_uniform", low = 0.1, high = 6.28 }
+"""
+HEADS = {
+    "study": "[study]\nruns = 2",
+    "sweep": "[sweep]",
+    "tune": '[tune]\nparameters = ["controller.k1"]\n[[objective]]\nkind = "tracking"',
+}
+
+
+def perturbations_in(kind, ways, path):
+    """The perturbations of a file of one of the three kinds."""
+    path.write_text(f'preset = "zhang_yan_2024"\n[run]\nduration = 0.01\n{ways}\n{HEADS[kind]}\n')
+    return load_tuning_file(path)["perturbations"] if kind == "tune" else study_file.load_study_file(path, kind).perturbations
+
+
+def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
+    expected = {
+        "plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)),
+        "initial.q": ij.offset(ij.normal(std=0.02), shared=True),
+        "plant.payload": ij.value(ij.choice([0.0, 0.5], [3.0, 1.0])),
+        "disturbance.phase": ij.value(ij.log_uniform(0.1, 6.28)),
+    }
+    for kind in HEADS:
+        found = perturbations_in(kind, WAYS, tmp_path / "file.toml")
+        assert list(found) == list(expected)
+        assert jax.tree.structure(found) == jax.tree.structure(expected)
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("{ factor = { uniform = [0.7, 1.3] } }", '{ factor = "uniform", low = 0.7, high = 1.3 }'),
+        ("{ offset = { normal = [0.0, 2e-3] }, shared = true }", '{ offset = "normal", mean = 0.0, std = 0.002, shared = true }'),
+        ("{ value = { log_uniform = [1, [2.5, 3]] } }", '{ value = "log_uniform", low = 1, high = [2.5, 3] }'),
+        ("{ value = { choice = [0.5, 0.25, 4] } }", '{ value = "choice", values = [0.5, 0.25, 4] }'),
+        ("{ factor = { uniform = [0.9] } }", '{ factor = "uniform", low = 0.9, high = ... }'),
+    ],
+)
+@pytest.mark.parametrize("kind", HEADS)
+def test_the_old_spelling_is_told_the_new_one(kind, old, new, tmp_path):
+    with pytest.raises(ValueError, match=rf"file.toml: perturbations.plant.mass.*{re.escape(f'This is now written {new}.')}"):
+        perturbations_in(kind, f"[perturbations]\nplant.mass = {old}", tmp_path / "file.toml")
+    if "..." not in new:
+        assert perturbations_in(kind, f"[perturbations]\nplant.mass = {new}", tmp_path / "file.toml").keys() == {"plant.mass"}
+
+
+def test_a_distribution_of_ones_own_is_named_in_files(tmp_path, monkeypatch):
+    @ij.component
+    class Triangle:
+        """From `low` up to `high`, more often near `high`."""
+
+        low: jax.Array = ij.leaf("", shape="any")
+        high: jax.Array = ij.leaf("", shape="any")
+
+        def quantile(self, u):
+            return self.low + np.sqrt(u) * (self.high - self.low)
+
+        def support(self):
+            return np.asarray(self.low), np.asarray(self.high)
+
+    monkeypatch.setitem(distributions.MEMBERS, "triangle", Triangle)
+    (found,) = perturbations_in("tune", '[perturbations]\nplant.mass = { factor = "triangle", low = 1, high = 2 }', tmp_path / "a").values()
+    assert isinstance(found.distribution, Triangle) and found.kind == "factor"
 
 
 @pytest.mark.parametrize(

@@ -351,7 +351,7 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
     assert sharp.evaluator.evaluations < 0.6 * len(starts) * len(sharp.history["loss"])
     half = followed(starts, 4, stop=len(sharp.history["loss"]) // 2)
     assert 0 < half.state["stage"] < 4
-    save_checkpoint(tmp_path / "half.npz", half, "mark")
+    save_checkpoint(half, tmp_path / "half.npz", "mark")
     again = followed(starts, 4, resumed=tmp_path / "half.npz")
     np.testing.assert_array_equal(again.history["z"], sharp.history["z"])
     np.testing.assert_array_equal(again.history["loss"], sharp.history["loss"])

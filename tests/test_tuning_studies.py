@@ -72,7 +72,7 @@ def test_falsify_returns_what_can_be_run(paper, sets):
 
 
 def test_falsify_refuses_sets_without_an_admissible_run(paper):
-    with pytest.raises(ValueError, match=r"sets: got \{'initial.q': .*start inside the bounds .*Narrow"):
+    with pytest.raises(ValueError, match=r"perturbations: got \{'initial.q': .*start inside the bounds .*Narrow"):
         ij.falsify(paper, {"initial.q": ij.value(ij.uniform(1.1, 1.2))}, starts=2, **SHORT)
 
 
@@ -119,7 +119,7 @@ weight = 0.5
 kind = "margin_above"
 limit = 0.02
 [perturbations]
-"plant.mass[1]" = { factor = { uniform = [0.7, 1.3] } }
+"plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
 """
 
 

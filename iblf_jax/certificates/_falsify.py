@@ -4,8 +4,8 @@ The inequality is a statement about states, so a counterexample is one state: th
 
     V2' - 1/2 |f'|^2 <= -Q,   Q = sum_i rate_i V1_i + e2^T (K2 - I/2) e2 + f_tilde^T (kf - I) f_tilde >= rho V2,           (3.24)
 
-and `falsify` climbs  g = (V2' - 1/2 |f'|^2) / Q  at t = 0 over ranges of the scenario's parameters, from many starting points, with
-the exact gradient.  Where the proof is exact g never exceeds -1, whatever is varied.  g > -1 breaks (3.24); g > 0 breaks the claim
+and `falsify` climbs  g = (V2' - 1/2 |f'|^2) / Q  at t = 0 over perturbations of the scenario (`studies.cube`), from many starting points,
+with the exact gradient.  Where the proof is exact g never exceeds -1, whatever is varied.  g > -1 breaks (3.24); g > 0 breaks the claim
 itself, (3.18) and (3.26) for every rho > 0: V2 grows where the theorem has it fall.  For law and observer as printed such starts exist,
 because the terms dropped from the proof grow with the cube of the joint velocity, and Q with its square.
 
@@ -16,8 +16,7 @@ counterexample: such points are passed over.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +24,13 @@ import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.box import admissible_points, maximise
+from iblf_jax.certificates.box import maximise
 from iblf_jax.certificates.evidence import evidence_at
 from iblf_jax.closed_loop import initial_state
-from iblf_jax.paths import get, why_inadmissible, with_parameters
+from iblf_jax.distributions import Perturbation
+from iblf_jax.paths import with_parameters
 from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.studies.cube import bounded
 
 
 class Counterexample(NamedTuple):
@@ -58,13 +59,14 @@ def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     return (seen.dV - 0.5 * seen.df @ seen.df) / (jnp.min(constants.decay) * V1 + by_e2 + by_f), seen.held
 
 
-def falsify(scenario: Scenario, ranges: Mapping[str, Any], *, starts: int = 16, seed: int = 0) -> Counterexample:
+@checks.renamed(ranges="perturbations")
+def falsify(scenario: Scenario, perturbations: Mapping[str, Perturbation], *, starts: int = 16, seed: int = 0) -> Counterexample:
     """Climbs to the start and gains at which V2' - 1/2 |f'|^2 is largest relative to -Q of the proof.                    (3.24)
 
     Args:
       scenario: a scenario for which Theorem 2 claims something.
-      ranges: path -> (low, high), each a number or an array of the leaf's shape, in the leaf's unit; what is inadmissible in them
-        (a start outside its bounds) is passed over.
+      perturbations: path -> `factor`, `offset` or `value` of a bounded distribution, as in `ij.falsify`: what may vary, and between which
+        ends; what is inadmissible in them (a start outside its bounds) is passed over.
       starts: from how many random points to climb.
       seed: of the random points.
 
@@ -72,71 +74,37 @@ def falsify(scenario: Scenario, ranges: Mapping[str, Any], *, starts: int = 16, 
       The worst that was found, a `Counterexample` if its `growth` is positive; its scenario can be run.
 
     Raises:
-      ValueError: no claim to break, an unknown path, an empty range, ranges in which nothing admissible was found.
+      ValueError: no claim to break, an unknown path, a perturbation without ends, perturbations in which nothing admissible was found.
     """
     scenario = canonical(scenario)
     reason = claims.why_no_claim(scenario)
     if reason:
         raise checks.fail("scenario", type(scenario.controller).__name__, "a scenario with a claim", reason + ".")
     starts, seed = checks.positive_integer("starts", starts), checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
-    low, high, split = _flat_ranges(scenario, ranges)
-    checks.fits("starts", starts, 8.0 * 2 * low.size)
-    dtype = scenario.initial.q.dtype
-
-    def at(unit):
-        """Path -> value at a point of the unit cube, in which the ranges are climbed."""
-        return split(low + (high - low) * unit)
-
-    growth = jax.jit(jax.value_and_grad(lambda unit: _growth(with_parameters(scenario, at(unit))), has_aux=True))
+    cube = bounded(scenario, perturbations, signs=False)
+    checks.fits("starts", starts, 8.0 * 2 * cube.size)
+    growth = jax.jit(jax.value_and_grad(lambda u: _growth(with_parameters(scenario, cube.values(u))), has_aux=True))
     best = (-np.inf, np.zeros(0))
 
-    def seen(unit):
+    def seen(u):
         """Why a point is no answer, g and its gradient there; the best point is kept."""
         nonlocal best
-        why = why_inadmissible(scenario, at(unit))
+        why = cube.refused(u)
         if why:
-            return why, -np.inf, np.zeros(low.size)
-        (g, held), slope = growth(jnp.asarray(unit, dtype))
+            return why, -np.inf, np.zeros(cube.size)
+        (g, held), slope = growth(jnp.asarray(u, scenario.initial.q.dtype))
         if held or not np.isfinite(g):
-            return "The guard or a torque limit is at work at the start, where nothing is claimed.", -np.inf, np.zeros(low.size)
-        best = max(best, (float(g), unit.copy()), key=lambda pair: pair[0])
+            return "The guard or a torque limit is at work at the start, where nothing is claimed.", -np.inf, np.zeros(cube.size)
+        best = max(best, (float(g), u.copy()), key=lambda pair: pair[0])
         return "", float(g), np.asarray(slope)
 
-    def climb(unit, worse):
+    def climb(u, worse):
         """What the ascent sees: beyond what is admissible a plain below its start, from which the line search turns back."""
-        why, g, slope = seen(unit)
+        why, g, slope = seen(u)
         return (worse, slope) if why else (g, slope)
 
-    points = admissible_points("ranges", dict(ranges), starts, low.size, seed, lambda unit: seen(unit)[0])
-    for point in points:
+    for point in cube.admissible_points(starts, seed, lambda u: seen(u)[0]):
         worse = seen(point)[1] - 1.0
-        maximise(lambda unit, worse=worse: climb(unit, worse), point, np.zeros(low.size), np.ones(low.size))
-    values = {path: np.asarray(value) for path, value in at(best[1]).items()}
+        maximise(lambda u, worse=worse: climb(u, worse), point, np.zeros(cube.size), np.ones(cube.size))
+    values = {path: np.asarray(value) for path, value in cube.values(jnp.asarray(best[1], scenario.initial.q.dtype)).items()}
     return Counterexample(with_parameters(scenario, values), values, best[0])
-
-
-def _flat_ranges(scenario: Scenario, ranges: Mapping[str, Any]):
-    """Lower and upper ends as flat vectors, and the function that takes such a vector apart by path."""
-    if not isinstance(ranges, Mapping) or not ranges:
-        raise checks.fail("ranges", ranges, 'a mapping from path to (low, high), such as {"initial.dq": (-3, 3)}')
-    lows, highs, shapes = [], [], {}
-    for path, pair in ranges.items():
-        shapes[path] = jnp.shape(get(scenario, path))
-        if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise checks.fail(f"ranges[{path!r}]", pair, "(low, high)")
-        low, high = (np.asarray(checks.as_floats(f"ranges[{path!r}]", end), float) for end in pair)
-        if any(end.shape not in ((), shapes[path]) for end in (low, high)):
-            raise checks.fail(f"ranges[{path!r}]", pair, f"one number, or shape {shapes[path]}, for each end")
-        low, high = (np.broadcast_to(end, shapes[path]) for end in (low, high))
-        if not np.all(low <= high) or not np.all(np.isfinite(low)) or not np.all(np.isfinite(high)):
-            raise checks.fail(f"ranges[{path!r}]", pair, "finite low <= high")
-        lows.append(low.ravel())
-        highs.append(high.ravel())
-    sizes = [x.size for x in lows]
-    return np.concatenate(lows), np.concatenate(highs), partial(_split, shapes=shapes, ends=np.cumsum(sizes)[:-1])
-
-
-def _split(x, *, shapes: dict[str, tuple[int, ...]], ends: np.ndarray):
-    """A flat vector as path -> array."""
-    parts = jnp.split(jnp.asarray(x), ends)
-    return {path: part.reshape(shape) for (path, shape), part in zip(shapes.items(), parts, strict=True)}

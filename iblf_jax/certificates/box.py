@@ -9,15 +9,13 @@ improved by projected quasi-Newton steps.  What was searched is said in words be
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.robots import Robot
 
 GRID = {1: 257, 2: 65, 3: 21}
@@ -25,8 +23,6 @@ GRID = {1: 257, 2: 65, 3: 21}
 SOBOL_POINTS = 4096
 REFINED = 4
 """How many of the best points are improved."""
-BATCHES = 64
-"""How often as many points as are wanted are drawn, to find admissible ones."""
 
 
 class Extremes(NamedTuple):
@@ -64,39 +60,6 @@ def maximise(value_and_gradient, start: np.ndarray, low: np.ndarray, high: np.nd
 
     found = minimize(negative, np.asarray(start, float), jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)))
     return -float(found.fun), np.clip(found.x, low, high)
-
-
-def admissible_points(
-    name: str, ranges: dict[str, tuple[Any, Any]], count: int, size: int, seed: Any, refused: Callable[[np.ndarray], str]
-) -> np.ndarray:
-    """Random points of the unit cube at which nothing is refused, (count, size); repeated where few were found.
-
-    Args:
-      name: what the user gave the ranges as.
-      ranges: path -> (low, high), for the message.
-      count, size, seed: of the points.
-      refused: why a point is inadmissible, in words; "" if it is not.
-
-    Raises:
-      ValueError: no admissible point was found.
-    """
-    rng, found, reason = np.random.default_rng(seed), [], ""
-    for _ in range(BATCHES):
-        for point in rng.uniform(size=(count, size)):
-            why = refused(point)
-            found += [] if why else [point]
-            reason = why or reason
-        if len(found) >= count:
-            break
-    if not found:
-        raise none_admissible(name, ranges, f"None of {BATCHES * count} random points is; the last: {reason} Narrow or move the ranges.")
-    return np.resize(np.array(found), (count, size))
-
-
-def none_admissible(name: str, ranges: dict[str, tuple[Any, Any]], mend: str) -> ValueError:
-    """The error for ranges in which there is nothing to look at."""
-    shown = {path: (np.asarray(low).tolist(), np.asarray(high).tolist()) for path, (low, high) in ranges.items()}
-    return checks.fail(name, shown, "ranges with admissible values in them", mend)
 
 
 def points_in(low: np.ndarray, high: np.ndarray, *, seed: int = 0) -> tuple[np.ndarray, str]:

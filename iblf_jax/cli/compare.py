@@ -74,6 +74,6 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
     joints = range(next(iter(result.rollouts.values())).n)
     figures = {f"comparison_joint_{joint}": plotting.comparison(result, joint) for joint in joints}
     plotting.save(figures, folder, formats=("png", "pdf"))
-    save_rollouts(folder / "rollouts.nc", result.rollouts)
+    save_rollouts(result.rollouts, folder / "rollouts.nc")
     named = ", ".join(figures)
     print(f"\nwritten to {folder}: comparison.txt, comparison.csv, comparison.json, {named} (.png, .pdf), rollouts.nc")

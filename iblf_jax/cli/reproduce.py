@@ -96,7 +96,7 @@ def _write_data(
     import iblf_jax
     from iblf_jax.io import save_rollouts
 
-    save_rollouts(folder / "rollouts.nc", runs)
+    save_rollouts(runs, folder / "rollouts.nc")
     report: dict[str, Any] = {
         "source": "Zhang & Yan 2024, section 4",
         "run": {"reading": args.reading, "duration": args.duration, "dt": args.dt, "method": "rk4"},

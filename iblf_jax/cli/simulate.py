@@ -61,7 +61,7 @@ def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any]) 
     from iblf_jax.scenario_file import save_scenario
 
     save_scenario(result.scenario, folder / "scenario.toml", run=options)
-    save_rollouts(folder / "rollout.nc", result)
+    save_rollouts(result, folder / "rollout.nc")
     write_json(folder / "metrics.json", {"source": source, "run": options, "iblf_jax_version": iblf_jax.__version__, **verdict(result)})
     plotting.save({"overview": plotting.overview(result)}, folder, formats=("png",))
     print(f"\nwritten to {folder}: rollout.nc, metrics.json, overview.png, scenario.toml")

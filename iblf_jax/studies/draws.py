@@ -77,8 +77,16 @@ def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
         seen.append(path)
 
 
-def plan(scenario: Scenario, perturbations: Any, what: str = "perturbations") -> tuple[tuple[Target, ...], dict[str, Perturbation]]:
+def plan(
+    scenario: Scenario, perturbations: Any, what: str = "perturbations", *, signs: bool = True
+) -> tuple[tuple[Target, ...], dict[str, Perturbation]]:
     """Checks a user's perturbations; returns the targets, and target path -> perturbation.
+
+    Args:
+      scenario: what is perturbed.
+      perturbations: path -> perturbation.
+      what: the user's word for them.
+      signs: whether distributions that can leave the admissible range by design are refused.
 
     Raises:
       ValueError: not a mapping of perturbations, an unknown or overlapping path, a distribution that does not fit the leaf or can
@@ -90,16 +98,23 @@ def plan(scenario: Scenario, perturbations: Any, what: str = "perturbations") ->
     targets, by_path = [], {}
     for source, perturbation in perturbations.items():
         if not isinstance(perturbation, Perturbation):
-            raise checks.fail(
-                f"{what}[{source!r}]", perturbation, "ij.factor(...), ij.offset(...) or ij.value(...)", "Say how the draw acts on the leaf."
-            )
+            expected = "ij.factor(...), ij.offset(...) or ij.value(...)"
+            raise checks.fail(f"{what}[{source!r}]", perturbation, expected, _said_properly(perturbation))
         for path in _targets(scenario, source, perturbation):
             nominal = np.asarray(paths.get(scenario, path))
             target = Target(path, source, nominal.shape, paths.sign_at(scenario, path))
-            _check_fit(target, perturbation, nominal, what)
+            _check_fit(target._replace(sign=target.sign if signs else None), perturbation, nominal, what)
             targets.append(target)
             by_path[path] = perturbation
     return tuple(targets), by_path
+
+
+def _said_properly(given: Any) -> str:
+    """The mend for a range or a distribution in the place of a perturbation, with the user's numbers."""
+    if isinstance(given, tuple | list) and len(given) == 2 and checks.is_concrete(given):
+        low, high = (checks.shown(np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x) for x in given)
+        return f"Say how the draw acts on the leaf: for values between two ends ij.value(ij.uniform({low}, {high}))."
+    return "Say how the draw acts on the leaf: ij.value(ij.uniform(low, high)), for example."
 
 
 def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> list[str]:

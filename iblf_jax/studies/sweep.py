@@ -133,11 +133,12 @@ def sweep(
     return result
 
 
-def load_sweep(store: str | os.PathLike) -> xarray.Dataset:
+@checks.renamed(store="path")
+def load_sweep(path: str | os.PathLike) -> xarray.Dataset:
     """The data of a store, complete or not.
 
     Args:
-      store: folder that `sweep` writes to.
+      path: folder that `sweep` writes to, its `store`.
 
     Returns:
       The Dataset that `sweep` returns; where nothing has been computed yet, NaN and status -1.  Its attributes `computed_cases` and
@@ -147,11 +148,11 @@ def load_sweep(store: str | os.PathLike) -> xarray.Dataset:
       ValueError: something that is not a path.
       StoreError: no store, a foreign or a damaged one.
     """
-    opened = load_store(checks.file_path("store", store, "a folder"))
+    opened = load_store(checks.file_path("path", path, "a folder"))
     try:
         return _dataset(opened)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, MemoryError) as error:
-        raise StoreError(f"{store}: is damaged: its configuration is wrong ({type(error).__name__}). Choose another store.") from error
+        raise StoreError(f"{path}: is damaged: its configuration is wrong ({type(error).__name__}). Choose another store.") from error
 
 
 def _dataset(store: Store) -> xarray.Dataset:

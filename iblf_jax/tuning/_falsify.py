@@ -1,4 +1,4 @@
-"""`falsify`: attack a scenario before it is believed, by gradient ascent over start, disturbance and plant within stated sets.
+"""`falsify`: attack a scenario before it is believed, by gradient ascent over start, disturbance and plant within stated ends.
 
 Random runs seldom meet the worst case: in d dimensions its corner of the set is small.  Here the uniform number u in [0, 1]^d behind
 each perturbation is the unknown, and every one of S attacks, started at random, climbs
@@ -19,25 +19,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import checks
-from iblf_jax.certificates.box import admissible_points, none_admissible
 from iblf_jax.distributions import Perturbation
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.integrators import tableau
-from iblf_jax.paths import get, why_inadmissible, with_parameters
+from iblf_jax.paths import with_parameters
 from iblf_jax.results import Rollout
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario, canonical
 from iblf_jax.status import Status, describe
+from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.designs import check_seed
-from iblf_jax.studies.draws import Cases, Target, draw, plan, sample_size
 from iblf_jax.studies.progress import bar
 from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Peak, Quantities
@@ -53,25 +52,6 @@ SMOOTHING = 1e-3
 
 NO_ANSWER = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
 """Flags of runs that say nothing about the law: no law could keep the bounds, or the integrator is to blame."""
-
-
-class _Sizes(NamedTuple):
-    """Path -> shape of its u, flattened; static."""
-
-    shapes: tuple[tuple[str, tuple[int, ...]], ...]
-
-    @property
-    def total(self) -> int:
-        return sum(int(np.prod(shape, dtype=int)) for _, shape in self.shapes)
-
-    def split(self, u: jax.Array) -> dict[str, jax.Array]:
-        """Path -> its part of u, (d,)."""
-        parts, at = {}, 0
-        for path, shape in self.shapes:
-            size = int(np.prod(shape, dtype=int))
-            parts[path] = u[at : at + size].reshape(shape)
-            at += size
-        return parts
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,9 +91,10 @@ class Attack:
         return "\n".join(lines)
 
 
+@checks.renamed(sets="perturbations")
 def falsify(
     scenario: Scenario,
-    sets: Mapping[str, Perturbation],
+    perturbations: Mapping[str, Perturbation],
     *,
     duration: float,
     dt: float = 1e-3,
@@ -130,7 +111,7 @@ def falsify(
 
     Args:
       scenario: what to attack, with its tuned gains say.
-      sets: path -> `factor`, `offset` or `value` of a bounded distribution, whose range is the set: the same as in `monte_carlo`.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution, as in `monte_carlo`, that has two ends: the set.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s].
       method: integrator.
@@ -144,7 +125,8 @@ def falsify(
       An `Attack`: the worst run found, and whether it left its bounds.  Not to have found one proves nothing.
 
     Raises:
-      ValueError: a set without bounds (a normal distribution), sets in which nothing admissible was found, or bad arguments.
+      ValueError: a perturbation without ends (a normal distribution), perturbations in which nothing admissible was found, or bad
+        arguments.
 
     Source: head of this module.
     """
@@ -153,28 +135,15 @@ def falsify(
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
     checks.fits("iterations", iterations, 8 * starts)
-    targets, by_path = plan(scenario, sets, "sets")
-    if not targets:
-        raise checks.fail("sets", sets, "at least one set", "Say what may vary, and between which limits.")
-    _check_bounded(scenario, targets, by_path)
-    dtype = scenario.initial.q.dtype
-    by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
-    cases = Cases(scenario, by_path, jax.random.key(0))
-    sizes = _Sizes(tuple(sample_size(targets, by_path).items()))
-    checks.fits("starts", starts, 8.0 * (1 + sizes.total) * NUMBERS_A_RUN)
-    push = partial(_push, targets=targets, sizes=sizes, steps=steps, method=method, backend=backend)
-    made = jax.jit(partial(_made, cases, targets, sizes))
-
-    def refused(point: np.ndarray) -> str:
-        return why_inadmissible(scenario, made(jnp.asarray(point, dtype)))
-
-    ranges = {target.path: by_path[target.path].range(np.asarray(get(scenario, target.path))) for target in targets}
+    cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype
+    checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
+    push = partial(_push, cube, jnp.asarray(dt, dtype), steps=steps, method=method, backend=backend)
     seed = check_seed(seed)
-    u = admissible_points("sets", ranges, starts, sizes.total, [seed, 3], refused)
+    u = cube.admissible_points(starts, [seed, 3])
     sound, ever, best, history = u.copy(), np.zeros(starts, bool), None, []
     with bar(progress, iterations + 1, unit="steps") as shown:
         for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
-            margin, slope, status = (np.asarray(x) for x in push(cases, step, jnp.asarray(u, dtype)))
+            margin, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
             fine = np.isfinite(margin) & (status & int(NO_ANSWER) == 0)
             history.append(np.where(fine, margin, np.nan))
             s = int(np.argmin(np.where(fine, margin, np.inf)))
@@ -185,18 +154,18 @@ def falsify(
                 ahead = np.where(fine[:, None], stepped, 0.5 * (u + sound))
                 sound, ever = np.where(fine[:, None], u, sound), ever | fine
                 if not ever.all():  # an attack that has nowhere to go back to starts somewhere else
-                    anew = admissible_points("sets", ranges, starts, sizes.total, [seed, 3, len(history)], refused)
+                    anew = cube.admissible_points(starts, [seed, 3, len(history)])
                     sound, ahead = (np.where(ever[:, None], x, anew) for x in (sound, ahead))
-                u = np.stack([_back(refused, *pair) for pair in zip(sound, ahead, strict=True)])
+                u = np.stack([_back(cube.refused, *pair) for pair in zip(sound, ahead, strict=True)])
             shown.update(1)
             shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} rad")
     if best is None:
         mend = (
-            "In every run that was tried the reference leaves the bounds (Assumption 2) or the step is too large: narrow the sets, "
-            "widen the bounds, or take a smaller dt."
+            "In every run that was tried the reference leaves the bounds (Assumption 2) or the step is too large: narrow the "
+            "perturbations, widen the bounds, or take a smaller dt."
         )
-        raise none_admissible("sets", ranges, mend)
-    values = {path: np.asarray(x) for path, x in made(jnp.asarray(best[1], dtype)).items()}
+        raise cube.nothing(mend)
+    values = {path: np.asarray(x) for path, x in cube.values(jnp.asarray(best[1], dtype)).items()}
     timing = {"duration": duration, "dt": dt, "method": method}
     worst = with_parameters(scenario, values)
     first = next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row)))
@@ -212,28 +181,13 @@ def _back(refused: Callable[[np.ndarray], str], sound: np.ndarray, ahead: np.nda
     return sound
 
 
-def _check_bounded(scenario: Scenario, targets: tuple[Target, ...], by_path) -> None:
-    for target in targets:
-        low, high = by_path[target.path].distribution.support()
-        if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
-            raise checks.fail(
-                f"sets[{target.source!r}]", by_path[target.path].distribution, "a bounded distribution", "Use ij.uniform(low, high)."
-            )
-
-
-def _made(cases: Cases, targets: tuple[Target, ...], sizes: _Sizes, u: jax.Array) -> dict[str, jax.Array]:
-    """Path -> value of one run."""
-    return draw(cases, targets, jnp.uint32(0), {}, sizes.split(u))[0]
-
-
-@partial(jax.jit, static_argnames=("targets", "sizes", "steps", "method", "backend"))
-def _push(cases: Cases, dt, u, *, targets, sizes, steps, method, backend):
+@partial(jax.jit, static_argnames=("steps", "method", "backend"))
+def _push(cube: Cube, dt, u, *, steps, method, backend):
     """Smallest margin (S,) [rad], its gradient by u (S, d) and the status of each attack."""
     one: Any = jnp.ones_like(dt)
     fold = Quantities((Peak(one, "deficit", smoothing=one * SMOOTHING),))
-    made = partial(_made, cases, targets, sizes)
-    varied = jax.vmap(made)(u)
-    slopes = jax.vmap(jax.jacfwd(made))(u)
-    found = by_coordinates(cases.scenario, varied, slopes, (fold,), dt, Run(steps, method), backend=backend)
+    varied = jax.vmap(cube.values)(u)
+    slopes = jax.vmap(jax.jacfwd(cube.values))(u)
+    found = by_coordinates(cube.cases.scenario, varied, slopes, (fold,), dt, Run(steps, method), backend=backend)
     margin = -found.outcome.metrics["tuning_exact"][:, 0]
     return margin, -found.tangents["tuning_smooth"][:, :, 0], found.outcome.status

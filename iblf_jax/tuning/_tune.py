@@ -147,7 +147,7 @@ def tune(
 
         def on_step(loop: Loop) -> None:
             if checkpoint is not None:
-                save_checkpoint(checkpoint, loop, mark)
+                save_checkpoint(loop, checkpoint, mark)
             _show(shown, loop)
             if callback is not None:
                 callback(loop)

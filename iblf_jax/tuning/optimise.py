@@ -271,7 +271,7 @@ def fingerprint(plan: Plan, shared: Shared, options: Any) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
+def save_checkpoint(loop: Loop, path: str | os.PathLike, mark: str) -> None:
     """Writes the state of a loop, whole or not at all."""
     leaves = jax.tree.leaves(loop.state)
     arrays = {f"state_{i:03d}": np.asarray(x) for i, x in enumerate(leaves)}
