@@ -210,6 +210,11 @@ class Tree:
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
         own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
         mass, inertia, *_ = own.settled(repairs)
+        compensated = float(m.body_gravcomp[body])
+        if compensated and mass:
+            where, expected = f"body {self.bodies[body]!r}: gravcomp", "0: compensation of gravity is not modelled, it is the law's to do"
+            error = checks.fail(where, compensated, expected, "Remove it.")
+            repairs.meet(Fault(where, str(compensated), error, "0: gravity acts on it"))
         second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
         return np.block([[second, mass * p[:, None]], [mass * p[None, :], np.array([[mass]])]])
 
