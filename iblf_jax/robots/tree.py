@@ -295,19 +295,16 @@ def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:
     """Rotation matrix of a quaternion (w, x, y, z) of length one."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 def turn(axis: np.ndarray, angle: float) -> np.ndarray:
     """Rotation about a unit axis."""
-    return matrix(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]))
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def joined(outer: Pose, inner: Pose) -> Pose:
