@@ -204,7 +204,7 @@ with a bad reference gives large numbers and a flag instead of NaN."""
 
 def positive_width(k: jax.Array) -> jax.Array:
     """`k` where it is wider than NARROWEST, else NARROWEST."""
-    return jnp.maximum(k, NARROWEST)
+    return jnp.maximum(checks.as_floats("k", k), NARROWEST)
 
 
 def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration: bool = True) -> Tube:
@@ -220,7 +220,15 @@ def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration:
 
     Returns:
       `Tube`; its ddq_d costs nothing where it is not used, as what is not used is not compiled.
+
+    Raises:
+      ValueError: something that is no reference, no bounds or no time.
     """
+    checks.offers("reference", reference, ("position",), "a reference, as iblf_jax.references.Reference")
+    checks.offers("bounds", bounds, ("lower", "upper"), "bounds, as iblf_jax.bounds.Bounds(lower=..., upper=...)")
+    t = checks.as_floats("t", t)
+    checks.shape_is("t", t, ())
+    acceleration = checks.flag("acceleration", acceleration)
 
     def values(t):
         q_d = reference.position(t)

@@ -31,6 +31,9 @@ LIMITS = ("limit", "positive limit")
 LONGEST = {"field": 200, "value": 160, "words": 800}
 """Characters of an error message's parts: what a user typed may be of any length."""
 
+MOST_JOINTS = 10_000
+"""More than any robot has."""
+
 DEEPEST = 32
 """Lists inside each other that can be an array."""
 
@@ -208,6 +211,24 @@ def conforms(name: str, value: Any, protocol: type, mend: str = "", optional: tu
         raise fail(name, value, expected, " ".join(x for x in (mend, "" if bare else f"It lacks {', '.join(missing)}.") if x))
     if any(leaf is value for leaf in jax.tree.leaves(value)):
         raise fail(name, value, expected, "JAX does not know its class: decorate it with iblf_jax.component.")
+
+
+def offers(name: str, value: Any, methods: tuple[str, ...], expected: str) -> None:
+    """Raises unless `value` is an object, not a class, an array or a word, that has these methods or fields."""
+    bare = value is None or isinstance(value, type | str | bytes | tuple | list | dict) or _is_number_like(value)
+    missing = [x for x in methods if bare or not hasattr(value, x)]
+    if missing:
+        raise fail(name, value, expected, "" if bare else f"It lacks {', '.join(missing)}.")
+
+
+def vectors(n: int | None = None, **named: Any) -> tuple[jax.Array, ...]:
+    """Vectors with one number a joint, (n,), from arguments by name, traced or not; as long as the first if n is not given."""
+    arrays = tuple(as_floats(name, value) for name, value in named.items())
+    shape = np.shape(arrays[0]) if n is None else (n,)
+    for name, array in zip(named, arrays, strict=True):
+        if array.ndim != 1 or array.shape != shape:
+            raise fail(name, array, f"one number a joint, shape {shape if len(shape) == 1 else '(n,)'}", f"Its shape is {array.shape}.")
+    return arrays
 
 
 def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:

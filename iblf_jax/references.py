@@ -97,7 +97,7 @@ class WaypointSpline:
         """Raises ValueError for times that do not increase or do not match the waypoints."""
         try:
             times = np.asarray(self.times, float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             times = np.zeros(0)
         if times.ndim != 1 or times.size < 2 or not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
             raise checks.fail("WaypointSpline.times", self.times, "at least two strictly increasing times [s]")

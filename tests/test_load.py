@@ -6,6 +6,7 @@ import builtins
 import contextlib
 import os
 import re
+import struct
 import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -167,6 +168,83 @@ def test_mjcf_without_gravity(file):
     assert not np.any(ij.robots.load(file(mjcf("").replace("<worldbody>", off)), tip="a").g)
 
 
+CORNERS = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (0.0, 0.3)])
+FACES = np.array(
+    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+)
+"""A box, its corners [m] and its triangles."""
+MESHED = """<mujoco><compiler meshdir="meshes"/><default><mesh scale="0.5 0.5 0.5"/></default>
+<asset><mesh file="box.obj"/><mesh name="cube" file="deep/box.stl" inertia="shell"/><mesh name="unused" file="nowhere.stl"/></asset>
+<worldbody><geom type="mesh" mesh="unused"/>
+<body name="a" pos="0 0 1"><joint name="ja" axis="0 1 0"/>
+  <geom type="mesh" mesh="box" euler="0 20 0"/><geom size="0.05" pos="0 0 .2" mass="1"/>
+  <geom type="mesh" mesh="unused" density="0"/>
+  <body name="b" pos="0 0 .3"><joint name="jb" axis="1 0 0"/>
+    <geom type="mesh" mesh="cube" mass="2"/><geom type="capsule" mesh="box"/>
+    <body name="c" pos="0 .1 0"><inertial mass="1" pos="0 0 0" diaginertia=".1 .1 .1"/><geom type="mesh" mesh="unused"/>
+    </body></body></body>
+<body name="other"><joint name="jo"/><geom type="mesh" mesh="unused"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def meshed(file, tmp_path):
+    """An MJCF whose chain to "c" is weighed by meshes, and whose other body would be by one that is not there."""
+    (tmp_path / "meshes" / "deep").mkdir(parents=True)
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS] + [f"f {i} {j} {k}" for i, j, k in FACES + 1]
+    file("\n".join(lines), "meshes/box.obj")
+    triangles = b"".join(struct.pack("<12fH", 0, 0, 0, *CORNERS[face].ravel(), 0) for face in FACES)
+    (tmp_path / "meshes" / "deep" / "box.stl").write_bytes(bytes(80) + struct.pack("<I", len(FACES)) + triangles)
+    return file(MESHED)
+
+
+def test_meshes_weigh_what_they_weigh_in_mujoco(meshed):
+    arm = ij.robots.load(meshed, tip="c")
+    spec = mujoco.MjSpec.from_file(str(meshed))
+    for body in spec.bodies:
+        for geom in [x for x in body.geoms if x.meshname == "unused"]:
+            spec.delete(geom)
+    spec.delete(spec.mesh("unused"))
+    spec.delete(spec.body("other"))
+    q, v = np.array([0.3, -0.4]), np.array([1.0, -2.0])
+    M, bias = dynamics_of(without_constraints(spec.compile()), q, v)
+    np.testing.assert_allclose(arm.mass_matrix(q), M, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(arm.coriolis(q, v, v) + arm.gravity(q), bias, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "got '.*deep/box.stl'.*Nothing is there.*<inertial>"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "box.stl, expected a surface around a volume.*wrong size.*<inertial>"),
+        (lambda path: path.write_bytes(b""), "empty"),
+        (lambda path: (path.unlink(), os.mkfifo(path)), "not a file"),
+        (lambda path: (path.unlink(), path.mkdir()), "a directory"),
+    ],
+)
+def test_a_mesh_that_cannot_be_weighed_is_a_fault_of_its_body_alone(meshed, tmp_path, damage, message):
+    damage(tmp_path / "meshes" / "deep" / "box.stl")
+    with pytest.raises(ValueError, match=f"body 'b': mesh 'cube': .*{message}"):
+        ij.robots.load(meshed, tip="c")
+    with pytest.raises(ValueError, match=r"body 'other': mesh 'unused': got .*nowhere.stl', .*Nothing is there"):
+        ij.robots.load(meshed, tip="other")
+
+
+def test_meshes_under_their_bare_names_and_of_a_limited_size(meshed, tmp_path, monkeypatch):
+    (tmp_path / "meshes" / "deep" / "box.stl").rename(tmp_path / "meshes" / "box.stl")
+    meshed.write_text(MESHED.replace("<compiler", '<compiler strippath="true"'))
+    assert ij.robots.load(meshed, tip="c").n == 2
+    monkeypatch.setattr("iblf_jax.robots.meshes.LARGEST_MESHES", 700)
+    with pytest.raises(ValueError, match="meshes of at most"):
+        ij.robots.load(meshed, tip="c")
+
+
+def test_mjcf_that_compensates_gravity_is_mended_only_if_asked(file):
+    path = file(mjcf('<body name="b" gravcomp="0.5"><joint/><geom size="0.1" mass="1"/></body>'))
+    with pytest.warns(UserWarning, match="'b': gravcomp: from 0.5 to 0: gravity acts"):
+        arm = ij.robots.load(path, repair=True)
+    assert np.any(np.asarray(arm.g))
+
+
 def test_mjcf_that_includes_another_file(file):
     main = MJCF.format(finger="").replace("<worldbody>", '<include file="more.xml"/><worldbody>')
     file("<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>", "more.xml")
@@ -244,6 +322,12 @@ BAD_MJCF = {
     "ball": (mjcf(f'<body name="b"><joint name="jb" type="ball"/>{SPHERE}</body>'), "joint 'jb'.*ball"),
     "free": (f'<mujoco><worldbody><body name="a"><freejoint name="f"/>{SPHERE}</body></worldbody></mujoco>', "joint 'f'.*free"),
     "mesh": (mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>'), "body 'b'.*mesh"),
+    "missing mesh": (
+        mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'),
+        "body 'b': mesh 'm': got .*m.stl'.*Nothing is there.*<inertial>",
+    ),
+    "height field": (mjcf('<body name="b"><joint/><geom type="hfield" hfield="h"/></body>'), "body 'b'.*height field 'h'"),
+    "compensated gravity": (mjcf(f'<body name="b" gravcomp="1"><joint/>{SPHERE}</body>'), "body 'b': gravcomp: got 1.0.*repair=True"),
     "no mass": (mjcf('<body name="b"><joint/></body>'), "'b'"),
     "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness"),
     "connect": (

@@ -9,6 +9,7 @@ import warnings
 from pathlib import Path
 
 import jax
+import members
 import numpy as np
 import pytest
 from conftest import SHORT
@@ -18,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 from members import FAMILIES
 
 import iblf_jax as ij
-from iblf_jax import checks, metrics, paths, robots, rollout
+from iblf_jax import barriers, bounds, checks, metrics, paths, robots, rollout
 from iblf_jax.pytree import is_leaf_field
 from iblf_jax.scenario import check_values
 from iblf_jax.status import Status
@@ -302,6 +303,71 @@ def test_anything_in_the_place_of_any_argument(entry, paper, no_runs, tmp_path, 
                 assert len(text) < 1500, (name, label)
                 assert "\n" not in text, (name, label)
     assert depth_left(500)  # a deep list that reached JAX would have spoilt the interpreter's count
+
+
+PARTS = {
+    "at_time": (robots.at_time, {"robot": members.TWO_LINK, "t": 0.0}, ("robot",)),
+    "friction_torque": (robots.friction_torque, {"robot": members.TWO_LINK, "dq": [0.1, 0.2]}, ("dq",)),
+    "coriolis_from_mass_matrix": (
+        robots.coriolis_from_mass_matrix,
+        {"mass_matrix": members.TWO_LINK.mass_matrix, "q": [0.1, 0.2], "v": [0.1, 0.2], "u": [0.1, 0.2]},
+        ("q", "v", "u"),
+    ),
+    "mass_matrix_rate": (robots.mass_matrix_rate, {"robot": members.TWO_LINK, "q": [0.1, 0.2], "dq": [0.1, 0.2]}, ("robot", "q", "dq")),
+    "energy_gradient": (robots.energy_gradient, {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]}, ("robot", "q", "v")),
+    "from_energy": (robots.from_energy, {"cls": None}, ("cls",)),
+    "joint_names": (robots.joint_names, {"robot": members.TWO_LINK, "n": 2}, ("n",)),
+    "tube_at": (
+        bounds.tube_at,
+        {"reference": members.REFERENCES["sinusoid"], "bounds": bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(2.0)), "t": 0.1},
+        ("reference", "bounds", "t", "acceleration"),
+    ),
+    "positive_width": (bounds.positive_width, {"k": 1.0}, ("k",)),
+    "guarded_error": (barriers.guarded_error, {"tube": None, "q": [0.1, 0.2], "guard": 1e-3}, ("tube", "q", "guard")),
+    "guard_is_active": (barriers.guard_is_active, {"tube": None, "q": [0.1, 0.2], "guard": 1e-3}, ("tube", "q", "guard")),
+    "splines": (ij.references.WaypointSpline, {"times": (0.0, 1.0), "waypoints": [[0.0], [1.0]]}, ("times", "waypoints")),
+    "objectives.complete": (ij.objectives.complete, {"objective": GOAL, "start": [1.0]}, ("objective", "start")),
+    "objectives.sharper": (ij.objectives.sharper, {"objective": GOAL, "factor": 2.0}, ("objective",)),
+    "objectives.metric": (ij.objectives.metric, {"fold": metrics.Tracking(), "name": "rmse"}, ("fold", "name")),
+    "check_law": (ij.testing.check_law, {"law": members.LAWS["pd_gravity"]}, ("law", "scenario")),
+    "check_robot": (ij.testing.check_robot, {"robot": members.TWO_LINK}, ("robot", "q")),
+    "check_reference": (ij.testing.check_reference, {"reference": members.REFERENCES["sinusoid"]}, ("reference", "n", "duration")),
+    "check_side": (ij.testing.check_side, {"side": bounds.Constant(1.0)}, ("side", "n", "duration")),
+    "check_disturbance": (
+        ij.testing.check_disturbance,
+        {"disturbance": members.DISTURBANCES["step"]},
+        ("disturbance", "plant", "model", "duration"),
+    ),
+    "check_observer": (ij.testing.check_observer, {"observer": members.OBSERVERS["printed"]}, ("observer", "model")),
+    "check_objective": (ij.testing.check_objective, {"objective": GOAL}, ("objective", "scenario", "duration")),
+}
+"""Functions that parts are made of and looked at with: arguments that are fine, and those that anything is put in the place of."""
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.filterwarnings("ignore")
+def test_anything_in_the_place_of_the_arguments_of_a_part(part, paper, monkeypatch):
+    """A ValueError that says what came, or the findings of a checker; what is accepted goes no further than to its first function."""
+    monkeypatch.setattr("iblf_jax.testing._contract.probe", entered)
+    for checker in ("barriers", "laws", "metrics", "observers", "robots", "world", "objectives"):
+        monkeypatch.setattr(f"iblf_jax.testing.{checker}.shape_of", entered)
+    function, arguments, names = PARTS[part]
+    if "tube" in arguments:
+        arguments = {**arguments, "tube": bounds.tube_at(paper.reference, paper.bounds, 0.1)}
+    refused = set()
+    for name in names:
+        for label, value in {**NASTY, "empty": [], "complex": 1j, "matrix": np.ones((2, 3, 4)), "words of words": {"a": 1}}.items():
+            try:
+                function(**(arguments | {name: value}))
+            except (Entered, ij.testing.ContractError):
+                refused.add(name)
+            except ValueError as error:
+                refused.add(name)
+                text = str(error)
+                assert ": got " in text, (name, label, text)
+                assert "\n" not in text, (name, label)
+    assert refused == set(names)
+    assert depth_left(500)
 
 
 def depth_left(n: int) -> bool:

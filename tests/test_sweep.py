@@ -314,6 +314,18 @@ def test_an_empty_grid_is_one_point():
     assert data.attrs["cases"] == 2
 
 
+@pytest.mark.slow
+def test_starts_outside_the_bounds_are_told_from_violations_as_a_study_tells_them(tmp_path):
+    """Some runs start outside and some do not; the store says the same."""
+    ways = {"initial.q": ij.offset(ij.uniform(-0.5, 0.5)), "controller.K2": ij.factor(ij.uniform(0.5, 1.5))}
+    options = {"perturbations": ways, "runs": 64, "seed": 3, "duration": 0.05, "dt": 1e-3}
+    data = ij.sweep(SCENARIO, {}, **options, store=tmp_path / "x.zarr")
+    study = ij.monte_carlo(SCENARIO, ways, runs=64, seed=3, duration=0.05, dt=1e-3)
+    assert 0 < study.started_outside.sum() < 64
+    np.testing.assert_array_equal(data.started_outside.values.ravel(), study.started_outside)
+    assert data.identical(ij.load_sweep(tmp_path / "x.zarr"))
+
+
 def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(ij.StoreError, match="cannot be written"):
@@ -509,3 +521,36 @@ def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, mo
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert cases.table(store=path).identical(table)
+
+
+def handlers() -> list:
+    return [signal.getsignal(number) for number in interrupt.SIGNALS]
+
+
+@pytest.mark.parametrize("event", range(40))
+def test_handlers_are_given_back_wherever_a_second_signal_comes(event, monkeypatch):
+    """Ctrl-C twice at any line of __enter__ and __exit__, which then do not come to their end."""
+    monkeypatch.setattr(sys, "stderr", None)
+    before, files, seen = handlers(), interrupt.StopRequest.__enter__.__code__.co_filename, 0
+
+    def trace(frame, what, value):
+        nonlocal seen
+        if frame.f_code.co_filename != files:
+            return None
+        seen += 1
+        if seen == event + 1:
+            sys.settrace(None)
+            for _ in range(2):
+                signal.raise_signal(signal.SIGINT)
+        return trace
+
+    old = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        with contextlib.suppress(KeyboardInterrupt), interrupt.StopRequest():
+            pass
+        assert handlers() == before
+    finally:
+        sys.settrace(old)
+        for number, handler in zip(interrupt.SIGNALS, before, strict=True):
+            signal.signal(number, handler)

@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax import checks
 from iblf_jax.bounds import Tube
@@ -109,8 +110,14 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
     Returns:
       `GuardedError`: e, beyond and k, (n,) [rad], and dk, the rate of k, (n,) [rad/s].
 
+    Raises:
+      ValueError: something that is no tube, no position that fits it, or no guard.
+
     Source: design of this package; the sides are Zhang & Yan 2024, (3.15).
     """
+    q = _in_tube(tube, q)
+    if checks.is_concrete(guard):
+        check_guard("guarded_error", guard)
     e1 = q - tube.q_d
     above = e1 > 0
     k = jnp.where(above, tube.k_u, tube.k_l)
@@ -118,6 +125,18 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
     edge = (1.0 - guard) * k
     e = jnp.where(jnp.abs(e1) <= edge, e1, jnp.where(above, edge, -edge))
     return GuardedError(e, e1 - e, k, dk)
+
+
+def _in_tube(tube: Tube, q: jax.Array) -> jax.Array:
+    """The position as an array that fits the tube."""
+    if not isinstance(tube, Tube):
+        raise checks.fail("tube", tube, "an iblf_jax.bounds.Tube", "iblf_jax.bounds.tube_at(reference, bounds, t) makes one.")
+    q = checks.as_floats("q", q)
+    try:
+        np.broadcast_shapes(q.shape, jnp.shape(tube.q_d))
+    except ValueError:
+        raise checks.fail("q", q, f"one number a joint, shape {jnp.shape(tube.q_d)}", f"Its shape is {q.shape}.") from None
+    return q
 
 
 def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
@@ -132,7 +151,13 @@ def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
 
     Returns:
       (n,) bool.
+
+    Raises:
+      ValueError: something that is no tube, no position that fits it, or no guard.
     """
+    q = _in_tube(tube, q)
+    if checks.is_concrete(guard) and not (isinstance(guard, float) and guard == -np.inf):
+        check_guard("guard_is_active", guard)
     return jnp.abs(tube.xi(q)) > 1.0 - guard
 
 

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax import checks
+
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
 
 
@@ -113,9 +115,9 @@ class Certificate:
 
     def __getitem__(self, name: str) -> Line:
         for line in self.lines:
-            if line.name == name:
+            if isinstance(name, str) and line.name == name:
                 return line
-        raise KeyError(f"no line {name!r}; there are {', '.join(repr(line.name) for line in self.lines)}")
+        raise KeyError(f"no line {checks.shown(name)}; there are {', '.join(repr(line.name) for line in self.lines)}")
 
     def __repr__(self) -> str:
         rows = [("", "equation", "verdict", "margin", "value", "where the margin is smallest"), *self._rows()]

@@ -64,4 +64,4 @@ def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, readi
 
 def observer_of(name: str, usual: Observer) -> Observer:
     """The observer that belongs to a system: `usual`, or none for the laws that are classical without one."""
-    return NoObserver() if name in _WITHOUT_OBSERVER else usual
+    return NoObserver() if checks.word("name", name, "the name of a law") in _WITHOUT_OBSERVER else usual

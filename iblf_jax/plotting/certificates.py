@@ -116,12 +116,15 @@ def _relative_error(axes: Axes, traces: Traces, joints: tuple[str, ...]) -> None
         for sign in (1, -1):
             text = "bound" if joint == 0 and sign == 1 else "_"
             axes.plot(*thinned(traces.t, sign * traces.xi_bound[:, joint]), label=text, **own)
-    axes.axhspan(1.0, 1.6, color=_style.broken(), linewidth=0, zorder=0)
+    # Names of a robot's file may be long: as many columns as fit, and room above the wall for the rows.
+    columns = int(np.clip(44 // (max(map(len, joints)) + 4), 1, 4 if n > 5 else 3))
+    top = 1.3 + 0.15 * -(-(n + 1) // columns)
+    axes.axhspan(1.0, top, color=_style.broken(), linewidth=0, zorder=0)
     axes.axhspan(-1.08, -1.0, color=_style.broken(), linewidth=0, zorder=0)
-    axes.set_ylim(-1.08, 1.6)
+    axes.set_ylim(-1.08, top)
     _frame(axes, traces.t, r"relative error $\xi$", "1")
     small = {"fontsize": _style.size(6.5), "handlelength": 1.8, "columnspacing": 0.8}
-    axes.legend(loc="upper center", ncols=4 if n > 5 else 3, **LEGEND, **small)
+    axes.legend(loc="upper center", ncols=columns, **LEGEND, **small)
 
 
 def _mark_held(panels: Any, traces: Traces) -> None:
@@ -144,7 +147,7 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
         height = 1.0 - (row + 0.5) / max(len(lines), 12)
         colour = _style.alarm() if line.verdict == "fails" else _style.ink()
         margin = "" if line.margin is None else f"{line.margin:.3g}" + ("" if line.unit == "1" else f" {line.unit}")
-        for x, text in ((0.0, line.name), (0.42, line.equation), (0.6, line.verdict), (0.76, margin)):
-            axes.text(x, height, text, transform=axes.transAxes, color=colour, va="center", fontsize=8 * growth)
+        for x, text in ((0.0, line.name), (0.41, line.equation), (0.56, line.verdict), (0.69, margin)):
+            axes.text(x, height, text, transform=axes.transAxes, color=colour, va="center", fontsize=7 * growth)
     if not lines:
         axes.text(0.5, 0.5, "no claim applies", transform=axes.transAxes, ha="center", va="center")

@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
+from iblf_jax import checks
 from iblf_jax.linalg import inner, matvec
 
 T = TypeVar("T")
@@ -70,11 +71,13 @@ class Robot(Protocol):
 
 def at_time(robot: T, t: jax.Array) -> T:
     """The robot as it is at time t [s]: itself, unless it has a method `at`."""
+    _is_robot(robot)
     return robot.at(t) if hasattr(robot, "at") else robot
 
 
 def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
     """What the joints put against their motion, (n,) [N m], against q' in sign: zero, unless the robot has a method of this name."""
+    (dq,) = checks.vectors(dq=dq)
     return robot.friction_torque(dq) if hasattr(robot, "friction_torque") else jnp.zeros_like(dq)
 
 
@@ -87,7 +90,13 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 
     Returns:
       (n,) [N m].
+
+    Raises:
+      ValueError: something that is no function, or no vectors of one length.
     """
+    if not callable(mass_matrix):
+        raise checks.fail("mass_matrix", mass_matrix, "a function q -> M(q)", "Such as robot.mass_matrix, without brackets.")
+    q, v, u = checks.vectors(q=q, v=v, u=u)
     _, M_along_v = jax.jvp(mass_matrix, (q,), (v,))
     _, M_along_u = jax.jvp(mass_matrix, (q,), (u,))
     energy_gradient = jax.grad(lambda x: inner(u, matvec(mass_matrix(x), v)))(q)
@@ -96,17 +105,26 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 
 def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint 0", "joint 1", ..."""
+    n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
     names = tuple(map(str, getattr(robot, "joints", ())))
     return names if len(names) == n else tuple(f"joint {i}" for i in range(n))
 
 
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:
     """M'(q) = dM/dq . q', (n, n) [kg m^2/s], by jvp."""
+    _is_robot(robot)
+    q, dq = checks.vectors(robot.n, q=q, dq=dq)
     return jax.jvp(robot.mass_matrix, (q,), (dq,))[1]
+
+
+def _is_robot(robot: Any) -> None:
+    checks.offers("robot", robot, ("n", "mass_matrix"), "a robot, as iblf_jax.robots.Robot")
 
 
 def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v, by the robot's own method if it has one."""
+    _is_robot(robot)
+    q, v = checks.vectors(robot.n, q=q, v=v)
     if hasattr(robot, "energy_gradient"):
         return robot.energy_gradient(q, v)
     return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
@@ -120,7 +138,16 @@ def from_energy(cls: type[T]) -> type[T]:
         @ij.component
         @ij.robots.from_energy
         class MyArm: ...
+
+    Raises:
+      ValueError: something that is no class, or a class that lacks what a method is to follow from.
     """
+    sources = {"coriolis": "mass_matrix", "gravity": "potential", "jacobian": "tip"}
+    if not isinstance(cls, type):
+        raise checks.fail("from_energy", cls, "a class", "Write @iblf_jax.robots.from_energy above it.")
+    missing = [source for method, source in sources.items() if not hasattr(cls, method) and not hasattr(cls, source)]
+    if missing:
+        raise checks.fail("from_energy", cls, "a class with mass_matrix(q), potential(q) and tip(q)", f"It lacks {', '.join(missing)}.")
 
     def coriolis(self, q, v, u):
         """C(q, v) u, (n,) [N m], from M(q) by automatic differentiation."""

@@ -2,8 +2,8 @@
 
 A file from elsewhere may be malformed, huge, a bomb of entities, or just not what its ending says.  Here it is read with limits, parsed by
 a parser that knows no entities, and copied: only the elements and attributes that say how links move and what they weigh go on, to the
-library that understands them.  What draws, what collides and what senses stays behind, so no mesh is ever opened, and files that MJCF
-includes are read here, under the same limits.
+library that understands them.  What draws, what collides and what senses stays behind; files that MJCF includes are read here, under
+the same limits.  The only other files are meshes that a body of an MJCF takes its weight from (`meshes`).
 """
 
 from __future__ import annotations
@@ -126,19 +126,24 @@ class _Reader:
         return root
 
     def _bytes(self, path: Path) -> bytes:
-        name, expected = str(path), "the path of a URDF or MJCF file"
-        try:
-            if not path.is_file():
-                found = "It is a directory." if path.is_dir() else "It is not a file." if path.exists() else "Nothing is there."
-                raise checks.fail("path", name, expected, found)
-            with path.open("rb") as file:
-                data = file.read(self.bytes_left + 1)
-        except OSError as error:
-            raise checks.fail("path", name, expected, f"It cannot be read: {error}.") from None
+        data = contents("path", path, self.bytes_left, "the path of a URDF or MJCF file")
         self.bytes_left -= len(data)
         if self.bytes_left < 0:
-            raise checks.fail("path", name, f"a file of at most {LARGEST >> 20} MiB", "A description without meshes is far smaller.")
+            expected = f"a file of at most {LARGEST >> 20} MiB"
+            raise checks.fail("path", str(path), expected, "A description without meshes is far smaller.")
         return data
+
+
+def contents(field: str, path: Path, most: int, expected: str, mend: str = "") -> bytes:
+    """What a file holds, no more than a byte beyond `most`; ValueError, with `field`, unless it is a file that can be read."""
+    try:
+        if not path.is_file():
+            found = "It is a directory." if path.is_dir() else "It is not a file." if path.exists() else "Nothing is there."
+            raise checks.fail(field, str(path), expected, f"{found} {mend}")
+        with path.open("rb") as file:
+            return file.read(most + 1)
+    except OSError as error:
+        raise checks.fail(field, str(path), expected, f"It cannot be read: {error}. {mend}") from None
 
 
 def label(element: ET.Element) -> str:
@@ -147,11 +152,11 @@ def label(element: ET.Element) -> str:
     return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag[:40]}>"
 
 
-def floats(where: str, text: str, count: int | None = None, *, most: float = LARGEST_NUMBER) -> list[float]:
+def floats(where: str, text: str, count: int | None = None, *, most: float = LARGEST_NUMBER, longest: int = 100) -> list[float]:
     """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as expected, finite and below `most`."""
     words = text.split()
     expected = f"{count} numbers" if count and count > 1 else "one number" if count else "numbers"
-    if (count is not None and len(words) != count) or not 1 <= len(words) <= 100:
+    if (count is not None and len(words) != count) or not 1 <= len(words) <= longest:
         raise checks.fail(where, text, expected)
     try:
         values = [float(word) for word in words]

@@ -138,14 +138,7 @@ def _about_centre(P: np.ndarray) -> np.ndarray:
 
 def quaternion(R: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of a rotation matrix, w >= 0."""
-    K = np.array(
-        [
-            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [0.0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
-            [0.0, 0.0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
-            [0.0, 0.0, 0.0, R[2, 2] - R[0, 0] - R[1, 1]],
-        ]
-    )
-    q = np.linalg.eigh(K, UPLO="U")[1][:, -1]
-    q = np.where(np.abs(q) < 1e-15, 0.0, q)
-    return q if q[0] > 0 or (q[0] == 0 and q[np.flatnonzero(q)[0]] > 0) else -q
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
+    return np.where(np.abs(q) < 1e-15, 0.0, q)

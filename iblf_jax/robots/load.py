@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,8 +36,9 @@ def load(
     """The serial arm of a URDF or MJCF file.
 
     Fixed joints are fused; joints that are not between base and tip are locked, and their links' masses and inertias stay, with the link
-    that carries them.  Meshes are neither needed nor opened.  What is wrong with links that the chain does not carry, and with joints that
-    do not move in it, does not matter; nor do moments of inertia that are off by rounding, 1e-6 of them or m (1 um)^2.
+    that carries them.  A mesh is opened only where a body of an MJCF takes its weight from it.  What is wrong
+    with links that the chain does not carry, and with joints that do not move in it, does not matter; nor do moments of inertia that are
+    off by rounding, 1e-6 of them or m (1 um)^2.
 
     With `repair` the rest is mended where a rule says how, with the least change, and listed: with J = V diag(...) V^T an inertia about
     the centre of mass m,
@@ -45,8 +47,9 @@ def load(
 
     the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link, where a link that moves would resist its
     joint with nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and
-    refused else.  A range that is none, and a torque below 0, become no limits; friction below 0 becomes 0; a spring is left out; a joint
-    of the chain that is tied to another (a mimic, a coupling) moves by itself.
+    refused else.  A range that is none, and a torque below 0, become no limits; friction below 0 becomes 0; a spring is left
+    out, and so is MuJoCo's compensation of a body's gravity; a joint of the chain that is tied to another (a mimic, a coupling) moves by
+    itself.
 
     Args:
       path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.
@@ -76,8 +79,8 @@ def load(
         chain = _Chain.picked(tree, base, tip, dict(locked), repairs).following(file, repairs)
         arm = chain.arm(gravity, {}, repairs)
     else:
-        model = mjcf.checked(root)
-        tree = Tree.compiled(model.text, str(path), "world", mjcf.taken_out)
+        model = mjcf.checked(root, Path(path).parent)
+        tree = Tree.compiled(model.text, str(path), "world", model.taken_out)
         arm = _Chain.picked(tree, base, tip, dict(locked), repairs).arm(gravity, model.tendons, repairs)
     if arm.repaired:
         warnings.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".", stacklevel=2)

@@ -210,6 +210,11 @@ class Tree:
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
         own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
         mass, inertia, *_ = own.settled(repairs)
+        compensated = float(m.body_gravcomp[body])
+        if compensated and mass:
+            where, expected = f"body {self.bodies[body]!r}: gravcomp", "0: compensation of gravity is not modelled, it is the law's to do"
+            error = checks.fail(where, compensated, expected, "Remove it.")
+            repairs.meet(Fault(where, str(compensated), error, "0: gravity acts on it"))
         second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
         return np.block([[second, mass * p[:, None]], [mass * p[None, :], np.array([[mass]])]])
 
@@ -290,19 +295,16 @@ def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:
     """Rotation matrix of a quaternion (w, x, y, z) of length one."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 def turn(axis: np.ndarray, angle: float) -> np.ndarray:
     """Rotation about a unit axis."""
-    return matrix(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]))
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def joined(outer: Pose, inner: Pose) -> Pose:

@@ -164,11 +164,13 @@ def _weight(link: ET.Element) -> tuple[Weight, list[float]]:
 
 
 def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
+    from scipy.spatial.transform import Rotation
+
     mass, inertia = _one(inertial, "mass"), _one(inertial, "inertia")
     if mass is None:
         raise checks.fail(f"{where}: inertial", Shown("no <mass>"), "a mass [kg]")
     (kg,) = floats(f"{where}: mass", mass.get("value", ""), 1)
-    centre, (roll, pitch, yaw) = _origin(inertial, f"{where}: inertial")
+    centre, rpy = _origin(inertial, f"{where}: inertial")
     if inertia is None:
         if kg <= 0:
             return judged(where, kg, np.zeros((3, 3))), centre
@@ -176,17 +178,8 @@ def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
         return Weight(kg, fault=Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")), centre
     numbers = (floats(f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1)[0] for name in INERTIA)
     xx, yy, zz, xy, xz, yz = numbers
-    R = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+    R = Rotation.from_euler("xyz", rpy).as_matrix()  # about fixed axes, one after the other
     return judged(where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T), centre
-
-
-def _about(axis: int, angle: float) -> np.ndarray:
-    """Rotation about a coordinate axis."""
-    R, (i, k) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
-    R[i, i] = R[k, k] = np.cos(angle)
-    R[k, i] = np.sin(angle)
-    R[i, k] = -R[k, i]
-    return R
 
 
 def _joint(joint: ET.Element, found: Urdf) -> ET.Element:

@@ -67,6 +67,11 @@ def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Ma
             "flag_meanings": " ".join((f.name or "").lower() for f in flags),
         },
     )
+    if "first_violation_time" in flat:
+        violated = (flat["status"] >= 0) & (flat["status"] & int(Status.BOUND_VIOLATED) != 0)
+        outside = violated & (np.asarray(flat["first_violation_time"]) <= 0)
+        words = "whether the run violated a bound at t = 0 already: it was started there, and no law could keep it"
+        variables["started_outside"] = (dims, outside.reshape(status.shape), {"units": "1", "description": words})
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
 import threading
@@ -11,7 +12,10 @@ from typing import Any
 from iblf_jax._start import end_process
 
 SIGNALS = {signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)), signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,))}
-"""Signals that ask, what they are called, and who handles them where nobody else does.  A cluster sends SIGTERM before it kills."""
+"""Signals that ask, what they are called, and who handles them where nobody else does.  A cluster sends SIGTERM before it kills.
+
+Ctrl-C is the first, as it is what may raise in the middle of anything where nobody handles it: it is taken over first and given back last.
+"""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -30,17 +34,24 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            ours = [number for number, (_, usual) in SIGNALS.items() if signal.getsignal(number) in usual]
-            self._before = {number: signal.signal(number, self._handle) for number in ours}
+            now = {number: signal.getsignal(number) for number in SIGNALS}
+            self._before = {number: now[number] for number, (_, usual) in SIGNALS.items() if now[number] in usual}
+            for number in self._before:
+                signal.signal(number, self._handle)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for number, handler in self._before.items():
+        self._give_back()
+
+    def _give_back(self) -> None:
+        for number, handler in reversed(self._before.items()):
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
+            self._give_back()  # before it raises: that may be inside __enter__ or __exit__, which then do not come to their end
             before = self._before[signal.Signals(number)]
             (before if callable(before) else signal.default_int_handler)(number, frame)
         self.asked = True
-        sys.stderr.write(f"\n{SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand; again to stop at once.\n")
+        with contextlib.suppress(Exception):  # nobody may be there to read it
+            sys.stderr.write(f"\n{SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand; again to stop at once.\n")

@@ -103,7 +103,8 @@ def sweep(
 
     Returns:
       An `xarray.Dataset` of the metrics and `status`, with one dimension for each path of a grid (or "point"), then `run` if there are
-      perturbations, then `joint`; the configuration, seed and versions are in its attributes.
+      perturbations, then `joint`; the configuration, seed and versions are in its attributes.  `started_outside` tells runs that violated
+      a bound at t = 0 already, which no law could keep, from violations of the law; it is there if `first_violation_time` is.
 
     Raises:
       ValueError: bad arguments; the message names the field, the value and the mend.

@@ -15,6 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
+from iblf_jax.presets import zhang_yan_2024
+from iblf_jax.scenario import Scenario
+
 STEP = 1e-6
 """Relative step of the central differences; with float64 they are good to about 1e-9."""
 
@@ -67,14 +71,22 @@ def _is_component(findings: Findings, member: Any) -> None:
     if isinstance(member, type):
         findings.add("it is a class", "Give an instance, with brackets")
         findings.stop_if_any()
-    leaves, structure = jax.tree.flatten(member)
+    try:
+        checks.flat_enough(findings.family, member)
+        leaves, structure = jax.tree.flatten(member)
+    except Exception as error:
+        findings.add(f"JAX cannot take it apart ({type(error).__name__}: {checks.line(str(error))})")
+        findings.stop_if_any()
+        raise
     if any(leaf is member for leaf in leaves):
         findings.add("JAX does not know its class", "Decorate it with @iblf_jax.component, or register it with jax.tree_util")
         findings.stop_if_any()
     for path, leaf in jax.tree_util.tree_leaves_with_path(member):
         numeric = isinstance(leaf, jax.Array | np.ndarray | np.generic | float) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
         mend = "Make it a floating-point array, or declare it with iblf_jax.static if it is structure"
-        findings.require(numeric, f"the leaf {jax.tree_util.keystr(path).lstrip('.')} is {leaf!r}, not a floating-point number", mend)
+        findings.require(
+            numeric, f"the leaf {jax.tree_util.keystr(path).lstrip('.')} is {checks.shown(leaf)}, not a floating-point number", mend
+        )
     try:
         rebuilt = jax.tree.unflatten(structure, [object() for _ in leaves])
         again: Any = jax.tree.structure(rebuilt)
@@ -246,6 +258,15 @@ def _float32(findings, outputs, values, point) -> None:
                 scale = max(1.0, float(np.max(np.abs(values[name]), initial=0)))
                 off = float(np.max(np.abs(np.asarray(value, float) - np.asarray(values[name])), initial=0))
                 findings.require(off <= 5e-3 * scale, f"{name} in float32 is off by {off:.2g}")
+
+
+def scenario_or_the_papers(scenario: Any) -> Scenario:
+    """The scenario to try a member in: the paper's simulation if none is given; ValueError for what is no scenario."""
+    if scenario is None:
+        return zhang_yan_2024()
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", "Such as iblf_jax.presets.zhang_yan_2024().")
+    return scenario
 
 
 def joints_of(member: Any, default: int = 2) -> int:

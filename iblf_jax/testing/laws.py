@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.controllers import Command, Controller
-from iblf_jax.presets import zhang_yan_2024
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario
 from iblf_jax.status import Status
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, scenario_or_the_papers, shape_of
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
 """Where the law is asked for a torque, in xi: a run may get anywhere, and must stay finite there."""
@@ -33,9 +32,11 @@ def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: surroundings that are no scenario.
     """
+    scenario = scenario_or_the_papers(scenario)
     with examine(law, "Controller", Controller) as findings:
-        base = in_dtype(zhang_yan_2024() if scenario is None else scenario, "float64")
+        base = in_dtype(scenario, "float64")
         try:
             base = in_dtype(dataclasses.replace(base, controller=law), "float64")
         except ValueError as error:

@@ -9,11 +9,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
 from iblf_jax.engine.derivatives import Outer
-from iblf_jax.presets import zhang_yan_2024
 from iblf_jax.rollout import simulate
 from iblf_jax.scenario import Scenario
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, joints_of, probe, same_structure, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    examine,
+    has_shape,
+    in_dtype,
+    joints_of,
+    probe,
+    same_structure,
+    scenario_or_the_papers,
+    shape_of,
+)
 from iblf_jax.testing.metrics import LENGTH, at_rest, folded, parts, samples, samples_from
 from iblf_jax.tuning.objectives import Objective, Requirement, complete
 from iblf_jax.tuning.quantities import Quantities, Quantity
@@ -34,7 +44,9 @@ def check_objective(objective: Any, *, scenario: Scenario | None = None, duratio
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: what it is tried on is no scenario, or not for a time.
     """
+    scenario, duration = scenario_or_the_papers(scenario), checks.positive_number("duration", duration, "s")
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
     elif not isinstance(objective, Objective):
@@ -47,7 +59,7 @@ def check_objective(objective: Any, *, scenario: Scenario | None = None, duratio
     with examine(objective, "Objective", Objective) as findings:
         findings.require(objective.quantities, "it has neither terms nor requirements", "Such as ij.objectives.tracking()")
         findings.stop_if_any()
-        _on_a_run(findings, in_dtype(objective, "float64"), zhang_yan_2024() if scenario is None else scenario, duration)
+        _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
 
 
 def _quantity(findings: Findings, quantity: Any, duration: float) -> None:

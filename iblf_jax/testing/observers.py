@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
 from iblf_jax.observers import Observer
 from iblf_jax.presets import customary_two_link
+from iblf_jax.robots import Robot
 from iblf_jax.scenario import fit_joints
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
 
@@ -23,7 +25,10 @@ def check_observer(observer: Any, *, model: Any = None) -> None:
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: a model that is no robot.
     """
+    if model is not None:
+        checks.conforms("model", model, Robot)
     with examine(observer, "Observer", Observer) as findings:
         model = in_dtype(customary_two_link() if model is None else model, "float64")
         n, t = model.n, jnp.asarray(0.7)

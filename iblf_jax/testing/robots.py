@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
 from iblf_jax.robots import Robot, coriolis_from_mass_matrix, mass_matrix_rate
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
 
@@ -26,6 +27,7 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: configurations that are none, or none of this robot.
     """
     with examine(robot, "Robot", Robot) as findings:
         n = robot.n
@@ -34,7 +36,10 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
         findings.stop_if_any()
         robot = in_dtype(robot, "float64")
         rng = np.random.default_rng(1)
-        points = jnp.asarray(rng.uniform(-2, 2, (4, n)) if q is None else np.atleast_2d(np.asarray(q, float)))
+        points = jnp.asarray(rng.uniform(-2, 2, (4, n))) if q is None else jnp.atleast_2d(checks.as_floats("q", q))
+        checks.check_values("q", points, None)
+        if points.ndim != 2 or points.shape[1] != n or not len(points):
+            raise checks.fail("q", points, f"configurations, shape (m, {n})", f"Its shape is {points.shape}.")
         _shapes(findings, robot, points[0])
         findings.stop_if_any()
 

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import checks
 from iblf_jax.bounds import Side
 from iblf_jax.disturbances import Disturbance
 from iblf_jax.presets import customary_two_link
 from iblf_jax.references import Reference
+from iblf_jax.robots import Robot
 from iblf_jax.scenario import fit_joints
 from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, joints_of, probe, shape_of
 
@@ -24,6 +26,12 @@ def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
 
     (value, rate), (_, second) = jax.jvp(first, (t,), (jnp.ones_like(t),))
     return value, rate, second
+
+
+def _surroundings(n: int | None, duration: float) -> tuple[int | None, float]:
+    """Number of joints, if given, and duration of a checker's arguments; ValueError where they are none."""
+    joints = None if n is None else checks.positive_integer("n", n, most=checks.MOST_JOINTS)
+    return joints, checks.positive_number("duration", duration, "s")
 
 
 def _smooth_in_time(findings: Findings, label: str, function: Any, duration: float) -> None:
@@ -51,7 +59,9 @@ def check_reference(reference: Any, *, n: int | None = None, duration: float = 2
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: an argument beside the reference that is none.
     """
+    n, duration = _surroundings(n, duration)
     with examine(reference, "Reference", Reference) as findings:
         t = jnp.asarray(0.3217 * duration)
         fitted = fit_joints(in_dtype(reference, "float64"), joints_of(reference) if n is None else n, "reference")
@@ -78,7 +88,9 @@ def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> No
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: an argument beside the side that is none.
     """
+    n, duration = _surroundings(n, duration)
     with examine(side, "Side", Side) as findings:
         n = joints_of(side) if n is None else n
         t = jnp.asarray(0.3217 * duration)
@@ -109,7 +121,12 @@ def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None,
 
     Raises:
       ContractError: lists what does not hold, with the mend.
+      ValueError: an argument beside the disturbance that is none.
     """
+    _, duration = _surroundings(None, duration)
+    for name, robot in (("plant", plant), ("model", model)):
+        if robot is not None:
+            checks.conforms(name, robot, Robot)
     with examine(disturbance, "Disturbance", Disturbance) as findings:
         plant = in_dtype(customary_two_link() if plant is None else plant, "float64")
         model = plant if model is None else in_dtype(model, "float64")

@@ -155,7 +155,13 @@ def checked(objective: Any) -> Objective:
 
 def is_complete(objective: Objective) -> bool:
     """Whether no scale or limit is missing."""
-    return all(t.scale is not None and (t.limit is not None or t.shape == "plain") for t in objective.terms)
+    return all(t.scale is not None and (t.limit is not None or t.shape == "plain") for t in _composed(objective).terms)
+
+
+def _composed(objective: Any) -> Objective:
+    if not isinstance(objective, Objective):
+        raise checks.fail("objective", objective, "an objective", "Such as ij.objectives.tracking().")
+    return objective
 
 
 def complete(objective: Objective, start: Any) -> Objective:
@@ -165,7 +171,9 @@ def complete(objective: Objective, start: Any) -> Objective:
       objective: as the user composed it.
       start: the exact values of the terms' quantities at the start, (n_terms,).
     """
-    terms = tuple(_completed(t, x) for t, x in zip(objective.terms, start, strict=True))
+    values = np.asarray(checks.as_floats("start", start), float)
+    checks.shape_is("start", values, (len(_composed(objective).terms),))
+    terms = tuple(_completed(t, x) for t, x in zip(objective.terms, values, strict=True))
     return Objective(terms, objective.requirements)
 
 
@@ -190,12 +198,13 @@ def sharper(objective: Objective, factor: float) -> Objective:
             return part
         return dataclasses.replace(part, quantity=dataclasses.replace(part.quantity, smoothing=factor * smoothing))
 
+    objective = _composed(objective)
     return Objective(tuple(map(mended, objective.terms)), tuple(map(mended, objective.requirements)))
 
 
 def is_smoothed(objective: Objective) -> bool:
     """Whether a quantity of the objective is smoothed, so that `sharper` changes it."""
-    return any(getattr(quantity, "smoothing", None) is not None for quantity in objective.quantities)
+    return any(getattr(quantity, "smoothing", None) is not None for quantity in _composed(objective).quantities)
 
 
 def _plain(name: str, quantity: Quantity, scale: Any) -> Objective:
@@ -295,7 +304,7 @@ def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Ob
 
     Source: design of this package.
     """
-    return _plain(str(name), MetricResult(fold, name, joints), scale)
+    return _plain(checks.word("name", name, "the name of one of the fold's results"), MetricResult(fold, name, joints), scale)
 
 
 def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:
