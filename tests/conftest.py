@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 import signal
 import sys
@@ -35,6 +37,21 @@ PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
 
 SHORT = {"duration": 0.5, "dt": 1e-3}
 """A run with every step recorded; used wherever the length does not matter, so that it compiles once."""
+
+
+MEMORY = 2 * 2**30
+"""Bytes of a process from which what it has compiled is let go after a test: what is needed again comes from the cache on disk."""
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory():
+    """Compiled programs of hundreds of tests would take 10 GB a process."""
+    yield
+    statm = Path("/proc/self/statm")
+    if statm.exists() and int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session")

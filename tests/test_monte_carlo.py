@@ -64,6 +64,7 @@ def test_two_devices_and_one_agree_bit_for_bit(study, tmp_path, compiled):
 
 
 def test_a_study_compiles_once_whatever_its_numbers(study):
+    cases.study()
     before = blocks._execute._cache_size()
     stiffer = ij.with_parameters(SCENARIO, {"controller.K2": 30.0})
     ij.monte_carlo(stiffer, cases.perturbations(0.05, 0.01), runs=300, **cases.options() | {"seed": 9})
@@ -72,6 +73,7 @@ def test_a_study_compiles_once_whatever_its_numbers(study):
 
 def test_a_repeated_study_lowers_nothing(study, monkeypatch):
     """Else its second of tracing is longer than many a study, and no second device helps."""
+    cases.study()
     monkeypatch.setattr(execute, "run_all", lambda *_, **__: pytest.fail("lowered again"))
     cases.study(ways=cases.perturbations(0.2, 0.01), seed=8)
 

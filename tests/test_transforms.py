@@ -150,6 +150,7 @@ def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
 
 def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     """Once a structure, a length and a method are compiled, every other value runs the same program."""
+    ij.simulate(paper, **PAPER)
     traces = []
     original = step.advance
     monkeypatch.setattr(step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
