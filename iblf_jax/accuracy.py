@@ -91,14 +91,14 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
 
     Args:
       method: the integrator.
-      jacobian: of the closed loop at the start, by its whole state, (., .) [1/s].
+      jacobian: of the closed loop at the start, by these numbers, (m, m) [1/s].
       state: the state at the start.
     """
-    n, kept = state.q.size, places(state)
+    n = state.q.size
     table = tableau(method)
     none = jnp.zeros((2 * n,), jacobian.dtype)
     pending = (none,) * ((len(table.differences) - 1) // (2 if table.halfway else 1))
-    return Accuracy(pending, none, response(jacobian[kept][:, kept], n), none[:n], none[0])
+    return Accuracy(pending, none, response(jacobian, n), none[:n], none[0])
 
 
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:

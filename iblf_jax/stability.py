@@ -5,12 +5,13 @@ explicit step is stable only while dt times that mode stays inside the method's 
 without any physics behind them.  So every run measures its fastest mode, at its start, where it was nearest to its bound
 (there the barrier is stiffest) and at its end, and says when the step was too large.
 
-The Jacobian comes from central differences of the loop's rate: the rate is compiled as it is, its derivative would take thrice as long.
+Derivatives of the loop are central differences of its rate: the rate is compiled as it is, its derivative would take thrice as long.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,55 +26,63 @@ SLOWEST = 1.0
 """1/s.  A loop slower than this still follows a reference."""
 
 
-def moved(x: jax.Array, index: jax.Array) -> jax.Array:
-    """The `index`-th of the 2 m states around x, (m,), whose rates give the Jacobian: up along every entry, then down."""
-    upward = index < x.size
-    entry = jnp.arange(x.size) == jnp.where(upward, index, index - x.size)
-    return x + jnp.where(entry, jnp.where(upward, 1.0, -1.0) * _size(x), 0.0)
+class Growth(NamedTuple):
+    """State of the power iteration: a direction of length one, and the sum of the last logarithms of its growth."""
+
+    direction: jax.Array
+    total: jax.Array
 
 
-def _size(x: jax.Array) -> jax.Array:
-    """How far each entry is moved, (m,).  Short, as the slope of a barrier changes within the distance to its wall."""
-    return jnp.sqrt(jnp.finfo(x.dtype).eps) * jnp.maximum(1.0, jnp.abs(x))
+def growth_start(x: jax.Array) -> Growth:
+    """A direction that no mode is orthogonal to, for a state (m,)."""
+    start = jnp.cos(jnp.arange(1, x.size + 1, dtype=x.dtype))
+    return Growth(start / jnp.sqrt(jnp.sum(start**2)), jnp.zeros((), x.dtype))
 
 
-def jacobian_from(x: jax.Array, rates: jax.Array) -> jax.Array:
-    """The Jacobian at x, (m, m), entry (i, j) of rate i by number j, from the rates (2 m, m) at the states `moved`."""
-    return ((rates[: x.size] - rates[x.size :]) / (2.0 * _size(x))[:, None]).T
+def grown(growth: Growth, w: jax.Array, iteration: jax.Array) -> Growth:
+    """The growth after one of POWER_ITERATIONS, in which the Jacobian has made w of the direction."""
+    size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(w.dtype).tiny)
+    counted = iteration >= POWER_ITERATIONS - AVERAGED
+    return Growth(w / size, growth.total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size)))
 
 
-def jacobian_by_differences(rate_at: Callable, x: jax.Array) -> jax.Array:
-    """The Jacobian of `rate_at`, (m,) -> (m,), at x, one evaluation at a time."""
-    return jacobian_from(x, jax.lax.map(lambda index: rate_at(moved(x, index)), jnp.arange(2 * x.size)))
+def growth_rate(growth: Growth) -> jax.Array:
+    """The mode that was found, () [1/s].  It is averaged over iterations, so that a pair of complex modes is measured too."""
+    return jnp.exp(growth.total / AVERAGED)
+
+
+def ahead_and_behind(x: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Two states around x, (2, m), and their distance, (), whose rates give the derivative along a direction, (m,).
+
+    """
+    size = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
+    return jnp.stack([x + size * direction, x - size * direction]), 2.0 * size
+
+
+def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
+    """The derivative of `rate_at`, (m,) -> (m,), at x along a direction, one evaluation at a time."""
+    states, distance = ahead_and_behind(x, direction)
+    rates = jax.lax.map(rate_at, states)
+    return (rates[0] - rates[1]) / distance
+
+
+def _flat_rate(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Callable, jax.Array]:
+    x, whole = ravel_pytree(state)
+    return lambda y: ravel_pytree(rate(scenario, t, whole(y)))[0], x
 
 
 @jax.jit
 def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     """The closed loop's Jacobian at (t, state), (m, m) [1/s]."""
-    x, whole = ravel_pytree(state)
-    return jacobian_by_differences(lambda y: ravel_pytree(rate(scenario, t, whole(y)))[0], x)
-
-
-def spectral_radius(matrix: jax.Array) -> jax.Array:
-    """The largest modulus of an eigenvalue of an (m, m) matrix, () [1/s], by power iteration.
-
-    The growth is averaged over the last iterations, so that a pair of complex modes is measured too.
-    """
-    # A direction that no mode is orthogonal to.
-    start = jnp.cos(jnp.arange(1, len(matrix) + 1, dtype=matrix.dtype))
-
-    def iterate(growth, index):
-        direction, total = growth
-        w = jnp.sum(matrix * direction, axis=1)
-        size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(w.dtype).tiny)
-        counted = index >= POWER_ITERATIONS - AVERAGED
-        return (w / size, total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size))), None
-
-    before = (start / jnp.sqrt(jnp.sum(start**2)), jnp.zeros((), matrix.dtype))
-    (_, total), _ = jax.lax.scan(iterate, before, jnp.arange(POWER_ITERATIONS))
-    return jnp.exp(total / AVERAGED)
+    rate_at, x = _flat_rate(scenario, t, state)
+    return jax.lax.map(lambda unit: along(rate_at, x, unit), jnp.eye(x.size, dtype=x.dtype)).T
 
 
 def fastest_mode(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
-    """Spectral radius of the closed loop's Jacobian at (t, state), () [1/s]."""
-    return spectral_radius(jacobian(scenario, t, state))
+    """Spectral radius of the closed loop's Jacobian at (t, state), () [1/s], by power iteration."""
+    rate_at, x = _flat_rate(scenario, t, state)
+
+    def iterate(growth, iteration):
+        return grown(growth, along(rate_at, x, growth.direction), iteration), None
+
+    return growth_rate(jax.lax.scan(iterate, growth_start(x), jnp.arange(POWER_ITERATIONS))[0])

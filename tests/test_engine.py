@@ -47,7 +47,7 @@ def test_every_shape_is_the_same_run(paper, run):
     together = outcome(inputs, run, varied=DRAWS)
     first = outcome(inputs._replace(scenario=ij.with_parameters(inputs.scenario, {"controller.K2": DRAWS["controller.K2"][0]})), run)
     assert_same(jax.tree.map(lambda x: x[0], together), first)
-    for shape in (plan.Shape("together", "parts"), plan.Shape("in turn", "parts")):
+    for shape in (plan.Shape("together", "parts", False), plan.Shape("in turn", "parts", True), plan.Shape("together", "none", True)):
         assert_same(outcome(inputs, run, shape, DRAWS), together)
     whole = jax.jit(lambda inputs: execute._scanned(inputs, None, False, lambda batch: run_all(scan, batch, run)))(inputs)
     assert_same(jax.tree.map(np.asarray, whole), alone)
@@ -106,11 +106,11 @@ def test_stretches_are_whole_records(steps, every):
 
 def test_what_the_plan_says():
     """A short loop alone is one machine function, a long one goes in parts and in turn, and a caller's own batch is XLA's."""
-    assert plan.scan_shape("cpu", 700, None, False) == ("together", "whole")
-    assert plan.scan_shape("cpu", 700, 1000, False) == ("together", "none")
-    assert plan.scan_shape("cpu", 10_000, 1000, False) == ("in turn", "parts")
-    assert plan.scan_shape("cpu", 10_000, None, True) == ("together", "none")
-    assert plan.scan_shape("gpu", 10_000, None, False) == ("together", "none")
+    assert plan.scan_shape("cpu", 700, None, False) == ("together", "whole", True)
+    assert plan.scan_shape("cpu", 700, 1000, False) == ("together", "none", False)
+    assert plan.scan_shape("cpu", 10_000, 1000, False) == ("in turn", "parts", True)
+    assert plan.scan_shape("cpu", 700, None, True) == ("together", "none", False)
+    assert plan.scan_shape("gpu", 10_000, None, False) == ("together", "none", True)
     assert plan.order("auto", "cpu") == plan.order("native", "cpu") == ("native", "xla")
     assert plan.order("auto", "gpu") == ("gpu", "xla")
     assert plan.order("auto", "tpu") == plan.order("xla", "cpu") == ("xla",)

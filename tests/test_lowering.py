@@ -15,7 +15,7 @@ import iblf_jax as ij
 from iblf_jax.engine import execute
 from iblf_jax.engine.batch import Batch, begin, carry_shapes
 from iblf_jax.engine.executors import program_of, scan
-from iblf_jax.engine.step import Inputs, Run, TimeStep
+from iblf_jax.engine.step import Form, Inputs, Run, TimeStep
 from iblf_jax.lowering import program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.identities import FUNCTIONS
@@ -109,7 +109,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name):
     carry = jax.tree.map(lambda x: x[0], carries)
     inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.lane])
     p, _ = program_of(step, run, carries)
-    expected = numbers(jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, rolled=True)[0])(carry)))
+    expected = numbers(jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, Form(rolled=True))[0])(carry)))
     found = evaluate(p, numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index)
     np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
 

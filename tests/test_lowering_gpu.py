@@ -37,7 +37,7 @@ def _has_nvrtc() -> bool:
     return True
 
 
-pytestmark = pytest.mark.filterwarnings("error::iblf_jax.execute.BackendWarning")
+pytestmark = pytest.mark.filterwarnings("error::iblf_jax.engine.execute.BackendWarning")
 needs_nvrtc = pytest.mark.skipif(not _has_nvrtc(), reason="no NVRTC")
 
 

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.accuracy import places
 from iblf_jax.closed_loop import initial_state
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import Shape
-from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Run, TimeStep, jacobians, probed, start, verdict
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, modes, probe_steps, probed, start, verdict
 from iblf_jax.paths import with_parameters
-from iblf_jax.stability import spectral_radius
 
 
 class Leaves(NamedTuple):
@@ -50,7 +50,7 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
     return Leaves(treedef, tuple(touched), [x for x, yes in zip(before, touched, strict=True) if not yes], list(lane))
 
 
-PLAIN = Shape("together", "none")
+PLAIN = Shape("together", "none", False)
 
 
 class Batch(NamedTuple):
@@ -94,14 +94,14 @@ Executor = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
 All arrays have the run axis first, records then the time axis; `every` is None where nothing is recorded."""
 
 
-def jacobians_at(executor: Executor, batch: Batch, at: Callable, *args: Any) -> jax.Array:
-    """The closed loop's Jacobians, (runs, 2, m, m) [1/s], at the two states `at(inputs, *args)` of every run."""
+def _looked_around(executor: Executor, batch: Batch, states: int, at: Callable, *args: Any) -> Probed:
+    """A `Probe` of the first or both states `at(inputs, *args)` of every run."""
     leaves = batch.leaves
     shared, lane = jax.lax.stop_gradient((leaves.shared, leaves.lane))
     batch = batch._replace(leaves=leaves._replace(shared=shared, lane=lane))
     carry = batch.each(at, *jax.lax.stop_gradient(args))
-    _, rates = executor(Probe(), batch, carry, 4 * carry.states.shape[-1], 1)
-    return batch.each(lambda _, carry, rates: jacobians(carry, rates), carry, rates)
+    steps = probe_steps(leaves.together(leaves.shared, [x[0] for x in leaves.lane]).scenario)
+    return executor(Probe(), batch, carry, states * steps, None)[0]
 
 
 def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, jax.Array]:
@@ -111,17 +111,17 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, jax.Arr
         state = initial_state(inputs.scenario)
         return probed([jnp.zeros_like(inputs.dt)] * 2, [state] * 2)
 
-    def one(inputs, jacobian):
-        return start(inputs, method, jacobian[0]), spectral_radius(jacobian[0])
+    def one(inputs, probe):
+        return start(inputs, method, probe.jacobian), modes(probe)[0]
 
-    return batch.each(one, jacobians_at(executor, batch, at_start))
+    return batch.each(one, _looked_around(executor, batch, 1, at_start))
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry."""
 
     def one(inputs):
-        size = sum(x.size for x in jax.tree.leaves(initial_state(inputs.scenario)))
+        size = places(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     return jax.eval_shape(lambda: batch.each(one))
@@ -133,10 +133,10 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, mode: jax.Arra
     def critical(inputs, carry):
         return probed([carry.nearest.t, inputs.dt * run.steps], [carry.nearest.state, carry.state])
 
-    def one(inputs, carry, mode, jacobian):
-        return verdict(inputs, run, carry, jnp.stack([mode, *jax.vmap(spectral_radius)(jacobian)]))
+    def one(inputs, carry, mode, probe):
+        return verdict(inputs, run, carry, jnp.stack([mode, *modes(probe)]))
 
-    return batch.each(one, carry, mode, jacobians_at(executor, batch, critical, carry))
+    return batch.each(one, carry, mode, _looked_around(executor, batch, 2, critical, carry))
 
 
 def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:

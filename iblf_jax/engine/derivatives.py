@@ -26,7 +26,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax import accuracy
 from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
 from iblf_jax.engine.batch import Batch, Executor, begin, end
-from iblf_jax.engine.step import Carry, Inputs, Outcome, Run, advance
+from iblf_jax.engine.step import Carry, Form, Inputs, Outcome, Run, advance
 from iblf_jax.paths import get, with_parameters
 
 FLAGS = ("guard_active", "saturated")
@@ -187,14 +187,14 @@ class DerivativeStep:
     directions: Directions
     is_derivative: ClassVar[bool] = True
 
-    def __call__(self, inputs: Inputs, carry: Differentiated, index: jax.Array, *, rolled: bool, piece: Callable = lambda f: f):
+    def __call__(self, inputs: Inputs, carry: Differentiated, index: jax.Array, form: Form):
         """The carry after the step; nothing is recorded."""
         rows, columns = np.triu_indices(self.directions.tangents)
 
         def one(scenario, before, eps):
-            # In a loop over the stages a Jacobian for a few tangents would cost more than the tangents.
-            loop = evaluate if rolled else preaccumulated(inputs.scenario, self.directions, eps, before.state)
-            after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, rolled, piece, loop)
+            # On arrays a Jacobian for a few tangents would cost more than the tangents.
+            loop = evaluate if not form.scalar else preaccumulated(inputs.scenario, self.directions, eps, before.state)
+            after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
             outer = _outer_of(inputs.folds, begun, sample)
             return (_floats(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
 

@@ -99,8 +99,6 @@ def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], nested: bool
 def _shape(inputs: Inputs, runs: int | None, nested: bool) -> plan.Shape:
     """How the scan executor runs them."""
     platform, zero = jax.default_backend(), jnp.zeros_like(inputs.dt)
-    if platform != "cpu" or nested:
-        return plan.scan_shape(platform, 0, runs, nested)
     operations = length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
     return plan.scan_shape(platform, operations, runs, nested)
 
@@ -185,12 +183,14 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
 def run_plain(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
     """One run that may be batched and differentiated from outside; arguments as `run_one`."""
-    return run_all(scan, Batch.of(_inputs(scenario, folds, dt, run), None), run)
+    inputs = _inputs(scenario, folds, dt, run)
+    return run_all(scan, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 
 def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
     """As `run_plain`, for reverse mode: few states are in memory at a time; `run` records nothing."""
-    return run_all(checkpointed, Batch.of(_inputs(scenario, folds, dt, run), None), run)
+    inputs = _inputs(scenario, folds, dt, run)
+    return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 
 def run_batch_jvp(

@@ -13,16 +13,17 @@ import numpy as np
 from iblf_jax.engine import plan
 from iblf_jax.engine.batch import Batch, Executor, Leaves
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.engine.step import keep_if
+from iblf_jax.engine.step import Form, Probe, keep_if
 from iblf_jax.lowering.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
 
 
 def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
     """All steps of all runs in `jax.lax.scan`: any scenario, any device, and differentiable in either mode."""
-    piece = machine_function if batch.shape.function == "parts" else lambda function: function
+    shape = batch.shape
+    form = Form(shape.rolled, machine_function) if shape.function == "parts" else Form(shape.rolled)
 
     def one(inputs, carry):
-        return _scanned(partial(step, inputs, rolled=True, piece=piece), carry, steps, every)
+        return _scanned(partial(step, inputs, form=form), carry, steps, every)
 
     return batch.each(one, carry)
 
@@ -54,14 +55,14 @@ def checkpointed(step: Any, batch: Batch, carry: Any, steps: int, every: int | N
 
     Only every T^(2/3)-th state is kept; the others are computed again, in three nested loops.
     """
-    if every is not None:
+    if every is not None or isinstance(step, Probe):
         return scan(step, batch, carry, steps, every)
     inner, blocks = plan.checkpoint_edge(steps)
 
     def one(inputs, carry):
         @jax.checkpoint
         def single(carry, index):
-            return keep_if(index < steps, step(inputs, carry, index, rolled=True)[0], carry), None
+            return keep_if(index < steps, step(inputs, carry, index, Form(batch.shape.rolled))[0], carry), None
 
         @jax.checkpoint
         def few(carry, first):
@@ -82,7 +83,7 @@ def _on_leaves(step: Any, treedef, is_lane: tuple[bool, ...], carry_treedef) -> 
 
     def on_leaves(shared, lane, carry, index):
         inputs = Leaves(treedef, is_lane, [], []).together(shared, lane)
-        after, records = step(inputs, jax.tree.unflatten(carry_treedef, carry), index, rolled=False)
+        after, records = step(inputs, jax.tree.unflatten(carry_treedef, carry), index, Form(scalar=True))
         return jax.tree.leaves(after), records
 
     return on_leaves

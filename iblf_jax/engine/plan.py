@@ -57,6 +57,9 @@ class Shape(NamedTuple):
     """"together": in lock step, by vmap; "in turn": one after the other."""
     function: str
     """"whole": all is one machine function; "parts": its parts are one each (closed loop, record and metrics, start, end); "none"."""
+    rolled: bool
+    """Whether the integrator's stages are a loop.  One run as a machine function takes half the time so, and a third to compile; 32 runs
+    take 2.3 times as long, and XLA's own loop over one run three times."""
 
 
 def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -> Shape:
@@ -68,17 +71,16 @@ def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -
       runs: in the batch; None for one run.
       nested: whether a caller may batch, differentiate or loop over the result: XLA refuses machine functions there, or aborts.
     """
-    is_long = operations > LONG_EVALUATION
     if platform != "cpu" or nested:
-        return Shape("together", "none")
-    if is_long:
-        return Shape("in turn", "parts")
-    return Shape("together", "whole" if (runs or 1) <= SMALL_BATCH else "none")
+        return Shape("together", "none", operations > LONG_EVALUATION)
+    if operations > LONG_EVALUATION:
+        return Shape("in turn", "parts", True)
+    return Shape("together", "whole" if (runs or 1) <= SMALL_BATCH else "none", runs is None)
 
 
 def lowered_shape(platform: str, runs: int, nested: bool) -> Shape:
     """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time; for 48 runs XLA refuses a fusion."""
-    return Shape("together", "parts" if platform == "cpu" and runs == 1 and not nested else "none")
+    return Shape("together", "parts" if platform == "cpu" and runs == 1 and not nested else "none", False)
 
 
 def order(backend: str, platform: str) -> tuple[str, ...]:

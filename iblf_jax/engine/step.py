@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Var
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax import accuracy, integrators, stability
@@ -102,23 +104,43 @@ def keep_if(condition, new, old):
 
 
 def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
-    """The carry before the first step; accumulators begin with the first sample, and are blank until then.
+    """The carry before the first step; accumulators that begin with something of the first sample are blank until then.
 
     Args:
       inputs: of the run.
       method: the integrator.
-      jacobian: the closed loop's at the start.
+      jacobian: the closed loop's at the start, by the numbers that `accuracy` watches.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_accumulators, inputs, state))
+    blank = _begun(inputs.folds, _blank_sample(inputs, state))
     there = jax.lax.stop_gradient(state)
     estimate = accuracy.begin(method, jax.lax.stop_gradient(jacobian), there)
     return Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(zero), zero, there), estimate)
 
 
-def _accumulators(inputs: Inputs, state: LoopState) -> tuple:
-    sample = evaluate(inputs.scenario, jnp.zeros_like(inputs.dt), state, inputs.dt)[1]
-    return tuple(fold.init(sample) for fold in inputs.folds)
+def _blank_sample(inputs: Inputs, state: LoopState) -> Sample:
+    """A sample of zeros."""
+    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def _begun(folds: Any, sample: Sample) -> tuple:
+    """The accumulators before a first sample."""
+    return tuple(fold.init(sample) for fold in folds)
+
+
+def _begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple) -> tuple:
+    """The accumulators before an instant: begun with its sample if it is the first.
+
+    What does not depend on the sample was begun by `start`, and costs no choice in every step.
+    """
+    closed, shapes = jax.make_jaxpr(_begun, return_shape=True)(folds, sample)
+    depends = set(closed.jaxpr.invars[-len(jax.tree.leaves(sample)) :])
+    for equation in closed.jaxpr.eqns:
+        if not depends.isdisjoint(x for x in equation.invars if isinstance(x, Var)):
+            depends.update(equation.outvars)
+    chosen = jax.tree.unflatten(jax.tree.structure(shapes), [isinstance(x, Var) and x in depends for x in closed.jaxpr.outvars])
+    return jax.tree.map(lambda yes, new, old: jnp.where(index > 0, old, new) if yes else old, chosen, _begun(folds, sample), accumulators)
 
 
 class Advanced(NamedTuple):
@@ -131,28 +153,40 @@ class Advanced(NamedTuple):
     """Of the folds, before the sample."""
 
 
-def advance(
-    inputs: Inputs, carry: Carry, index: jax.Array, method: str, rolled: bool, piece: Callable, loop: Callable = evaluate
-) -> Advanced:
+def _as_it_is(function: Callable) -> Callable:
+    return function
+
+
+class Form(NamedTuple):
+    """How an executor wants a step to be written."""
+
+    rolled: bool = False
+    """The stages of the integrator as a loop."""
+    piece: Callable = _as_it_is
+    """What is made of a function that is compiled on its own."""
+    scalar: bool = False
+    """Whether it is taken apart into numbers, where equal ones are one."""
+
+
+def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: Form, loop: Callable = evaluate) -> Advanced:
     """One step: observe, integrate, freeze what runs away.
 
     Args:
       inputs, carry: of the run.
       index: number of the instant, () int.
       method: the integrator.
-      rolled: its stages as a loop.
-      piece: what is made of a function that is compiled on its own (`TimeStep`).
+      form: how it is written.
       loop: stands for `closed_loop.evaluate`.
     """
     scenario, _, dt, steps = inputs
     t, moving = index.astype(dt.dtype) * dt, index.astype(dt.dtype) < steps
     covered = jnp.where(moving, dt, jnp.zeros_like(dt))
-    at = piece(loop)
-    stepped = integrators.step(method, lambda t, state: at(scenario, t, state, covered), t, carry.state, dt, rolled=rolled)
+    at = form.piece(loop)
+    stepped = integrators.step(method, lambda t, state: at(scenario, t, state, covered), t, carry.state, dt, rolled=form.rolled)
 
     def folded_in(inputs, carry, index, moving, stepped):
         folds, dt, sample = inputs.folds, inputs.dt, stepped.first
-        begun = keep_if(index > 0, carry.accumulators, tuple(fold.init(sample) for fold in folds))
+        begun = _begun_at(index, folds, sample, carry.accumulators)
         accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
         here = Nearest(near, sample.t, jax.lax.stop_gradient(carry.state))
@@ -165,7 +199,7 @@ def advance(
         status |= flag(~sound & moving, Status.NOT_FINITE)
         return Advanced(Carry(state, accumulators, status, nearest, estimate), sample, begun)
 
-    return piece(folded_in)(inputs, carry, index, moving, stepped)
+    return form.piece(folded_in)(inputs, carry, index, moving, stepped)
 
 
 def record_of(sample: Sample, state: LoopState):
@@ -180,43 +214,77 @@ class TimeStep:
     method: str
     recorded: bool = False
 
-    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, *, rolled: bool, piece: Callable = lambda f: f):
-        """The carry after the step, and what is recorded; `piece` makes of the closed loop a function of its own."""
-        found = advance(inputs, carry, index, self.method, rolled, piece)
+    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, form: Form):
+        """The carry after the step, and what is recorded."""
+        found = advance(inputs, carry, index, self.method, form)
         return found.carry, record_of(found.sample, carry.state) if self.recorded else ()
 
 
 class Probed(NamedTuple):
-    """Two states whose surroundings are looked at; they stay as they are."""
+    """Two states whose surroundings are looked at, and the power iterations of both."""
 
     times: jax.Array
     states: jax.Array
     """(2, m)."""
+    direction: jax.Array
+    """(m,)."""
+    totals: jax.Array
+    """(2,)."""
+    jacobian: jax.Array
+    """By the numbers that `accuracy` watches, at the first state, (m', m') [1/s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """The closed loop's rates at the 4 m states around two of its states, one a step, from which their Jacobians come."""
+    """The closed loop's derivative along a direction, at the first of two states and then at the second.
 
-    def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, *, rolled: bool, piece: Callable = lambda f: f):
-        """The two states again, and a rate, (m,)."""
-        whole = ravel_pytree(initial_state(inputs.scenario))[1]
-        around = 2 * carry.states.shape[1]
-        second = index >= around
-        t, x = (jnp.where(second, pair[1], pair[0]) for pair in carry)
-        moved = stability.moved(x, jnp.where(second, index - around, index))
-        slope, _ = piece(evaluate)(inputs.scenario, t, whole(moved), jnp.zeros_like(inputs.dt))
-        return carry, ravel_pytree(slope)[0]
+    The directions are at first the units of the numbers that `accuracy` watches, then those of the power iteration.
+    """
+
+    def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
+        """The carry after the step; nothing is recorded."""
+        watched, span = accuracy.places(initial_state(inputs.scenario)), probe_steps(inputs.scenario)
+        whole, size = ravel_pytree(initial_state(inputs.scenario))[1], carry.direction.size
+        second = index >= span
+        k = jnp.where(second, index - span, index)
+        iteration = k - watched.size
+        t, x = (jnp.where(second, pair[1], pair[0]) for pair in (carry.times, carry.states))
+
+        rank = np.full(size, -1, np.int32)
+        rank[watched] = np.arange(watched.size)
+        unit = (jnp.asarray(rank) == k).astype(x.dtype)
+        begun = stability.growth_start(x).direction
+        direction = jnp.where(iteration < 0, unit, jnp.where(iteration == 0, begun, carry.direction))
+
+        def rate_at(y):
+            return ravel_pytree(form.piece(evaluate)(inputs.scenario, t, whole(y), jnp.zeros_like(inputs.dt))[0])[0]
+
+        states, distance = stability.ahead_and_behind(x, direction)
+        ahead, behind = [rate_at(y) for y in states] if form.scalar else jax.lax.map(rate_at, states)
+        w = (ahead - behind) / distance
+        total = jnp.where(second, carry.totals[1], carry.totals[0])
+        growth = stability.grown(stability.Growth(direction, total), w, iteration)
+        totals = jnp.stack([jnp.where(second, carry.totals[0], growth.total), jnp.where(second, growth.total, carry.totals[1])])
+        column = (jnp.arange(watched.size) == k) & ~second
+        jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
+        return Probed(carry.times, carry.states, growth.direction, totals, jacobian), ()
+
+
+def probe_steps(scenario: Scenario) -> int:
+    """Steps of a `Probe` for one state."""
+    return accuracy.places(initial_state(scenario)).size + stability.POWER_ITERATIONS
 
 
 def probed(times: list[jax.Array], states: list[LoopState]) -> Probed:
     """The carry of a `Probe` of two states."""
-    return jax.lax.stop_gradient(Probed(jnp.stack(times), jnp.stack([ravel_pytree(x)[0] for x in states])))
+    flat = jnp.stack([ravel_pytree(x)[0] for x in states])
+    zero, watched = jnp.zeros_like(flat[0]), accuracy.places(states[0]).size
+    return jax.lax.stop_gradient(Probed(jnp.stack(times), flat, zero, zero[:1].repeat(2), jnp.zeros((watched, watched), zero.dtype)))
 
 
-def jacobians(carry: Probed, rates: jax.Array) -> jax.Array:
-    """The closed loop's Jacobians at two states, (2, m, m) [1/s], from the rates (4 m, m) of a `Probe`."""
-    return jax.vmap(stability.jacobian_from)(carry.states, rates.reshape(2, -1, rates.shape[-1]))
+def modes(carry: Probed) -> jax.Array:
+    """The modes that a `Probe` has found, (2,) [1/s]."""
+    return jax.vmap(lambda total: stability.growth_rate(stability.Growth(carry.direction, total)))(carry.totals)
 
 
 def verdict(inputs: Inputs, run: Run, carry: Carry, modes: jax.Array) -> Outcome:
