@@ -52,9 +52,7 @@ def growth_rate(growth: Growth) -> jax.Array:
 
 
 def ahead_and_behind(x: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Two states around x, (2, m), and their distance, (), whose rates give the derivative along a direction, (m,).
-
-    """
+    """Two states around x, (2, m), and their distance, (), whose rates give the derivative along a direction, (m,)."""
     size = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
     return jnp.stack([x + size * direction, x - size * direction]), 2.0 * size
 

@@ -13,6 +13,7 @@ from iblf_jax.engine import execute, machine_function, plan
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
 from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.integrators import TABLEAUS, Tableau
 from iblf_jax.metrics import as_folds
 from iblf_jax.scenario import canonical
 from iblf_jax.status import Status
@@ -53,6 +54,21 @@ def test_every_shape_is_the_same_run(paper, run):
     assert_same(jax.tree.map(np.asarray, whole), alone)
     if run.record_every is None:
         assert_same(outcome(inputs, run, executor=checkpointed), alone)
+
+
+@pytest.mark.slow
+def test_any_explicit_method_is_a_row_of_the_table(paper, monkeypatch):
+    """Kutta's 3/8 rule, whose last stages look back at all slopes before them: written out, as a loop, and as a scalar program."""
+    rows = ((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0))
+    kutta = Tableau((0.0, 1 / 3, 2 / 3, 1.0), rows, (1 / 8, 3 / 8, 3 / 8, 1 / 8), 4, 2.785, (1.0, -3.0, 3.0, -1.0))
+    monkeypatch.setitem(TABLEAUS, "kutta", kutta)
+    inputs, run = inputs_of(paper), Run(50, "kutta", 10)
+    written_out, rolled = (outcome(inputs, run, plan.Shape("together", "none", loop)) for loop in (False, True))
+    lowered = outcome(inputs, run, varied={"initial.q": inputs.scenario.initial.q[None]}, executor=execute._executor("xla"))
+    assert_same(written_out, rolled)
+    assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
+    off = np.max(np.abs(written_out.records[0]["q"] - outcome(inputs, Run(50, "rk4", 10)).records[0]["q"]))
+    assert 0 < off < 1e-6
 
 
 @pytest.mark.slow

@@ -179,8 +179,11 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
     native.kernel.cache_clear()
     monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
     del COMPILED["float64", "native", 400, record_every]
-    assert_same(batch(record_every=record_every), whole, 1e-12)
+    cut = batch(record_every=record_every)
     native.kernel.cache_clear()
+    # The mode comes from differences of rates, which magnify the last digit.
+    np.testing.assert_allclose(cut.fastest_mode, whole.fastest_mode, rtol=1e-9)
+    assert_same(cut._replace(fastest_mode=whole.fastest_mode), whole, 1e-12)
 
 
 @pytest.mark.slow

@@ -12,8 +12,9 @@ from iblf_jax.accuracy import places
 from iblf_jax.closed_loop import initial_state
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import Shape
-from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, modes, probe_steps, probed, start, verdict
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, probe_steps, probed, start, verdict
 from iblf_jax.paths import with_parameters
+from iblf_jax.stability import growth_rate
 
 
 class Leaves(NamedTuple):
@@ -94,27 +95,20 @@ Executor = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
 All arrays have the run axis first, records then the time axis; `every` is None where nothing is recorded."""
 
 
-def _looked_around(executor: Executor, batch: Batch, states: int, at: Callable, *args: Any) -> Probed:
-    """A `Probe` of the first or both states `at(inputs, *args)` of every run."""
+def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
+    """What a `Probe` of every run has found."""
     leaves = batch.leaves
     shared, lane = jax.lax.stop_gradient((leaves.shared, leaves.lane))
     batch = batch._replace(leaves=leaves._replace(shared=shared, lane=lane))
-    carry = batch.each(at, *jax.lax.stop_gradient(args))
     steps = probe_steps(leaves.together(leaves.shared, [x[0] for x in leaves.lane]).scenario)
-    return executor(Probe(), batch, carry, states * steps, None)[0]
+    return executor(Probe(), batch, carry, steps, None)[0]
 
 
 def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, jax.Array]:
     """The carry before the first step, and the mode at the start [1/s]."""
-
-    def at_start(inputs):
-        state = initial_state(inputs.scenario)
-        return probed([jnp.zeros_like(inputs.dt)] * 2, [state] * 2)
-
-    def one(inputs, probe):
-        return start(inputs, method, probe.jacobian), modes(probe)[0]
-
-    return batch.each(one, _looked_around(executor, batch, 1, at_start))
+    around = batch.each(lambda inputs: probed(jnp.zeros_like(inputs.dt), initial_state(inputs.scenario)))
+    found = _probed(executor, batch, around)
+    return batch.each(lambda inputs, jacobian: start(inputs, method, jacobian), found.jacobian), growth_rate(found.growth)
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
@@ -131,12 +125,18 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, mode: jax.Arra
     """The outcome after the last step, without records; `mode` is that at the start."""
 
     def critical(inputs, carry):
-        return probed([carry.nearest.t, inputs.dt * run.steps], [carry.nearest.state, carry.state])
+        instants = ((carry.nearest.t, carry.nearest.state), (inputs.dt * run.steps, carry.state))
+        return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant) for instant in instants))
 
-    def one(inputs, carry, mode, probe):
-        return verdict(inputs, run, carry, jnp.stack([mode, *modes(probe)]))
-
-    return batch.each(one, carry, mode, _looked_around(executor, batch, 2, critical, carry))
+    # Both instants of a run are probed as two runs, by the program that probed the start.
+    lane = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.lane]
+    twice = batch._replace(leaves=batch.leaves._replace(lane=lane), runs=2 * (batch.runs or 1))
+    apart = batch.each(critical, carry)
+    if batch.runs is not None:
+        apart = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), apart)
+    found = growth_rate(_probed(executor, twice, apart).growth).reshape(*jnp.shape(mode), 2)
+    modes = jnp.concatenate([mode[..., None], found], axis=-1)
+    return batch.each(lambda inputs, carry, modes: verdict(inputs, run, carry, modes), carry, modes)
 
 
 def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:

@@ -221,70 +221,55 @@ class TimeStep:
 
 
 class Probed(NamedTuple):
-    """Two states whose surroundings are looked at, and the power iterations of both."""
+    """A state whose surroundings are looked at; it stays as it is, so what it decides is computed once."""
 
-    times: jax.Array
-    states: jax.Array
-    """(2, m)."""
-    direction: jax.Array
+    time: jax.Array
+    state: jax.Array
     """(m,)."""
-    totals: jax.Array
-    """(2,)."""
+    growth: stability.Growth
+    """Of the power iteration."""
     jacobian: jax.Array
-    """By the numbers that `accuracy` watches, at the first state, (m', m') [1/s]."""
+    """By the numbers that `accuracy` watches, (m', m') [1/s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """The closed loop's derivative along a direction, at the first of two states and then at the second.
+    """The closed loop's derivative along one direction after the other.
 
     The directions are at first the units of the numbers that `accuracy` watches, then those of the power iteration.
     """
 
     def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
         """The carry after the step; nothing is recorded."""
-        watched, span = accuracy.places(initial_state(inputs.scenario)), probe_steps(inputs.scenario)
-        whole, size = ravel_pytree(initial_state(inputs.scenario))[1], carry.direction.size
-        second = index >= span
-        k = jnp.where(second, index - span, index)
-        iteration = k - watched.size
-        t, x = (jnp.where(second, pair[1], pair[0]) for pair in (carry.times, carry.states))
-
-        rank = np.full(size, -1, np.int32)
+        start = initial_state(inputs.scenario)
+        watched, whole, x = accuracy.places(start), ravel_pytree(start)[1], carry.state
+        iteration = index - watched.size
+        rank = np.full(x.size, -1, np.int32)
         rank[watched] = np.arange(watched.size)
-        unit = (jnp.asarray(rank) == k).astype(x.dtype)
-        begun = stability.growth_start(x).direction
-        direction = jnp.where(iteration < 0, unit, jnp.where(iteration == 0, begun, carry.direction))
+        unit = (jnp.asarray(rank) == index).astype(x.dtype)
+        direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
-            return ravel_pytree(form.piece(evaluate)(inputs.scenario, t, whole(y), jnp.zeros_like(inputs.dt))[0])[0]
+            return ravel_pytree(form.piece(evaluate)(inputs.scenario, carry.time, whole(y), jnp.zeros_like(inputs.dt))[0])[0]
 
         states, distance = stability.ahead_and_behind(x, direction)
         ahead, behind = [rate_at(y) for y in states] if form.scalar else jax.lax.map(rate_at, states)
         w = (ahead - behind) / distance
-        total = jnp.where(second, carry.totals[1], carry.totals[0])
-        growth = stability.grown(stability.Growth(direction, total), w, iteration)
-        totals = jnp.stack([jnp.where(second, carry.totals[0], growth.total), jnp.where(second, growth.total, carry.totals[1])])
-        column = (jnp.arange(watched.size) == k) & ~second
+        growth = keep_if(iteration < 0, carry.growth, stability.grown(carry.growth, w, iteration))
+        column = jnp.arange(watched.size) == index
         jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
-        return Probed(carry.times, carry.states, growth.direction, totals, jacobian), ()
+        return Probed(carry.time, x, growth, jacobian), ()
 
 
 def probe_steps(scenario: Scenario) -> int:
-    """Steps of a `Probe` for one state."""
+    """Steps of a `Probe`."""
     return accuracy.places(initial_state(scenario)).size + stability.POWER_ITERATIONS
 
 
-def probed(times: list[jax.Array], states: list[LoopState]) -> Probed:
-    """The carry of a `Probe` of two states."""
-    flat = jnp.stack([ravel_pytree(x)[0] for x in states])
-    zero, watched = jnp.zeros_like(flat[0]), accuracy.places(states[0]).size
-    return jax.lax.stop_gradient(Probed(jnp.stack(times), flat, zero, zero[:1].repeat(2), jnp.zeros((watched, watched), zero.dtype)))
-
-
-def modes(carry: Probed) -> jax.Array:
-    """The modes that a `Probe` has found, (2,) [1/s]."""
-    return jax.vmap(lambda total: stability.growth_rate(stability.Growth(carry.direction, total)))(carry.totals)
+def probed(time: jax.Array, state: LoopState) -> Probed:
+    """The carry of a `Probe`."""
+    x, watched = ravel_pytree(state)[0], accuracy.places(state).size
+    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype)))
 
 
 def verdict(inputs: Inputs, run: Run, carry: Carry, modes: jax.Array) -> Outcome:

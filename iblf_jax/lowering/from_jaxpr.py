@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 from jax.extend import core
 
-from iblf_jax.lowering.program import Builder, UnsupportedError
-
-Ids = np.ndarray
-"""An array of node numbers, int64, of the shape of the array that it stands for."""
+from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, constants
+from iblf_jax.lowering.rules import RULES
 
 LONGEST_SCAN = 64
 """Steps up to which an inner scan is unrolled."""
@@ -25,29 +23,8 @@ INLINED = {
 }  # fmt: skip
 
 
-def kind_of(dtype) -> str:
-    """The kind "f", "i" or "b" of an array's type; UnsupportedError for others."""
-    if np.issubdtype(dtype, np.floating):
-        return "f"
-    if np.issubdtype(dtype, np.signedinteger):
-        return "i"
-    if dtype == np.bool_:
-        return "b"
-    raise UnsupportedError(f"arrays of type {dtype} are not lowered")
-
-
-def constants(b: Builder, array) -> Ids:
-    """The node numbers of a concrete array."""
-    array = np.asarray(array)
-    kind = kind_of(array.dtype)
-    flat = [b.constant(x, kind) for x in array.ravel().tolist()]
-    return np.asarray(flat, np.int64).reshape(array.shape)
-
-
 def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Ids]) -> list[Ids]:
     """The outputs of a jaxpr, given its constants and inputs as node numbers."""
-    from iblf_jax.lowering.rules import RULES
-
     known: dict[Any, Ids] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
 
     def read(atom):

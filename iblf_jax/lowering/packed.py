@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.lowering.from_jaxpr import closed, kind_of
+from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.passes import with_reciprocals
-from iblf_jax.lowering.program import Builder, Program, UnsupportedError, finished
+from iblf_jax.lowering.program import Builder, Program, UnsupportedError, finished, kind_of
 
 
 class Shapes(NamedTuple):

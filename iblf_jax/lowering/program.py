@@ -27,8 +27,23 @@ INPUTS = ("shared", "lane", "carry", "index")
 """Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step to step, number of the step."""
 
 
+Ids = np.ndarray
+"""An array of node numbers, int64, of the shape of the array that it stands for."""
+
+
 class UnsupportedError(Exception):
     """What a scalar program cannot express; the message is one line for the user."""
+
+
+def kind_of(dtype) -> str:
+    """The kind "f", "i" or "b" of an array's type; UnsupportedError for others."""
+    if np.issubdtype(dtype, np.floating):
+        return "f"
+    if np.issubdtype(dtype, np.signedinteger):
+        return "i"
+    if dtype == np.bool_:
+        return "b"
+    raise UnsupportedError(f"arrays of type {dtype} are not lowered")
 
 
 class Node(NamedTuple):
@@ -90,6 +105,14 @@ class Builder:
             found = self._known[key] = len(self.nodes)
             self.nodes.append(node)
         return found
+
+
+def constants(b: Builder, array) -> Ids:
+    """The node numbers of a concrete array."""
+    array = np.asarray(array)
+    kind = kind_of(array.dtype)
+    flat = [b.constant(x, kind) for x in array.ravel().tolist()]
+    return np.asarray(flat, np.int64).reshape(array.shape)
 
 
 class Program(NamedTuple):

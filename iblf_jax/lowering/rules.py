@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from iblf_jax.lowering.from_jaxpr import Ids, kind_of
-from iblf_jax.lowering.program import Builder, UnsupportedError
+from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, kind_of
 from iblf_jax.lowering.structure import STRUCTURE
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")

@@ -11,8 +11,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from iblf_jax.lowering.from_jaxpr import Ids, constants
-from iblf_jax.lowering.program import Builder, UnsupportedError
+from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, constants
 
 MOST_CHOICES = 64
 """Entries among which indices of the run may choose."""
