@@ -134,7 +134,8 @@ def tune(
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = starting_points(problem.box, starts, seed)
-    evaluator = Evaluator(problem.plan, problem.shared, problem.lanes(z), mode)
+    # The line search of L-BFGS is a loop of JAX's around the problem.
+    evaluator = Evaluator(problem.plan._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
     stages = sharpenings if method_.settles and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)

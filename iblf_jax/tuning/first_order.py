@@ -121,7 +121,7 @@ class LBFGS:
         for s in np.flatnonzero(~state["settled"]).tolist():
             shared, lanes = evaluate.row(s)
             inner = jax.tree.map(lambda x, s=s: jnp.asarray(x[s]), state["inner"])
-            w, inner = self.compiled(shared, lanes, jnp.asarray(state["w"][s]), inner, derive=evaluate.derive.in_a_loop())
+            w, inner = self.compiled(shared, lanes, jnp.asarray(state["w"][s]), inner, derive=evaluate.derive)
             evaluate.evaluations += int(np.asarray(optax.tree.get(inner, "num_linesearch_steps")))
             _put(state["inner"], inner, s)
             state["w"][s] = np.asarray(w)

@@ -99,10 +99,6 @@ class Derive:
         """Value and derivatives of every lane."""
         return self.function(shared, lanes, plan=self.plan)
 
-    def in_a_loop(self) -> Derive:
-        """The same, to be called from a loop of JAX's."""
-        return Derive(self.function, self.plan._replace(nested=True))
-
     def __hash__(self) -> int:
         return hash((self.function, self.plan))
 
