@@ -26,8 +26,9 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.closed_loop import initial_state, rate
+from iblf_jax.engine.execute import run_one
+from iblf_jax.engine.step import Run
 from iblf_jax.metrics import standard
-from iblf_jax.rollout import _run_lowered
 
 
 def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
@@ -80,7 +81,7 @@ def main() -> None:
     compiled, compile_times = {}, {}
     for backend in ("xla", "native"):
         start = time.perf_counter()
-        run = partial(_run_lowered, steps=steps, record_every=1, method="rk4", backend=backend)
+        run = partial(run_one, run=Run(steps, "rk4", 1), backend=backend)
         compiled[backend] = jax.jit(run).lower(scenario, folds, dt).compile()
         compile_times[backend] = time.perf_counter() - start
 

@@ -166,7 +166,7 @@ def test_a_quantity_of_ones_own_passes():
         ({"finish": lambda self, acc: acc}, ("finish(acc)", "(smooth value, exact value, weight for `hessian`)")),
         ({"finish": lambda self, acc: (acc, acc, jnp.ones(2))}, ("the weight of finish(acc)", "shape (2,)")),
         ({"update": lambda self, acc, sample: acc + sample.dq}, ("update(acc, sample)", "carried by a scan")),
-        ({"curvature": lambda self, acc, sample: sample.dq}, ("curvature(acc, sample)", "iblf_jax.derivatives.Outer")),
+        ({"curvature": lambda self, acc, sample: sample.dq}, ("curvature(acc, sample)", "iblf_jax.engine.derivatives.Outer")),
         ({"hessian": lambda self, products, gradient, weight: products[0]}, ("hessian gives shape", "(D, D)")),
         ({"hessian": lambda self, products, gradient, weight: jnp.triu(products)}, ("not symmetric",)),
         ({"finish": lambda self, acc: (jnp.sqrt(acc), acc, acc)}, ("derivative is NaN on a run without any error",)),

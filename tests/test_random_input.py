@@ -138,7 +138,7 @@ def test_arguments_of_simulate(paper, data, value):
     name = data.draw(st.sampled_from(["duration", "dt", "method", "record_every", "metrics", "scenario"]))
     options = {"scenario": paper, **SHORT, name: value}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "_run_lowered", entered)
+        patch.setattr(rollout, "_run_one", entered)
         try:
             accepts_or_value_error(lambda: ij.simulate(options.pop("scenario"), **options))
         except Entered:
