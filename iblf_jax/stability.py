@@ -51,17 +51,11 @@ def growth_rate(growth: Growth) -> jax.Array:
     return jnp.exp(growth.total / AVERAGED)
 
 
-def ahead_and_behind(x: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Two states around x, (2, m), and their distance, (), whose rates give the derivative along a direction, (m,)."""
-    size = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
-    return jnp.stack([x + size * direction, x - size * direction]), 2.0 * size
-
-
 def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
     """The derivative of `rate_at`, (m,) -> (m,), at x along a direction, one evaluation at a time."""
-    states, distance = ahead_and_behind(x, direction)
-    rates = jax.lax.map(rate_at, states)
-    return (rates[0] - rates[1]) / distance
+    size = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
+    rates = jax.lax.map(rate_at, jnp.stack([x + size * direction, x - size * direction]))
+    return (rates[0] - rates[1]) / (2.0 * size)
 
 
 def _flat_rate(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Callable, jax.Array]:

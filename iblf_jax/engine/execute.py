@@ -156,8 +156,8 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
-      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native for short steps where there is a
-        compiler.  What is long or does not lower is, on these two, on scan, without a warning.
+      backend: "native" or "gpu", which fall back with a warning; "xla"; "vmap", which is scan; or "auto", which is native for short
+        steps where there is a compiler.  What is long or does not lower is, on "auto" and "xla", on scan, without a warning.
     """
     inputs = _inputs(scenario, folds, dt, run)
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]})
@@ -170,7 +170,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     if backend in plan.COMPILED.values():
         return with_fallback(backend, run_on, plain)
-    if jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
+    if backend == "vmap" or jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
         return plain()
     name = "native" if backend == "auto" and not native.unavailable() else "xla"
     try:

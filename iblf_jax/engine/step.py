@@ -252,9 +252,7 @@ class Probe:
         def rate_at(y):
             return ravel_pytree(form.piece(evaluate)(inputs.scenario, carry.time, whole(y), jnp.zeros_like(inputs.dt))[0])[0]
 
-        states, distance = stability.ahead_and_behind(x, direction)
-        ahead, behind = [rate_at(y) for y in states] if form.scalar else jax.lax.map(rate_at, states)
-        w = (ahead - behind) / distance
+        w = stability.along(rate_at, x, direction)
         growth = keep_if(iteration < 0, carry.growth, stability.grown(carry.growth, w, iteration))
         column = jnp.arange(watched.size) == index
         jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
