@@ -29,8 +29,8 @@ from throughput import GAINS, chain, draws, textbook
 import iblf_jax as ij
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.step import Run
-from iblf_jax.metrics import standard
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.scenario import canonical
 
 LANES = {
     "float32": {"8.0": 64, "7.0": 64, "7.5": 64},

@@ -25,10 +25,10 @@ from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
-from iblf_jax.closed_loop import initial_state, rate
 from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.step import Run
-from iblf_jax.metrics import standard
+from iblf_jax.simulation.closed_loop import initial_state, rate
+from iblf_jax.simulation.metrics import standard
 
 
 def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:

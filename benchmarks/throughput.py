@@ -34,8 +34,8 @@ from iblf_jax import lowering
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
-from iblf_jax.metrics import standard
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.scenario import canonical
 
 FOLDER = Path(__file__).parent
 GAINS = {name: np.eye(6)[:, 2 * i : 2 * i + 2] for i, name in enumerate(("controller.k1", "controller.K2", "observer.kf"))}

@@ -11,51 +11,54 @@ from iblf_jax import barriers as barriers
 from iblf_jax import bounds as bounds
 from iblf_jax import controllers as controllers
 from iblf_jax import disturbances as disturbances
-from iblf_jax import metrics as metrics
 from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
-from iblf_jax.distributions import choice as choice
-from iblf_jax.distributions import factor as factor
-from iblf_jax.distributions import log_uniform as log_uniform
-from iblf_jax.distributions import normal as normal
-from iblf_jax.distributions import offset as offset
-from iblf_jax.distributions import uniform as uniform
-from iblf_jax.distributions import value as value
+from iblf_jax.core.pytree import astype as astype
+from iblf_jax.core.pytree import component as component
+from iblf_jax.core.pytree import leaf as leaf
+from iblf_jax.core.pytree import static as static
+from iblf_jax.core.status import Status as Status
 from iblf_jax.engine.explain import explain as explain
-from iblf_jax.flat_loop import VectorField as VectorField
-from iblf_jax.flat_loop import vector_field as vector_field
-from iblf_jax.io import load_rollouts as load_rollouts
-from iblf_jax.io import save_rollouts as save_rollouts
-from iblf_jax.paths import parameters as parameters
-from iblf_jax.paths import with_parameters as with_parameters
-from iblf_jax.pytree import astype as astype
-from iblf_jax.pytree import component as component
-from iblf_jax.pytree import leaf as leaf
-from iblf_jax.pytree import static as static
-from iblf_jax.results import Metrics as Metrics
-from iblf_jax.results import Rollout as Rollout
-from iblf_jax.rollout import SimulationError as SimulationError
-from iblf_jax.rollout import SimulationWarning as SimulationWarning
-from iblf_jax.rollout import simulate as simulate
-from iblf_jax.scenario import Initial as Initial
-from iblf_jax.scenario import Scenario as Scenario
-from iblf_jax.scenario import with_parts as with_parts
-from iblf_jax.scenario_file import load_scenario as load_scenario
-from iblf_jax.scenario_file import save_scenario as save_scenario
-from iblf_jax.status import Status as Status
+from iblf_jax.engine.simulate import SimulationError as SimulationError
+from iblf_jax.engine.simulate import SimulationWarning as SimulationWarning
+from iblf_jax.engine.simulate import simulate as simulate
+from iblf_jax.files.rollouts import load_rollouts as load_rollouts
+from iblf_jax.files.rollouts import save_rollouts as save_rollouts
+from iblf_jax.files.scenario import load_scenario as load_scenario
+from iblf_jax.files.scenario import save_scenario as save_scenario
+from iblf_jax.simulation import metrics as metrics
+from iblf_jax.simulation.paths import parameters as parameters
+from iblf_jax.simulation.paths import with_parameters as with_parameters
+from iblf_jax.simulation.results import Metrics as Metrics
+from iblf_jax.simulation.results import Rollout as Rollout
+from iblf_jax.simulation.scenario import Initial as Initial
+from iblf_jax.simulation.scenario import Scenario as Scenario
+from iblf_jax.simulation.scenario import with_parts as with_parts
+from iblf_jax.simulation.vector_field import VectorField as VectorField
+from iblf_jax.simulation.vector_field import vector_field as vector_field
+from iblf_jax.studies.distributions import choice as choice
+from iblf_jax.studies.distributions import factor as factor
+from iblf_jax.studies.distributions import log_uniform as log_uniform
+from iblf_jax.studies.distributions import normal as normal
+from iblf_jax.studies.distributions import offset as offset
+from iblf_jax.studies.distributions import uniform as uniform
+from iblf_jax.studies.distributions import value as value
 
 __version__ = _version("iblf_jax")
 
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates
-    from iblf_jax import distributed as distributed
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
     from iblf_jax.certificates import Certificate as Certificate
     from iblf_jax.certificates import Counterexample as Counterexample
     from iblf_jax.certificates import certify as certify
+    from iblf_jax.files.tuning import load_tuning as load_tuning
+    from iblf_jax.files.tuning import save_tuning as save_tuning
+    from iblf_jax.files.tuning import tune_file as tune_file
+    from iblf_jax.studies import distributed as distributed
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
     from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
@@ -75,9 +78,6 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import pareto as pareto
     from iblf_jax.tuning import tunable as tunable
     from iblf_jax.tuning import tune as tune
-    from iblf_jax.tuning_file import load_tuning as load_tuning
-    from iblf_jax.tuning_file import save_tuning as save_tuning
-    from iblf_jax.tuning_file import tune_file as tune_file
 
 _ON_FIRST_USE = {
     "Attack": ("iblf_jax.tuning", "Attack"),
@@ -88,17 +88,17 @@ _ON_FIRST_USE = {
     "Comparison": ("iblf_jax.studies.comparison", "Comparison"),
     "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
-    "distributed": ("iblf_jax.distributed", None),
+    "distributed": ("iblf_jax.studies.distributed", None),
     "falsify": ("iblf_jax.tuning", "falsify"),
     "Front": ("iblf_jax.tuning", "Front"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
-    "load_tuning": ("iblf_jax.tuning_file", "load_tuning"),
+    "load_tuning": ("iblf_jax.files.tuning", "load_tuning"),
     "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),
     "objectives": ("iblf_jax.tuning.objectives", None),
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
     "recommended_dt": ("iblf_jax.studies.recommended", "recommended_dt"),
-    "save_tuning": ("iblf_jax.tuning_file", "save_tuning"),
+    "save_tuning": ("iblf_jax.files.tuning", "save_tuning"),
     "Sensitivity": ("iblf_jax.studies.sensitivity", "Sensitivity"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),
     "StoreError": ("iblf_jax.studies.store", "StoreError"),
@@ -107,7 +107,7 @@ _ON_FIRST_USE = {
     "testing": ("iblf_jax.testing", None),
     "tunable": ("iblf_jax.tuning", "tunable"),
     "tune": ("iblf_jax.tuning", "tune"),
-    "tune_file": ("iblf_jax.tuning_file", "tune_file"),
+    "tune_file": ("iblf_jax.files.tuning", "tune_file"),
     "TuneResult": ("iblf_jax.tuning", "TuneResult"),
 }
 """Public name -> (module, attribute or None for the module itself): imported when first used, so that `import iblf_jax` stays

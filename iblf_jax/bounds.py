@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
 

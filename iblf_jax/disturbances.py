@@ -18,9 +18,9 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.linalg import matvec
-from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.robots import Robot
 
 

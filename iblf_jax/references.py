@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.linalg import matvec
-from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
 class Reference(Protocol):

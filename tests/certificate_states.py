@@ -10,8 +10,8 @@ import numpy as np
 
 import iblf_jax as ij
 from iblf_jax.certificates.evidence import Evidence, evidence_at
-from iblf_jax.closed_loop import LoopState
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.closed_loop import LoopState
+from iblf_jax.simulation.scenario import canonical
 
 STATES = 4096
 

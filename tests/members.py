@@ -8,7 +8,8 @@ from __future__ import annotations
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, controllers, disturbances, metrics, observers, references, robots
+from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax.simulation import metrics
 
 TWO_LINK = ij.presets.customary_two_link()
 

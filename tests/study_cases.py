@@ -60,7 +60,7 @@ observer.kf = [10.0, 20.0]
 def from_file(text, **more):
     """The sweep of a file, in this process."""
     import iblf_jax as ij
-    from iblf_jax import study_file
+    from iblf_jax.files import study as study_file
 
     file = study_file.study_from_dict(tomllib.loads(text), "sweep")
     return ij.sweep(file.scenario, file.grid, perturbations=file.perturbations, **file.options | more)

@@ -12,15 +12,15 @@ import pytest
 from conftest import SHORT
 
 import iblf_jax as ij
-from iblf_jax import linalg
-from iblf_jax.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.core import linalg
+from iblf_jax.core.status import Status
 from iblf_jax.engine import step_size
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.step import Run
-from iblf_jax.integrators import TABLEAUS
-from iblf_jax.metrics import as_folds
-from iblf_jax.scenario import canonical
-from iblf_jax.status import Status
+from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.simulation.integrators import TABLEAUS
+from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.scenario import canonical
 
 RUNS = 48
 FINER = 16

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from members import TWO_LINK
 
 import iblf_jax as ij
-from iblf_jax.closed_loop import evaluate, initial_state
-from iblf_jax.linalg import solve_spd
+from iblf_jax.core.linalg import solve_spd
 from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.scenario import canonical
 
 mujoco = pytest.importorskip("mujoco")
 

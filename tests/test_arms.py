@@ -11,8 +11,9 @@ import pytest
 from conftest import ROOT
 
 import iblf_jax as ij
-from iblf_jax import arms, bounds, controllers, references
-from iblf_jax.scenario_file import from_dict, scenario_to_dict
+from iblf_jax import bounds, controllers, references
+from iblf_jax.files.scenario import from_dict, scenario_to_dict
+from iblf_jax.presets import arms
 
 RUN = {"duration": 1.0, "dt": 1e-3, "record_every": 4}
 PRESETS = {"ur5": (ij.presets.ur5, 6, "tool0"), "iiwa14": (ij.presets.iiwa14, 7, "iiwa_link_ee")}

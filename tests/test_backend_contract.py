@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.core.status import FAILED
 from iblf_jax.engine import execute
 from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
-from iblf_jax.metrics import as_folds
-from iblf_jax.scenario import canonical
-from iblf_jax.status import FAILED
+from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.scenario import canonical
 
 TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
 STEPS, EVERY, DT, RUNS = 10_000, 250, 1e-3, 6

@@ -17,8 +17,8 @@ from iblf_jax.certificates import Certificate, certify, claims, facts, falsify
 from iblf_jax.certificates.box import eigenvalues_over
 from iblf_jax.certificates.evidence import evidence_at, rounding
 from iblf_jax.certificates.facts import look, starts_of
-from iblf_jax.closed_loop import LoopState, initial_state
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.closed_loop import LoopState, initial_state
+from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
 
 

@@ -17,8 +17,9 @@ import tomli_w
 from conftest import ROOT
 
 import iblf_jax as ij
-from iblf_jax import _start, cli, scenario_file
+from iblf_jax import _start, cli
 from iblf_jax.cli import _claims, _common
+from iblf_jax.files import scenario as scenario_file
 
 SHORT = ["--duration", "0.05", "--dt", "0.001", "--method", "heun"]
 

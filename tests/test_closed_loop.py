@@ -121,7 +121,7 @@ def test_plant_error_is_the_uncertain_term(rng):
 
     import jax
 
-    from iblf_jax.closed_loop import LoopState, evaluate
+    from iblf_jax.simulation.closed_loop import LoopState, evaluate
 
     base = ij.presets.zhang_yan_2024()
     friction = ij.disturbances.Friction(viscous=0.3, coulomb=0.2, width=0.1)

@@ -15,8 +15,9 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax import cli, distributed
+from iblf_jax import cli
 from iblf_jax.cli._studies import UNFINISHED
+from iblf_jax.studies import distributed
 
 
 def free_address():

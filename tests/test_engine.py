@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import rollout
-from iblf_jax.engine import execute, machine_function, plan
+from iblf_jax.core.status import Status
+from iblf_jax.engine import execute, machine_function, plan, simulate
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
 from iblf_jax.engine.step import Inputs, Run
-from iblf_jax.integrators import TABLEAUS, Tableau
-from iblf_jax.metrics import as_folds
-from iblf_jax.scenario import canonical
-from iblf_jax.status import Status
+from iblf_jax.simulation.integrators import TABLEAUS, Tableau
+from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.scenario import canonical
 
 DRAWS = {"controller.K2": jnp.asarray([[20.0, 20.0], [30.0, 25.0], [12.0, 14.0]])}
 
@@ -84,7 +83,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
     """By their length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)
     monkeypatch.setattr(plan, "LONG_EVALUATION", 0)
-    rollout._run_one.clear_cache()
+    simulate._run_one.clear_cache()
     try:
 
         def ise(K2):
@@ -95,7 +94,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
         slope = jax.grad(ise)(K2)
         values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
     finally:
-        rollout._run_one.clear_cache()
+        simulate._run_one.clear_cache()
     np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
     step = 1e-3
     for i in range(2):

@@ -12,7 +12,7 @@ from conftest import ROOT
 from members import LAWS, OBSERVERS
 
 import iblf_jax as ij
-from iblf_jax.closed_loop import initial_state, rate
+from iblf_jax.simulation.closed_loop import initial_state, rate
 
 PAGE = (ROOT / "docs" / "how_to_other_solvers.md").read_text(encoding="utf-8")
 LAW_WITH_MEMORY = {"controller": LAWS["adaptive_rbf"], "observer": OBSERVERS["extended_state"]}

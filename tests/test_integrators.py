@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
-from iblf_jax.closed_loop import initial_state, rate
-from iblf_jax.integrators import TABLEAUS, step, tableau
+from iblf_jax.simulation.closed_loop import initial_state, rate
+from iblf_jax.simulation.integrators import TABLEAUS, step, tableau
 
 methods = pytest.mark.parametrize("method", TABLEAUS)
 

@@ -16,8 +16,9 @@ import xarray
 from conftest import SHORT
 
 import iblf_jax as ij
-from iblf_jax import io, scenario_file
 from iblf_jax.engine.step import RECORDED
+from iblf_jax.files import rollouts
+from iblf_jax.files import scenario as scenario_file
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +32,8 @@ def batch(paper) -> ij.Rollout:
 def test_one_run(short_run):
     data = short_run.to_xarray()
     assert data.sizes == {"time": short_run.t.size, "joint": 2}
-    assert set(io.FIELDS) == set(RECORDED) - {"t"}
-    for name in io.FIELDS:
+    assert set(rollouts.FIELDS) == set(RECORDED) - {"t"}
+    for name in rollouts.FIELDS:
         np.testing.assert_array_equal(data[name], getattr(short_run, name))
     for name in short_run.metrics:
         np.testing.assert_array_equal(data[name], short_run.metrics[name])
@@ -152,7 +153,7 @@ def test_bad_arguments(short_run, tmp_path):
         with pytest.raises(ValueError, match=r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)"):
             ij.save_rollouts(tmp_path / "a.nc", runs)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="jit"):
-        jax.jit(lambda run: io.rollout_to_xarray(run) and 0)(short_run)
+        jax.jit(lambda run: rollouts.rollout_to_xarray(run) and 0)(short_run)
 
 
 @pytest.mark.parametrize("ending", ["nc", "npz"])

@@ -9,9 +9,9 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import controllers, observers
-from iblf_jax.closed_loop import LoopState, evaluate, initial_state, rate
 from iblf_jax.controllers.adaptive_rbf import sobol_centres
-from iblf_jax.pytree import rewrapped, unwrapped
+from iblf_jax.core.pytree import rewrapped, unwrapped
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state, rate
 
 PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
 Q, DQ = jnp.array([0.7, 0.6]), jnp.array([0.4, -0.3])

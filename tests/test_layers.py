@@ -1,15 +1,4 @@
-"""The layers of the package, held by its imports: they go down only.
-
-    6 outside     presets  arms  robot_file  scenario_file  io  codec  plain  plotting/  cli/  testing/
-    5 judgement   certificates/  tuning/
-    4 studies     studies/  distributions  distributed
-    3 the run     integrators  scenario  closed_loop  flat_loop  stability  metrics  results  paths  rollout  engine/  lowering/
-    2 the law     barriers/  observers/  controllers/
-    1 the world   robots/  references  bounds  disturbances
-    0 ground      pytree  linalg  checks  status  drafts  _start
-
-An import inside a function may go up: that is how `run.plot()` finds matplotlib when it is asked for a picture.
-"""
+"""The layers of the package, held by its imports: they go down only.  The table of layers is CONTRIBUTING.md's."""
 
 from __future__ import annotations
 
@@ -22,39 +11,29 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "iblf_jax"
 
-LAYERS = {
-    0: ("pytree", "linalg", "checks", "status", "drafts", "_start"),
-    1: ("robots", "references", "bounds", "disturbances"),
-    2: ("barriers", "observers", "controllers"),
-    3: (
-        "integrators",
-        "scenario",
-        "closed_loop",
-        "flat_loop",
-        "stability",
-        "accuracy",
-        "metrics",
-        "results",
-        "paths",
-        "engine",
-        "rollout",
-        "lowering",
-    ),
-    4: ("studies", "distributions", "distributed"),
-    5: ("certificates", "tuning"),
-    6: (
-        *("presets", "arms", "robot_file", "scenario_file", "study_file", "tuning_file", "io", "codec", "plain"),
-        *("plotting", "cli", "testing", "__main__"),
-    ),
+LAYER_OF = {
+    name.rstrip("/"): int(layer)
+    for layer, names in re.findall(r"^\| (\d) [\w ]+\| (`.*) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    for name in re.findall(r"`([\w/]+)`", names)
 }
-LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
+"""Module or folder at the root of the package -> its layer."""
+
+UPWARD = {
+    "certificates/result.py": {"plotting"},
+    "simulation/results.py": {"files", "plotting"},
+    "studies/comparison.py": {"plotting"},
+    "studies/study.py": {"plotting"},
+    "tuning/_pareto.py": {"plotting"},
+    "tuning/result.py": {"files", "plotting"},
+}
+"""File -> the higher modules that it imports inside a method: `.plot()`, `.save()`, `.to_xarray()`.  There are no others."""
 
 ONLY_IN = {
     "matplotlib": ("plotting",),
     "optax": ("tuning",),
     "argparse": ("cli",),
     "mujoco": ("robots",),
-    "xarray": ("io", "studies", "cli", "plotting"),
+    "xarray": ("files", "studies", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""
 
@@ -88,26 +67,35 @@ def imports(source: str, *, at_the_top: bool) -> set[str]:
     return found
 
 
-def edges(source: str) -> set[str]:
-    """Top-level modules of the package that a file imports at its top."""
-    names = [name.split(".") for name in imports(source, at_the_top=True)]
+def edges(source: str, *, at_the_top: bool = True) -> set[str]:
+    """Modules and folders at the root of the package that a file imports."""
+    names = [name.split(".") for name in imports(source, at_the_top=at_the_top)]
     return {parts[1] for parts in names if parts[0] == "iblf_jax" and len(parts) > 1}
 
 
-def upward(module: str, source: str) -> set[str]:
-    """The modules of a higher layer that a file of `module` imports at its top."""
-    return {name for name in edges(source) if LAYER_OF.get(name, -1) > LAYER_OF[module]}
+def upward(module: str, source: str, *, at_the_top: bool = True) -> set[str]:
+    """The modules of a higher layer that a file of `module` imports."""
+    return {name for name in edges(source, at_the_top=at_the_top) if LAYER_OF.get(name, -1) > LAYER_OF[module]}
 
 
 def test_every_module_has_a_layer():
     unknown = {module_of(path) for path in FILES} - set(LAYER_OF) - {""}
-    assert not unknown, f"say in which layer {unknown} belongs: tests/test_layers.py"
+    assert not unknown, f"say in which layer {unknown} belongs: CONTRIBUTING.md"
+    gone = {name for name in LAYER_OF if not (PACKAGE / name).exists() and not (PACKAGE / f"{name}.py").exists()}
+    assert not gone, f"CONTRIBUTING.md has layers for {gone}, which are not there"
 
 
 @pytest.mark.parametrize("path", [p for p in FILES if module_of(p)], ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_go_down_only(path):
     up = upward(module_of(path), SOURCES[path])
     assert not up, f"{path.name} is in layer {LAYER_OF[module_of(path)]} and imports {up} from above"
+
+
+def test_results_alone_go_up_when_asked():
+    found = {
+        str(path.relative_to(PACKAGE)): upward(module_of(path), text, at_the_top=False) for path, text in SOURCES.items() if module_of(path)
+    }
+    assert {path: names for path, names in found.items() if names} == UPWARD
 
 
 def test_no_cycle_between_modules():
@@ -137,9 +125,9 @@ def calls(source: str, name: str) -> list[int]:
 
 
 def test_time_is_scanned_in_one_place():
-    """lax.scan is a loop over time, which is the engine's; the stages of `integrators`, the steps that `certificates` makes again, the
-    power iteration of `stability`, the elimination of `linalg` and the checkers' own scans are not runs."""
-    allowed = {"engine", "integrators", "certificates", "stability", "linalg", "testing"}
+    """lax.scan is a loop over time, which is the engine's; the stages of integrators and the power iteration of modes (`simulation`), the
+    steps that `certificates` makes again, the elimination of `core.linalg` and the checkers' own scans are not runs."""
+    allowed = {"engine", "simulation", "certificates", "core", "testing"}
     users = {module_of(p) for p, text in SOURCES.items() if calls(text, "jax.lax.scan") or calls(text, "lax.scan")}
     assert users <= allowed, users - allowed
 
@@ -170,12 +158,16 @@ def test_no_leftovers():
 
 
 def test_these_tests_can_fail():
-    assert upward("bounds", "from iblf_jax.rollout import simulate") == {"rollout"}
-    assert upward("bounds", "import iblf_jax.rollout") == {"rollout"}
-    assert upward("bounds", "from iblf_jax import rollout") == {"rollout"}
-    assert upward("results", "def plot(self):\n    from iblf_jax import plotting") == set()
-    assert upward("results", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from iblf_jax import plotting") == set()
-    assert upward("rollout", "from iblf_jax.bounds import Tube") == set()
+    assert LAYER_OF["bounds"] == 1
+    assert LAYER_OF["engine"] == 4
+    assert upward("bounds", "from iblf_jax.engine.simulate import simulate") == {"engine"}
+    assert upward("bounds", "import iblf_jax.engine") == {"engine"}
+    assert upward("bounds", "from iblf_jax import engine") == {"engine"}
+    plot = "def plot(self):\n    from iblf_jax import plotting"
+    assert upward("simulation", plot) == set()
+    assert upward("simulation", plot, at_the_top=False) == {"plotting"}
+    assert upward("simulation", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from iblf_jax import plotting") == set()
+    assert upward("engine", "from iblf_jax.bounds import Tube") == set()
     assert imports("def f():\n    import optax.losses", at_the_top=False) == {"optax.losses"}
     assert calls("import jax\nx = jax.lax.scan(f, 0, None)\njax.config.update('a', 1)", "jax.lax.scan") == [2]
     assert calls("import jax\njax.config.update('a', 1)", "jax.config") == [2]

@@ -20,8 +20,8 @@ from iblf_jax.lowering import program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.identities import FUNCTIONS
 from iblf_jax.lowering.packed import Shapes, pack
-from iblf_jax.metrics import standard
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.scenario import canonical
 
 PRESET = ij.presets.zhang_yan_2024()
 DT = 1e-3

@@ -17,8 +17,8 @@ from iblf_jax.engine import execute, native, plan
 from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
-from iblf_jax.metrics import as_folds, standard
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.metrics import as_folds, standard
+from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Integral, Peak, Quantities
 
 

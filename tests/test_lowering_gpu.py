@@ -25,8 +25,8 @@ from iblf_jax.lowering import nvrtc
 from iblf_jax.lowering.emit_c import CUDA, Layout, source
 from iblf_jax.lowering.packed import Shapes, pack
 from iblf_jax.lowering.toolchain import ToolchainError
-from iblf_jax.metrics import standard
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.scenario import canonical
 
 
 def _has_nvrtc() -> bool:

@@ -13,8 +13,8 @@ import study_cases as cases
 from scipy import stats
 
 import iblf_jax as ij
+from iblf_jax.core.status import FAILED, Status
 from iblf_jax.engine import execute
-from iblf_jax.status import FAILED, Status
 from iblf_jax.studies import blocks, statistics
 
 SCENARIO = ij.presets.zhang_yan_2024()

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.testing import ContractError
 from iblf_jax.testing.metrics import folded, samples
 from iblf_jax.tuning import quantities
 from iblf_jax.tuning.quantities import MetricResult, Quantities
-from iblf_jax.tuning_file import load_tuning_file
 
 TUNING = {"duration": 0.5, "dt": 1e-3, "report_runs": 1}
 

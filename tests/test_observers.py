@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.closed_loop import LoopState, evaluate
 from iblf_jax.observers import Momentum, NoObserver, Printed
 from iblf_jax.robots import mass_matrix_rate
+from iblf_jax.simulation.closed_loop import LoopState, evaluate
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_the_momentum_observer_finds_a_constant_torque():
             return dq, ddq, observer.derivative(t, q, dq, tau, model, eta)
 
         def one(x, i):
-            from iblf_jax.integrators import step
+            from iblf_jax.simulation.integrators import step
 
             t = i * 1e-3
             return step("rk4", lambda t, x: (slope(t, x), None), t, x, 1e-3).state, f - observer.estimate(t, x[0], x[1], model, x[2])

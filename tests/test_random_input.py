@@ -19,10 +19,13 @@ from hypothesis.extra import numpy as hnp
 from members import FAMILIES
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, checks, metrics, paths, robots, rollout
-from iblf_jax.pytree import is_leaf_field
-from iblf_jax.scenario import check_values
-from iblf_jax.status import Status
+from iblf_jax import barriers, bounds, robots
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.core.status import Status
+from iblf_jax.engine import simulate
+from iblf_jax.simulation import metrics, paths
+from iblf_jax.simulation.scenario import check_values
 
 SCALARS = st.one_of(
     st.floats(),
@@ -138,7 +141,7 @@ def test_arguments_of_simulate(paper, data, value):
     name = data.draw(st.sampled_from(["duration", "dt", "method", "record_every", "metrics", "scenario"]))
     options = {"scenario": paper, **SHORT, name: value}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "_run_one", entered)
+        patch.setattr(simulate, "_run_one", entered)
         try:
             accepts_or_value_error(lambda: ij.simulate(options.pop("scenario"), **options))
         except Entered:
@@ -267,7 +270,7 @@ TIMED = ("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "
 def no_runs(monkeypatch):
     """Whatever would run raises Entered."""
     for place in (
-        "rollout._run_one",
+        "engine.simulate._run_one",
         "studies.blocks._execute",
         "studies.setup._execute",
         "tuning._tune.slope",

@@ -10,11 +10,11 @@ import pytest
 from conftest import ROOT
 
 import iblf_jax as ij
-from iblf_jax import scenario_file
 from iblf_jax.cli import main
 from iblf_jax.controllers import Saturated
-from iblf_jax.study_file import load_study_file
-from iblf_jax.tuning_file import load_tuning_file
+from iblf_jax.files import scenario as scenario_file
+from iblf_jax.files.study import load_study_file
+from iblf_jax.files.tuning import load_tuning_file
 
 pytest.importorskip("mujoco")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax import integrators
 from iblf_jax.robots import PlanarChain, TwoLink, mass_matrix_rate
+from iblf_jax.simulation import integrators
 
 
 def random_links(n, rng):
@@ -126,7 +126,7 @@ def test_payload_hangs_at_the_tip(rng):
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])
 def test_small_algebra_against_numpy(n, rng):
-    from iblf_jax.linalg import cholesky, solve_spd
+    from iblf_jax.core.linalg import cholesky, solve_spd
 
     A = rng.normal(size=(n, n))
     A = A @ A.T + 0.1 * np.eye(n)

@@ -18,7 +18,7 @@ import pytest
 import tomli_w
 
 import iblf_jax as ij
-from iblf_jax import scenario_file
+from iblf_jax.files import scenario as scenario_file
 
 
 def assert_equal(a: ij.Scenario, b: ij.Scenario) -> None:

@@ -11,7 +11,7 @@ import pytest
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.core.status import FAILED, Status, describe
 
 
 def quiet(scenario, **options) -> ij.Rollout:
@@ -93,8 +93,8 @@ def test_recommended_dt_and_the_measured_mode(paper, short_run):
 def test_the_fastest_mode_is_the_spectral_radius(paper):
     from jax.flatten_util import ravel_pytree
 
-    from iblf_jax.closed_loop import initial_state, rate
-    from iblf_jax.stability import fastest_mode
+    from iblf_jax.simulation.closed_loop import initial_state, rate
+    from iblf_jax.simulation.stability import fastest_mode
 
     state = initial_state(paper)
     flat, unravel = ravel_pytree(state)

@@ -14,9 +14,10 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax import cli, distributions, study_file
-from iblf_jax.studies import store
-from iblf_jax.tuning_file import load_tuning_file
+from iblf_jax import cli
+from iblf_jax.files import study as study_file
+from iblf_jax.files.tuning import load_tuning_file
+from iblf_jax.studies import distributions, store
 
 STUDY, SWEEP = cases.STUDY, cases.SWEEP
 CALM = SWEEP.replace("std = 0.05", "std = 0.001").replace("300", "3")

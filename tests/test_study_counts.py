@@ -11,7 +11,7 @@ import study_cases as cases
 
 import iblf_jax as ij
 from iblf_jax import Status
-from iblf_jax.status import FAILED
+from iblf_jax.core.status import FAILED
 from iblf_jax.studies import monte_carlo, progress, sensitivity
 
 

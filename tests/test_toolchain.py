@@ -17,7 +17,8 @@ import jax
 import pytest
 from conftest import ROOT
 
-from iblf_jax import cli, drafts
+from iblf_jax import cli
+from iblf_jax.core import drafts
 from iblf_jax.engine import execute, native
 from iblf_jax.lowering import nvrtc, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError

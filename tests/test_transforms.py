@@ -11,9 +11,8 @@ import pytest
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax import rollout
-from iblf_jax.engine import execute, step
-from iblf_jax.status import Status
+from iblf_jax.core.status import Status
+from iblf_jax.engine import execute, simulate, step
 
 PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")
 NOMINAL = (2.0, 20.0, 0.1, 20.0, 1.5, 0.8, 0.0, 0.0)
@@ -154,7 +153,7 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     traces = []
     original = step.advance
     monkeypatch.setattr(step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
-    before = rollout._run_one._cache_size()
+    before = simulate._run_one._cache_size()
     for changes in (
         {"controller.K2": 30.0},
         {"plant.mass[1]": 1},
@@ -167,7 +166,7 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     ij.simulate(fresh, **PAPER)
     ij.simulate(fresh, **PAPER, throw=True)
     assert traces == []
-    assert rollout._run_one._cache_size() == before
+    assert simulate._run_one._cache_size() == before
 
 
 def test_a_new_structure_does_recompile(paper, monkeypatch):

@@ -16,8 +16,8 @@ import iblf_jax as ij
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import run_plain
 from iblf_jax.engine.step import Inputs, Run
-from iblf_jax.metrics import standard
-from iblf_jax.scenario import canonical
+from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import _tune, problem
 from iblf_jax.tuning.newton import box_step
 from iblf_jax.tuning.optimise import Evaluator, Loop, load_checkpoint, save_checkpoint

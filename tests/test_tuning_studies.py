@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.paths import get
+from iblf_jax.simulation.paths import get
 from iblf_jax.tuning._pareto import Front, non_dominated
 from iblf_jax.tuning.result import TuneResult
 

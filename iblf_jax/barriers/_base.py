@@ -22,9 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.bounds import Tube
-from iblf_jax.pytree import Leaf
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf
 
 GUARD = 1e-3
 """Default distance from the wall, in xi, at which the guard takes over."""

@@ -8,7 +8,7 @@ from typing import ClassVar
 import jax
 
 from iblf_jax.bounds import Tube
-from iblf_jax.pytree import component
+from iblf_jax.core.pytree import component
 
 
 @component

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from iblf_jax.barriers._base import GUARD, check_guard, guarded_error
 from iblf_jax.barriers._series import sinc
 from iblf_jax.bounds import Tube
-from iblf_jax.pytree import component, static
+from iblf_jax.core.pytree import component, static
 
 
 @component

@@ -9,16 +9,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.facts import Facts, Whole, look, same_structure, same_tree
 from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed
-from iblf_jax.results import Rollout
+from iblf_jax.core import checks
+from iblf_jax.engine.simulate import simulate
 from iblf_jax.robots import joint_names
-from iblf_jax.rollout import simulate
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
 
 WORST = 16
 RECORDED = 20_000

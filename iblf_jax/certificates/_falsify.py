@@ -22,15 +22,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.box import maximise
 from iblf_jax.certificates.evidence import evidence_at
-from iblf_jax.closed_loop import initial_state
-from iblf_jax.distributions import Perturbation
-from iblf_jax.paths import with_parameters
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.core import checks
+from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import bounded
+from iblf_jax.studies.distributions import Perturbation
 
 
 class Counterexample(NamedTuple):

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from iblf_jax.controllers import Backstepping
 from iblf_jax.observers import Momentum, Printed
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario
 
 CASES = (1, 2)
 LOWEST_KF = {1: 0.5, 2: 1.0}

@@ -26,12 +26,12 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.certificates.claims import law_of
-from iblf_jax.closed_loop import LoopState, Sample, evaluate, rate
 from iblf_jax.controllers import Backstepping
-from iblf_jax.integrators import step
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, rate
+from iblf_jax.simulation.integrators import step
+from iblf_jax.simulation.scenario import Scenario
 
 ROUNDING = 2.0
 """Units of the last place by which V2' may be off, relative to the sizes of its terms; 0.1 is the most that was seen (tests)."""

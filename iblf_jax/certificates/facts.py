@@ -25,8 +25,8 @@ from iblf_jax.certificates import claims
 from iblf_jax.certificates.box import Extremes, eigenvalues_over
 from iblf_jax.certificates.evidence import rounding
 from iblf_jax.certificates.retrace import DISBELIEVED, Stretch, believed, check_status, grid, stretches
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import describe
+from iblf_jax.core.status import describe
+from iblf_jax.simulation.scenario import Scenario
 
 NOISE = 32.0
 """Units of the last place by which sqrt(2 V2) may be off, relative to the sizes of its terms."""

@@ -19,8 +19,8 @@ from iblf_jax.certificates import claims
 from iblf_jax.certificates.facts import Facts, Whole
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
 from iblf_jax.certificates.retrace import STRETCH
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status
+from iblf_jax.core.status import Status
+from iblf_jax.simulation.scenario import Scenario
 
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 RHO = {1: "(3.19)", 2: "(3.27)"}

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
 

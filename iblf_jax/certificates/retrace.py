@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.certificates.evidence import along_run
-from iblf_jax.closed_loop import LoopState, evaluate, initial_state
-from iblf_jax.integrators import step
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status, describe
+from iblf_jax.core import checks
+from iblf_jax.core.status import Status, describe
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation.integrators import step
+from iblf_jax.simulation.scenario import Scenario
 
 STRETCH = 1024
 """Steps that are looked at together: memory does not grow with the length of a run, and one program serves every length."""

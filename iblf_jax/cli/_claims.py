@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.status import Status
+from iblf_jax.core.status import Status
 
 if TYPE_CHECKING:
-    from iblf_jax.results import Rollout
+    from iblf_jax.simulation.results import Rollout
 
 Pair = Mapping[str, "Rollout"]
 """The two runs by name: the integral form first, then the logarithmic one."""

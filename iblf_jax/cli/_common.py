@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from iblf_jax.results import Rollout
-    from iblf_jax.scenario_file import ScenarioFile
+    from iblf_jax.files.scenario import ScenarioFile
+    from iblf_jax.simulation.results import Rollout
 
 RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "record_every": 1}
 """How a scenario is run if neither the command line nor its file says."""
@@ -49,10 +49,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 def scenario_of(args: argparse.Namespace) -> ScenarioFile:
     """The scenario that the arguments name, with their changes, and the [run] table of its file."""
-    from iblf_jax.paths import with_parameters
-    from iblf_jax.plain import numbers
+    from iblf_jax.files.scenario import ScenarioFile, from_dict, load_scenario_file
+    from iblf_jax.files.values import numbers
     from iblf_jax.presets import PRESETS
-    from iblf_jax.scenario_file import ScenarioFile, from_dict, load_scenario_file
+    from iblf_jax.simulation.paths import with_parameters
 
     words = assignments("--arg", args.arg)
     if args.scenario in PRESETS:
@@ -71,7 +71,7 @@ def scenario_of(args: argparse.Namespace) -> ScenarioFile:
 
 
 def _check_exists(name: str) -> None:
-    from iblf_jax.plain import did_you_mean
+    from iblf_jax.files.values import did_you_mean
     from iblf_jax.presets import PRESETS
 
     if not Path(name).is_file():
@@ -81,8 +81,8 @@ def _check_exists(name: str) -> None:
 
 def assignments(option: str, words: list[str]) -> dict[str, Any]:
     """NAME=VALUE words as a dict; values are TOML, and a bare word is a string."""
-    from iblf_jax import checks
-    from iblf_jax.plain import toml_tables
+    from iblf_jax.core import checks
+    from iblf_jax.files.values import toml_tables
 
     values = {}
     for word in words:
@@ -141,7 +141,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def verdict(run: Rollout) -> dict[str, Any]:
     """Status and metrics of one run, for JSON."""
-    from iblf_jax.status import Status, describe
+    from iblf_jax.core.status import Status, describe
 
     status = Status(int(run.status))
     return {

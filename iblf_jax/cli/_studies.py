@@ -42,8 +42,9 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
     """
     import jax
 
-    from iblf_jax import checks, distributed
     from iblf_jax.cli import INTERRUPTED, complain
+    from iblf_jax.core import checks
+    from iblf_jax.studies import distributed
     from iblf_jax.studies.store import StoreError, StoreWriteError
 
     _check_out(args.out)
@@ -82,7 +83,7 @@ def _check_out(name: str | None) -> None:
 
 def write_netcdf(data: xarray.Dataset, name: str | None) -> None:
     """Writes the file of --out, on the first process."""
-    from iblf_jax import distributed
+    from iblf_jax.studies import distributed
 
     if name is not None and distributed.rank() == 0:
         data.to_netcdf(name, engine="scipy")

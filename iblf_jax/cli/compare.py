@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any]) -> None:
     import iblf_jax
     from iblf_jax import plotting
-    from iblf_jax.io import save_rollouts
+    from iblf_jax.files.rollouts import save_rollouts
 
     (folder / "comparison.txt").write_text(f"{result!r}\n", encoding="utf-8")
     result.to_pandas().to_csv(folder / "comparison.csv")

@@ -31,9 +31,9 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
     def work(how: dict[str, Any]) -> int:
-        from iblf_jax import distributed
+        from iblf_jax.files.study import load_study_file
+        from iblf_jax.studies import distributed
         from iblf_jax.studies.monte_carlo import monte_carlo
-        from iblf_jax.study_file import load_study_file
 
         file = load_study_file(args.file, "study")
         given = {key: getattr(args, key) for key in ("runs", "seed") if getattr(args, key) is not None}

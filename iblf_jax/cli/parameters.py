@@ -20,7 +20,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.paths import parameters
+    from iblf_jax.simulation.paths import parameters
 
     print(repr(parameters(scenario_of(args).scenario)))
     return 0

@@ -24,8 +24,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._common import assignments
+    from iblf_jax.files.scenario import preset_scenario, scenario_to_toml
     from iblf_jax.presets import PRESETS
-    from iblf_jax.scenario_file import preset_scenario, scenario_to_toml
 
     if args.name is None:
         if args.toml or args.arg:

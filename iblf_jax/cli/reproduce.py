@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from iblf_jax.cli._claims import Claim
-    from iblf_jax.results import Rollout
+    from iblf_jax.simulation.results import Rollout
 
 NAMES = {"integral": "integral BLF", "log": "log-BLF"}
 """Law of the preset -> name of the run in tables, figures and files."""
@@ -43,7 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._claims import paper_claims, remark
-    from iblf_jax.status import FAILED, describe
+    from iblf_jax.core.status import FAILED, describe
 
     begin = time.perf_counter()
     folder = output_folder(args.out)
@@ -65,8 +65,8 @@ def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[s
     """Both runs, each done twice: the first call compiles, the second is timed for what a run costs."""
     import jax
 
+    from iblf_jax.engine.simulate import simulate
     from iblf_jax.presets import zhang_yan_2024
-    from iblf_jax.rollout import simulate
 
     def both() -> tuple[dict[str, Rollout], float]:
         start = time.perf_counter()
@@ -94,7 +94,7 @@ def _write_data(
     import jax
 
     import iblf_jax
-    from iblf_jax.io import save_rollouts
+    from iblf_jax.files.rollouts import save_rollouts
 
     save_rollouts(runs, folder / "rollouts.nc")
     report: dict[str, Any] = {

@@ -19,7 +19,7 @@ from iblf_jax.cli._common import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from iblf_jax.results import Rollout
+    from iblf_jax.simulation.results import Rollout
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -38,8 +38,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.rollout import simulate
-    from iblf_jax.status import FAILED, describe
+    from iblf_jax.core.status import FAILED, describe
+    from iblf_jax.engine.simulate import simulate
 
     file = scenario_of(args)
     options = run_options(args, file)
@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
 def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any]) -> None:
     import iblf_jax
     from iblf_jax import plotting
-    from iblf_jax.io import save_rollouts
-    from iblf_jax.scenario_file import save_scenario
+    from iblf_jax.files.rollouts import save_rollouts
+    from iblf_jax.files.scenario import save_scenario
 
     save_scenario(result.scenario, folder / "scenario.toml", run=options)
     save_rollouts(result, folder / "rollout.nc")

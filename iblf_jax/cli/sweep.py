@@ -32,10 +32,10 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
     def work(how: dict[str, Any]) -> int:
-        from iblf_jax import distributed
-        from iblf_jax.status import FAILED
+        from iblf_jax.core.status import FAILED
+        from iblf_jax.files.study import load_study_file
+        from iblf_jax.studies import distributed
         from iblf_jax.studies.sweep import sweep
-        from iblf_jax.study_file import load_study_file
 
         file = load_study_file(args.file, "sweep")
         data = sweep(file.scenario, file.grid, perturbations=file.perturbations, store=args.store, **file.options | how)
@@ -54,7 +54,7 @@ def report(data: xarray.Dataset) -> str:
     import numpy as np
 
     from iblf_jax.cli._common import number
-    from iblf_jax.status import FAILED
+    from iblf_jax.core.status import FAILED
 
     config = json.loads(data.attrs["config"])
     dims, runs = list(config["dims"]), config["runs"]

@@ -10,7 +10,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "tune",
         help="tune gains by gradient",
-        description="Tune the parameters of a tuning file (its format: iblf_jax.tuning_file); print the report, "
+        description="Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the report, "
         "on fresh runs where something is perturbed.",
         epilog="Exit code 1 if a requirement failed or the objective did not go down.",
     )
@@ -25,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._common import output_folder
-    from iblf_jax.tuning_file import tune_file
+    from iblf_jax.files.tuning import tune_file
 
     folder = output_folder(args.out) if args.out else None
     given = {name: x for name, x in (("checkpoint", args.checkpoint), ("iterations", args.iterations)) if x is not None}
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     print(result.report)
     if folder is not None:
         from iblf_jax import plotting
-        from iblf_jax.scenario_file import save_scenario
+        from iblf_jax.files.scenario import save_scenario
 
         timing = {"duration": result.setup.duration, "dt": result.setup.dt, "method": result.setup.method}
         save_scenario(result.scenario, folder / "scenario.toml", run=timing)

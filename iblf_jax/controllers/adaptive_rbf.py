@@ -22,12 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.barriers import Barrier, Log
 from iblf_jax.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.controllers._base import Command, Setting
 from iblf_jax.controllers.backstepping import alpha_and_rate, fit_o
-from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
 @component

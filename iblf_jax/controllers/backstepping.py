@@ -16,12 +16,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
 from iblf_jax.barriers import Barrier, Integral
 from iblf_jax.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.linalg import matvec
-from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 READINGS = ("printed", "corrected")
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.linalg import matvec
-from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 @component

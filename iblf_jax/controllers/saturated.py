@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.controllers._base import Command, Controller, Setting, State
-from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot
 
 EDGES = ("hard", "smooth")

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from iblf_jax import barriers, checks
+from iblf_jax import barriers
 from iblf_jax.controllers._base import Controller
 from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque
 from iblf_jax.controllers.pd_gravity import PDGravity
+from iblf_jax.core import checks
 from iblf_jax.observers import NoObserver, Observer
 
 BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.accuracy import places
-from iblf_jax.closed_loop import initial_state
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import Shape
 from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, probe_steps, probed, start, verdict
-from iblf_jax.paths import with_parameters
-from iblf_jax.stability import growth_rate
+from iblf_jax.simulation.accuracy import places
+from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.stability import growth_rate
 
 
 class Leaves(NamedTuple):

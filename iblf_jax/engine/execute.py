@@ -19,8 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.closed_loop import evaluate, initial_state
+from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
 from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
@@ -29,7 +28,8 @@ from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.scenario import Scenario
 
 LOWERED = {"native": native, "gpu": gpu, "xla": xla}
 """What runs scalar programs."""

@@ -10,17 +10,17 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import automatic
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.step import Inputs, TimeStep
-from iblf_jax.integrators import tableau
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
 from iblf_jax.lowering.toolchain import threads
-from iblf_jax.metrics import as_folds
-from iblf_jax.paths import get
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.paths import get
+from iblf_jax.simulation.scenario import Scenario, canonical
 
 SLOTS = {
     "div": 8, "sqrt": 8, "rsqrt": 16, "sin": 18, "cos": 18, "tan": 40, "exp": 20, "expm1": 22, "log": 24, "log1p": 32, "tanh": 32,

@@ -21,12 +21,12 @@ import numpy as np
 from jax.extend.core import Var
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax import accuracy, integrators, stability
 from iblf_jax.bounds import NARROWEST
-from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
-from iblf_jax.results import Rollout
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import VELOCITY_LIMIT, Status, flag
+from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
+from iblf_jax.simulation import accuracy, integrators, stability
+from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, initial_state
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario
 
 RECORDED = tuple(f.name for f in dataclasses.fields(Rollout) if f.name in Sample._fields and f.name != "dt")
 """Names of the quantities that a run records."""

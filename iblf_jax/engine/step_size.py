@@ -18,14 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax import accuracy, checks
-from iblf_jax.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.core import checks
+from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.integrators import step as one_step
-from iblf_jax.integrators import tableau
-from iblf_jax.scenario import Initial, Scenario, canonical
-from iblf_jax.stability import SLOWEST, jacobian
-from iblf_jax.status import VELOCITY_LIMIT
+from iblf_jax.simulation import accuracy
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation.integrators import step as one_step
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.scenario import Initial, Scenario, canonical
+from iblf_jax.simulation.stability import SLOWEST, jacobian
 
 COMFORT = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import jax
 
-from iblf_jax.drafts import draft, remove_abandoned
+from iblf_jax.core.drafts import draft, remove_abandoned
 
 FLAGS = (
     "-x", "c++", "-std=gnu++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math",

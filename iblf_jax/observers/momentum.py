@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import jax
 
-from iblf_jax import checks
-from iblf_jax.linalg import matvec
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
-from iblf_jax.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot, energy_gradient
 
 

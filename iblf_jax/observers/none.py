@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.pytree import component
+from iblf_jax.core.pytree import component
 from iblf_jax.robots import Robot
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.linalg import matvec
-from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot
 
 STARTS = ("zero", "matched")

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.results import Rollout
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.robots import joint_names
-from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.simulation.results import Rollout
 
 POINTS = 2400
 """About as many points as a line of a figure can show."""

@@ -14,11 +14,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct
 from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, show, transient_end
-from iblf_jax.results import Rollout
+from iblf_jax.simulation.results import Rollout
 
 Runs = Rollout | Mapping[str, Rollout]
 

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
 from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, draw, draw_frame, say_what_is_cut, set_limits, show
-from iblf_jax.results import Rollout
+from iblf_jax.simulation.results import Rollout
 
 WIDTH = 10.0
 COLUMNS = 4

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import called, plain
 from iblf_jax.studies import statistics

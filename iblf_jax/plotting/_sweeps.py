@@ -9,10 +9,10 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from iblf_jax import checks
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import plain
-from iblf_jax.status import FAILED
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
 if TYPE_CHECKING:

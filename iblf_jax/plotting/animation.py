@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._arm import Scene, motions_of
 from iblf_jax.plotting._curves import Curve, curves_of

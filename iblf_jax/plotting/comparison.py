@@ -12,12 +12,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax import checks
-from iblf_jax.metrics import Settling
+from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, check_joint, curves_of, thinned
 from iblf_jax.plotting._figures import Row, windows
 from iblf_jax.plotting._panels import QUANTITIES, Window, draw, set_limits
+from iblf_jax.simulation.metrics import Settling
 
 if TYPE_CHECKING:
     from iblf_jax.studies.comparison import Comparison

@@ -17,8 +17,8 @@ from typing import Any, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.linalg import inner, matvec
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import inner, matvec
 
 T = TypeVar("T")
 

@@ -27,8 +27,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.pytree import Leaf, component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import spatial
 from iblf_jax.robots.payload import Payload
 

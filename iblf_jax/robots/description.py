@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 LARGEST = 8 << 20
 """Bytes of a description, its includes together."""

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.robots.description import Shown
 from iblf_jax.robots.repair import COMPACT, FINEST, ROUNDING, Fault, Repairs, is_nothing, moments_of, second_moments, thickened
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.robots import description, mjcf, urdf
 from iblf_jax.robots.arm import Arm
 from iblf_jax.robots.description import Shown

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.robots.description import Shown, contents
 
 LARGEST_MESHES = 512 << 20

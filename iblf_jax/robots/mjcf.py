@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.robots.description import FARTHEST, LARGEST, MOST_BODIES, Shown, floats, label
 from iblf_jax.robots.meshes import Meshes
 from iblf_jax.robots.repair import Fault, Weight, judged

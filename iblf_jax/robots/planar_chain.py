@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.linalg import inner, matmul, matvec
-from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import inner, matmul, matvec
+from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.robots._base import from_energy, planar_skeleton
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.robots.description import Shown
 
 ROUNDING = 1e-6

@@ -9,7 +9,7 @@ A *pseudo-inertia* is the symmetric 4 x 4 matrix of a body's moments about the o
 
 It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], [0, 1]]: no parallel-axis rules.
 
-Products are written as sums: a call into a matrix library costs more than the arithmetic (`iblf_jax.linalg`), and what is compiled as one
+Products are written as sums: a call into a matrix library costs more than the arithmetic (`core.linalg`), and what is compiled as one
 function must hold none.  Few operations on whole arrays rather than many on their entries keep the compiler quick, and where an entry is
 known to be zero it is selected or concatenated as such, not multiplied by zero, so that a scalar program drops it.
 """

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.robots.description import Shown
 from iblf_jax.robots.links import Links, Pose
 from iblf_jax.robots.mjcf import Tendons

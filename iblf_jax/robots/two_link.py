@@ -16,8 +16,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.pytree import Leaf, component, leaf
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.robots._base import planar_skeleton
 
 

@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
+from iblf_jax.core.status import Status, flag
 from iblf_jax.engine.execute import run_batch, settled
 from iblf_jax.engine.step import Run
-from iblf_jax.status import Status, flag
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
 BLOCK = {"cpu": 256}

@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.controllers import LAWS, Controller, law_by_name
 from iblf_jax.controllers.systems import observer_of
-from iblf_jax.metrics import AboveGravity, standard
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import rewrapped, unwrapped
+from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.engine.simulate import simulate
 from iblf_jax.observers import NoObserver
-from iblf_jax.paths import with_parameters
-from iblf_jax.pytree import rewrapped, unwrapped
-from iblf_jax.results import Rollout
-from iblf_jax.rollout import simulate
-from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.simulation.metrics import AboveGravity, standard
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.comparison import Comparison
 
 RATIO = math.sqrt(2.0)

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.barriers import Integral
-from iblf_jax.pytree import unwrapped
-from iblf_jax.results import Rollout
-from iblf_jax.status import FAILED, describe
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.status import FAILED, describe
+from iblf_jax.simulation.results import Rollout
 
 HELD = {"gains": "Gains as given", "effort": "Equal effort"}
 

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.paths import get, why_inadmissible
-from iblf_jax.scenario import Scenario
+from iblf_jax.core import checks
+from iblf_jax.simulation.paths import get, why_inadmissible
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, plan, sample_size
 
 BATCHES = 64

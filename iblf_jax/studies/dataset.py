@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from iblf_jax.status import Status
+from iblf_jax.core.status import Status
 
 if TYPE_CHECKING:
     import xarray

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import qmc
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 SAMPLERS = ("independent", "latin_hypercube", "sobol")
 MOST_RUNS = 2**32

@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks, paths
-from iblf_jax.distributions import Perturbation
-from iblf_jax.scenario import Scenario
+from iblf_jax.core import checks
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.distributions import Perturbation
 
 _SIGNS = {"positive": "> 0", "nonnegative": ">= 0"}
 

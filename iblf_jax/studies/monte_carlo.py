@@ -15,13 +15,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import checks, distributed
-from iblf_jax.accuracy import RELATIVE
-from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import Fold
-from iblf_jax.scenario import Scenario
+from iblf_jax.core import checks
+from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.metrics import Fold
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies import distributed
 from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.setup import prepare

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax import checks, paths
-from iblf_jax.distributions import Perturbation, is_distribution, value
-from iblf_jax.scenario import Scenario
+from iblf_jax.core import checks
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS, split, unit_points
+from iblf_jax.studies.distributions import Perturbation, is_distribution, value
 from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, plan, sample_size
 
 MOST_DIMS = 60

@@ -6,7 +6,7 @@ import sys
 import warnings
 from typing import Any
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 DELAY = 1.0
 """Seconds before a bar appears that was not asked for."""

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.accuracy import RELATIVE, TOLERANCE
-from iblf_jax.distributions import Perturbation
+from iblf_jax.core.status import Status
 from iblf_jax.engine import step_size
-from iblf_jax.integrators import tableau
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status
+from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.blocks import block_size, run_blocks
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.setup import prepare
 
 TOO_LARGE = Status.STEP_TOO_LARGE | Status.INACCURATE

@@ -21,15 +21,15 @@ import jax
 import numpy as np
 from scipy import stats
 
-from iblf_jax import checks
-from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import Fold, metric_units
-from iblf_jax.results import Metrics
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import FAILED
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED
+from iblf_jax.simulation.metrics import Fold, metric_units
+from iblf_jax.simulation.results import Metrics
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import MEMORY, block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_SOBOL, check_seed, split
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.setup import Setup, prepare

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.distributions import Perturbation
-from iblf_jax.integrators import tableau
-from iblf_jax.metrics import Fold, as_folds
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.core import checks
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.metrics import Fold, as_folds
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import Program, Results, Shared, _execute, block_size, with_settled_backend
 from iblf_jax.studies.designs import check_seed, split, unit_points
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Lanes, plan, sample_size
 
 

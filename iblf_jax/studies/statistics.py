@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 SMALLER_IS_WORSE = ("margin", "xi_margin", "first_violation_time")
 """Metrics of which the smallest value, over joints and over runs, is the worst."""

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.drafts import draft
+from iblf_jax.core.drafts import draft
 
 FORMAT = 1
 DONE = "done"

@@ -21,16 +21,17 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax import checks, paths
-from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import metric_units
-from iblf_jax.results import Metrics, Rollout
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.engine.simulate import SimulationWarning, trajectory
 from iblf_jax.robots import joint_names
-from iblf_jax.rollout import SimulationWarning, trajectory
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.metrics import metric_units
+from iblf_jax.simulation.results import Metrics, Rollout
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import Results, block_size, run_blocks
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.setup import Setup
 from iblf_jax.studies.statistics import Probability
 

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.bounds import tube_at
-from iblf_jax.paths import get, parameters, with_parameters
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import FAILED, Status
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED, Status
+from iblf_jax.simulation.paths import get, parameters, with_parameters
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import block_size, run_blocks
 from iblf_jax.studies.config import describe_component

@@ -16,15 +16,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax import checks, distributed
-from iblf_jax.accuracy import RELATIVE
-from iblf_jax.distributions import Perturbation
-from iblf_jax.metrics import Fold, metric_units
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.core import checks
+from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.metrics import Fold, metric_units
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies import config as configuration
+from iblf_jax.studies import distributed
 from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler, check_seed
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
 from iblf_jax.studies.progress import bar

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.presets import zhang_yan_2024
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario
 
 STEP = 1e-6
 """Relative step of the central differences; with float64 they are good to about 1e-9."""

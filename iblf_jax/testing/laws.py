@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.controllers import Command, Controller
-from iblf_jax.rollout import simulate
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status
+from iblf_jax.core.status import Status
+from iblf_jax.engine.simulate import simulate
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, scenario_or_the_papers, shape_of
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.closed_loop import Sample
-from iblf_jax.metrics import Fold
+from iblf_jax.simulation.closed_loop import Sample
+from iblf_jax.simulation.metrics import Fold
 from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of
 
 LENGTH = 40

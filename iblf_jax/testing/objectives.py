@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.engine.derivatives import Outer
-from iblf_jax.rollout import simulate
-from iblf_jax.scenario import Scenario
+from iblf_jax.engine.simulate import simulate
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,
     examine,

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.observers import Observer
 from iblf_jax.presets import customary_two_link
 from iblf_jax.robots import Robot
-from iblf_jax.scenario import fit_joints
+from iblf_jax.simulation.scenario import fit_joints
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
 
 

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.bounds import Side
+from iblf_jax.core import checks
 from iblf_jax.disturbances import Disturbance
 from iblf_jax.presets import customary_two_link
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
-from iblf_jax.scenario import fit_joints
+from iblf_jax.simulation.scenario import fit_joints
 from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, joints_of, probe, shape_of
 
 

@@ -25,18 +25,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.distributions import Perturbation
+from iblf_jax.core import checks
+from iblf_jax.core.status import Status, describe
 from iblf_jax.engine.plan import BACKENDS
+from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import Run
-from iblf_jax.integrators import tableau
-from iblf_jax.paths import with_parameters
-from iblf_jax.results import Rollout
-from iblf_jax.rollout import simulate
-from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.status import Status, describe
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.designs import check_seed
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.progress import bar
 from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Peak, Quantities

@@ -20,11 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.distributions import Perturbation
-from iblf_jax.paths import with_parameters
-from iblf_jax.scenario import Scenario
+from iblf_jax.core import checks
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import check_seed
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.progress import bar
 from iblf_jax.tuning._tune import build, make_method, way_in
 from iblf_jax.tuning.objectives import Objective

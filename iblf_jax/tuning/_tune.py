@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.distributions import Perturbation
+from iblf_jax.core import checks
 from iblf_jax.engine.plan import BACKENDS
-from iblf_jax.integrators import tableau
-from iblf_jax.paths import with_parameters
-from iblf_jax.scenario import Scenario, canonical, fit_joints
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, plan
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.statistics import check_confidence

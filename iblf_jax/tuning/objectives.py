@@ -24,9 +24,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.metrics import Fold
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.simulation.metrics import Fold
 from iblf_jax.tuning.quantities import Integral, MetricResult, Peak, Quantity
 
 

@@ -27,7 +27,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.tuning import problem
 from iblf_jax.tuning.objectives import sharper
 from iblf_jax.tuning.problem import Lane, Plan, Shared, Slope

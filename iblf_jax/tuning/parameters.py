@@ -19,11 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks, paths
+from iblf_jax.core import checks
 from iblf_jax.engine.step_size import fastest_along
-from iblf_jax.integrators import tableau
-from iblf_jax.paths import with_parameters
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
 
 CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}

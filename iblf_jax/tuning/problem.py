@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core.status import Status
 from iblf_jax.engine.execute import run_batch, run_for_reverse
 from iblf_jax.engine.step import Run
-from iblf_jax.paths import with_parameters
-from iblf_jax.status import Status
+from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import Block, values_at

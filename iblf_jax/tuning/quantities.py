@@ -22,11 +22,11 @@ from typing import Any, ClassVar, Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.closed_loop import Sample
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine.derivatives import Outer
-from iblf_jax.metrics import Fold
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.simulation.closed_loop import Sample
+from iblf_jax.simulation.metrics import Fold
 
 FAR = 1e6
 """Where a peak starts, below everything; in units of its scale."""

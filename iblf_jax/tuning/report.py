@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from iblf_jax.metrics import Margin, Torque
-from iblf_jax.rollout import simulate
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status
+from iblf_jax.core.status import Status
+from iblf_jax.engine.simulate import simulate
+from iblf_jax.simulation.metrics import Margin, Torque
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.monte_carlo import monte_carlo
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED

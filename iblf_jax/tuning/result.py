@@ -11,15 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks, paths
-from iblf_jax.distributions import Perturbation
+from iblf_jax.core import checks
 from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.simulate import trajectory
 from iblf_jax.engine.step import Run
-from iblf_jax.metrics import as_folds
-from iblf_jax.results import Rollout
-from iblf_jax.rollout import trajectory
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.designs import check_seed
+from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.problem import NUMBERS_A_RUN, UNSOUND
 from iblf_jax.tuning.quantities import Quantities
@@ -218,7 +219,7 @@ class TuneResult:
           ValueError: the scenario, the objective or a perturbation holds a class that no file can name.
           OSError: the file cannot be written.
         """
-        from iblf_jax.tuning_file import save_tuning
+        from iblf_jax.files.tuning import save_tuning
 
         save_tuning(self, path)
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 KINDS = ("mean", "cvar", "worst")
 

@@ -17,7 +17,7 @@ import numpy as np
 from iblf_jax.engine.derivatives import Tangents
 from iblf_jax.engine.execute import run_batch_jvp
 from iblf_jax.engine.step import Run
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario
 
 
 def by_coordinates(

@@ -35,15 +35,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.codec import construct, decode_fields, encode_fields, field_hints
-from iblf_jax.integrators import TABLEAUS
-from iblf_jax.paths import parameters, with_parameters
-from iblf_jax.plain import Words, as_table, decode_static, did_you_mean, known_keys, numbers, toml_tables
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import astype
+from iblf_jax.files.components import construct, decode_fields, encode_fields, field_hints
+from iblf_jax.files.robot import names_a_file, with_robots_read
+from iblf_jax.files.values import Words, as_table, decode_static, did_you_mean, known_keys, numbers, toml_tables
 from iblf_jax.presets import PRESETS
-from iblf_jax.pytree import astype
-from iblf_jax.robot_file import names_a_file, with_robots_read
-from iblf_jax.scenario import Scenario, check_values
+from iblf_jax.simulation.integrators import TABLEAUS
+from iblf_jax.simulation.paths import parameters, with_parameters
+from iblf_jax.simulation.scenario import Scenario, check_values
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
 RUN = ("duration", "dt", "method", "record_every")

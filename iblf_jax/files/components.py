@@ -16,8 +16,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import barriers, bounds, checks, controllers, disturbances, observers, references, robots
-from iblf_jax.plain import (
+from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.files.values import (
     NONE,
     Words,
     as_table,
@@ -30,7 +32,6 @@ from iblf_jax.plain import (
     plain_static,
     without_none,
 )
-from iblf_jax.pytree import is_leaf_field
 
 FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     robots.Robot: ("robots", robots.MEMBERS),

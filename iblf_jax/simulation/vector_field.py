@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.closed_loop import LoopState, Sample, evaluate, initial_state
-from iblf_jax.pytree import component
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component
+from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, initial_state
+from iblf_jax.simulation.scenario import Scenario, canonical
 
 
 @component

@@ -15,11 +15,11 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax import checks
-from iblf_jax.accuracy import UNITS
-from iblf_jax.closed_loop import Sample
-from iblf_jax.pytree import Leaf, component, leaf
-from iblf_jax.scenario import fit_joints
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.simulation.accuracy import UNITS
+from iblf_jax.simulation.closed_loop import Sample
+from iblf_jax.simulation.scenario import fit_joints
 
 
 class Fold(Protocol):

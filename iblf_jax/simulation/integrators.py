@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 
 class Tableau(NamedTuple):

@@ -27,12 +27,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.closed_loop import LoopState
-from iblf_jax.integrators import tableau
-from iblf_jax.linalg import matvec, solve, solve_spd
+from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.robots import at_time
-from iblf_jax.scenario import Scenario
-from iblf_jax.stability import SLOWEST
+from iblf_jax.simulation.closed_loop import LoopState
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.stability import SLOWEST
 
 TOLERANCE = 0.005
 """Estimated error of a position, relative to the width of its tube, above which a run is flagged INACCURATE."""

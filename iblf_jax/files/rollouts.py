@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.paths import parameters
-from iblf_jax.plain import Words
-from iblf_jax.results import Rollout
-from iblf_jax.scenario_file import scenario_to_toml
-from iblf_jax.status import Status, describe
+from iblf_jax.core import checks
+from iblf_jax.core.status import Status, describe
+from iblf_jax.files.scenario import scenario_to_toml
+from iblf_jax.files.values import Words
+from iblf_jax.simulation.paths import parameters
+from iblf_jax.simulation.results import Rollout
 
 if TYPE_CHECKING:
     import xarray

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 NONE = "none"
 """What a file says for a structural field that is None though its default is something else; TOML has no null."""

@@ -35,17 +35,20 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax import checks, codec, distributions, metrics
-from iblf_jax.distributions import Distribution, Perturbation
+from iblf_jax.core import checks
 from iblf_jax.engine.plan import BACKENDS
-from iblf_jax.integrators import tableau
-from iblf_jax.paths import with_parameters
-from iblf_jax.plain import Words, as_table, did_you_mean, known_keys, numbers
-from iblf_jax.scenario_file import from_dict, read_toml, scenario_to_dict
+from iblf_jax.files import components
+from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
+from iblf_jax.files.study import perturbations_of
+from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, numbers
+from iblf_jax.simulation import metrics
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.studies import distributions
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
+from iblf_jax.studies.distributions import Distribution, Perturbation
 from iblf_jax.studies.draws import plan
 from iblf_jax.studies.statistics import check_confidence
-from iblf_jax.study_file import perturbations_of
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
@@ -53,9 +56,9 @@ from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import Setup, TuneResult
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
 
-codec.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
-codec.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
-codec.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
+components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
+components.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
+components.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
 
 OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin", "metric")
 REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "violation_probability_below")
@@ -113,7 +116,7 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
         checks.one_of("tune.risk", table["risk"], KINDS)
         options["risk"] = table["risk"]
     if options.get("risk") == "cvar" and "level" in table:
-        options["risk"] = codec.construct(cvar, {"level": table["level"]}, "tune.level")
+        options["risk"] = components.construct(cvar, {"level": table["level"]}, "tune.level")
     return options
 
 
@@ -124,7 +127,7 @@ def _parameter(entry: Any, key: str) -> Any:
     known_keys(table, key, ("path", "low", "high", "tied", "scale"))
     path = checks.word(f"{key}.path", table.pop("path", Words("nothing")), "the path of a leaf")
     limits: dict[str, Any] = {name: numbers(table[name], f"{key}.{name}") for name in ("low", "high") if name in table}
-    return codec.construct(tunable, {"path": path, **table, **limits}, key)
+    return components.construct(tunable, {"path": path, **table, **limits}, key)
 
 
 def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, besides: tuple[str, ...] = ()) -> Any:
@@ -138,7 +141,7 @@ def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, besides
     for name, parameter in taken.items():
         if parameter.default is parameter.empty and name not in table:
             raise checks.fail(f"{key}.{name}", Words("nothing"), f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it")
-    return codec.construct(function, {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table}, key)
+    return components.construct(function, {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table}, key)
 
 
 _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
@@ -147,7 +150,7 @@ _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
 
 def _argument(name: str, value: Any, key: str) -> Any:
     if name == "fold":
-        return codec.decode({"kind": value} if isinstance(value, str) else value, metrics.Fold, key)
+        return components.decode({"kind": value} if isinstance(value, str) else value, metrics.Fold, key)
     return checks.word(key, value, _NO_NUMBERS[name]) if name in _NO_NUMBERS else numbers(value, key)
 
 
@@ -166,7 +169,7 @@ def _objective(terms: Any, requirements: Any) -> Objective:
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
         term, weight = _called(objectives, OBJECTIVES, entry, key, ("weight",)), numbers(entry.get("weight", 1.0), f"{key}.weight")
-        total += codec.construct(term.__mul__, {"weight": weight}, key)
+        total += components.construct(term.__mul__, {"weight": weight}, key)
     if not isinstance(requirements, list):
         raise checks.fail("requirement", requirements, "[[requirement]] tables", 'Such as kind = "margin_above".')
     for i, entry in enumerate(requirements):
@@ -189,8 +192,8 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "history": history,
         "setup": {name: getattr(setup, name) for name in plain},
         "risk": list(setup.risk),
-        "objective": codec.encode_fields(setup.objective, "objective"),
-        "perturbations": {key: codec.encode_fields(x, key) for key, x in setup.perturbations.items()},
+        "objective": components.encode_fields(setup.objective, "objective"),
+        "perturbations": {key: components.encode_fields(x, key) for key, x in setup.perturbations.items()},
         **{name: getattr(result, name) for name in ("names", "best_start", "stopped", "optimiser", "mode", "seconds")},
         "report": result.report.to_dict(),
     }
@@ -234,8 +237,8 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     start = from_dict(data["start"]).scenario
     values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
     setup = Setup(
-        objective=checked(codec.decode_fields(Objective, data["objective"], "objective")),
-        perturbations={key: codec.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
+        objective=checked(components.decode_fields(Objective, data["objective"], "objective")),
+        perturbations={key: components.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
         risk=as_risk(Risk(*data["risk"])),
         **data["setup"] | {"limits": tuple((float(low), float(high)) for low, high in data["setup"].get("limits", ()))},
     )

@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.accuracy import RELATIVE
-from iblf_jax.scenario import Scenario
-from iblf_jax.status import Status, describe
+from iblf_jax.core import checks
+from iblf_jax.core.status import Status, describe
+from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.scenario import Scenario
 
 
 @jax.tree_util.register_dataclass
@@ -159,7 +159,7 @@ class Rollout:
 
     def to_xarray(self):
         """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its attributes."""
-        from iblf_jax.io import rollout_to_xarray
+        from iblf_jax.files.rollouts import rollout_to_xarray
 
         return rollout_to_xarray(self)
 

@@ -1,6 +1,6 @@
 """Real arms: the ones that come with the package, and a scenario on any arm.
 
-The data of an arm are what its file says, as the [robot] table of a scenario file (folder `arm_data`, with sources and licences); they need
+The data of an arm are what its file says, as the [robot] table of a scenario file (folder `data`, with sources and licences); they need
 neither the network nor a parser of robot descriptions.
 
 `arm_scenario` fills in what an arm's own numbers give: bounds from its joint ranges, saturation from its largest torques, and gains in
@@ -25,16 +25,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import bounds as bounds_
-from iblf_jax import checks, disturbances, references
+from iblf_jax import disturbances, references
 from iblf_jax.bounds import Bounds
-from iblf_jax.codec import decode_fields
 from iblf_jax.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
 from iblf_jax.controllers.systems import observer_of
+from iblf_jax.core import checks
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import Momentum, Printed
 from iblf_jax.references import Reference
 from iblf_jax.robots import Arm, Robot
-from iblf_jax.scenario import Initial, Scenario
+from iblf_jax.simulation.scenario import Initial, Scenario
 
 ARMS = ("ur5", "iiwa14")
 """The arms that come with the package."""
@@ -52,11 +52,12 @@ def arm(name: str) -> Arm:
     Raises:
       ValueError: another name.
 
-    Source: the files in `iblf_jax/arm_data` name theirs.
+    Source: the files in `iblf_jax/presets/data` name theirs.
     """
     checks.one_of("arm", name, ARMS)
-    text = resources.files("iblf_jax").joinpath("arm_data", f"{name}.toml").read_text(encoding="utf-8")
-    return decode_fields(Arm, tomllib.loads(text), name)
+    text = resources.files("iblf_jax.presets").joinpath("data", f"{name}.toml").read_text(encoding="utf-8")
+    fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in tomllib.loads(text).items()}
+    return Arm(**fields)
 
 
 def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST_K2) -> jax.Array:
@@ -143,7 +144,7 @@ def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2
     are inside the joint limits.  The law stays within the actuators' torques, and the disturbance is about 3 % of these.
 
     Args:
-      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.arms.arm_scenario`.
+      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.presets.arms.arm_scenario`.
       payload: at the tip of the plant; the model has none [kg].  (The maker allows 5 kg.)
 
     Returns:
@@ -152,7 +153,7 @@ def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2
     Raises:
       ValueError: an unknown law or reading, or a negative payload.
 
-    Source: this package; the arm as `iblf_jax.arms.arm` says.
+    Source: this package; the arm as `iblf_jax.presets.arms.arm` says.
     """
     return _swinging(
         arm("ur5"),
@@ -172,7 +173,7 @@ def iiwa14(*, law: str = "integral", reading: str = "corrected", payload: float 
     As `ur5`, for 7 joints.  The maker allows a payload of 14 kg.
 
     Args:
-      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.arms.arm_scenario`.
+      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.presets.arms.arm_scenario`.
       payload: at the tip of the plant; the model has none [kg].
 
     Returns:
@@ -181,7 +182,7 @@ def iiwa14(*, law: str = "integral", reading: str = "corrected", payload: float 
     Raises:
       ValueError: an unknown law or reading, or a negative payload.
 
-    Source: this package; the arm as `iblf_jax.arms.arm` says.
+    Source: this package; the arm as `iblf_jax.presets.arms.arm` says.
     """
     return _swinging(
         arm("iiwa14"),

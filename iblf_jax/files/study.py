@@ -27,12 +27,13 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iblf_jax import checks, distributions
-from iblf_jax.codec import construct
-from iblf_jax.distributions import KINDS, Perturbation
-from iblf_jax.plain import Words, as_table, did_you_mean, inline_table, known_keys, numbers
-from iblf_jax.scenario import Scenario
-from iblf_jax.scenario_file import from_dict, read_toml
+from iblf_jax.core import checks
+from iblf_jax.files.components import construct
+from iblf_jax.files.scenario import from_dict, read_toml
+from iblf_jax.files.values import Words, as_table, did_you_mean, inline_table, known_keys, numbers
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies import distributions
+from iblf_jax.studies.distributions import KINDS, Perturbation
 
 OPTIONS: dict[str, dict[str, type]] = {
     "study": {"runs": int, "seed": int, "sampler": str, "replicates": int},

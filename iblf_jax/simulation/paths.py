@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.scenario import Scenario, canonical
+from iblf_jax.core import checks
+from iblf_jax.simulation.scenario import Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""

@@ -16,15 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
 from iblf_jax.bounds import Bounds, tube_at
 from iblf_jax.controllers import Controller, Setting
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, leaf
+from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
-from iblf_jax.pytree import Leaf, astype, component, is_leaf_field, leaf
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
-from iblf_jax.status import VELOCITY_LIMIT
 
 
 @component

@@ -10,19 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.bounds import tube_at
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine import execute
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
-from iblf_jax.integrators import tableau
-from iblf_jax.metrics import Fold, as_folds, metric_units
-from iblf_jax.results import Metrics, Rollout
 from iblf_jax.robots import joint_names
-from iblf_jax.scenario import Scenario, canonical
-from iblf_jax.status import FAILED, Status, describe
+from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
+from iblf_jax.simulation.results import Metrics, Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
 
 MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""

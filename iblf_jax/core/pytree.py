@@ -20,7 +20,7 @@ from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 T = TypeVar("T")
 

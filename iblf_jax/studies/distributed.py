@@ -30,7 +30,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 
 PATIENCE = 20.0
 """How many times the longest piece of work here another process may take before it is given up."""

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.closed_loop import LoopState, rate
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.closed_loop import LoopState, rate
+from iblf_jax.simulation.scenario import Scenario
 
 POWER_ITERATIONS = 48
 AVERAGED = 16

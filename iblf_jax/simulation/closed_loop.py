@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.linalg import inner, matvec, solve_spd
+from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.robots import at_time, friction_torque
-from iblf_jax.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario
 
 
 class LoopState(NamedTuple):

@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import checks
-from iblf_jax.pytree import component, leaf, static
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component, leaf, static
 
 KINDS = ("factor", "offset", "value")
 """How a draw acts on the nominal value."""
