@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import iblf_jax as ij
-from iblf_jax.certificates.evidence import Evidence, evidence_at
+from iblf_jax.certificates.proof_terms import ProofTerms, terms_at
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import canonical
 
@@ -64,6 +64,6 @@ def _position(scenario: ij.Scenario, t, xi, dq):
 
 
 @jax.jit
-def evidence_of(batch: ij.Scenario, t, state: LoopState) -> Evidence:
-    """The evidence at each of the states."""
-    return jax.vmap(evidence_at)(batch, t, state)
+def terms_of(batch: ij.Scenario, t, state: LoopState) -> ProofTerms:
+    """The proof at each of the states."""
+    return jax.vmap(terms_at)(batch, t, state)

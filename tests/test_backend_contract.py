@@ -57,7 +57,7 @@ def test_backends_agree_with_the_reference(name, dtype):
     assert np.any(~ok), expected.status
     scenario, varied, folds, dt = arguments
     asked = ["xla", "native"] if has_compiler() else ["xla"]
-    taken = {execute.settled(backend, scenario, varied, folds, dt, method="rk4") for backend in asked}
+    taken = {execute.chosen_backend(backend, scenario, varied, folds, dt, method="rk4") for backend in asked}
     for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap
         found = jax.tree.map(np.asarray, outcome_of(*arguments, backend=backend))
         np.testing.assert_array_equal(found.status, expected.status, err_msg=backend)

@@ -1,4 +1,4 @@
-"""Bad input is a ValueError that names the field, the value and the mend; a doubtful one is a warning."""
+"""Bad input is a ValueError that names the field, the value and the remedy; a doubtful one is a warning."""
 
 from __future__ import annotations
 

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from certificate_states import evidence_of, loop, random_loops
+from certificate_states import loop, random_loops, terms_of
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax.certificates import Certificate, certify, claims, facts, falsify
-from iblf_jax.certificates.box import eigenvalues_over
-from iblf_jax.certificates.evidence import evidence_at, rounding
-from iblf_jax.certificates.facts import look, starts_of
+from iblf_jax.certificates import Certificate, certify, claims, counterexample, trajectory
+from iblf_jax.certificates.eigenvalues import eigenvalues_over
+from iblf_jax.certificates.proof_terms import rounding, terms_at
+from iblf_jax.certificates.trajectory import look, starts_of
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
@@ -46,23 +46,23 @@ BARRIERS = {
 }
 
 
-def proven_rate(scenario, t, state, evidence):
+def proven_rate(scenario, t, state, proof):
     """V2' of the integral barrier as the proof writes it, (3.8) and (3.24), with the terms that it drops."""
     law, kf = scenario.controller, scenario.observer.kf
     tube = scenario.setting.tube(t)
     above = state.q > tube.q_d
     k, dk = jnp.where(above, tube.k_u, tube.k_l), jnp.where(above, tube.dk_u, tube.dk_l)
     kappa = jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + law.o)
-    xi, e2, f_tilde = tube.xi(state.q), evidence.e2, evidence.f_tilde
+    xi, e2, f_tilde = tube.xi(state.q), proof.e2, proof.f_tilde
     position = -jnp.sum(2 * xi**2 / (1 - xi**2) * (law.k1 + kappa + dk / k))
-    rest = -e2 @ (law.K2 * e2) + e2 @ f_tilde + f_tilde @ evidence.df - f_tilde @ (kf * f_tilde)
-    return position + rest + evidence.dropped_e2 + evidence.dropped_f
+    rest = -e2 @ (law.K2 * e2) + e2 @ f_tilde + f_tilde @ proof.df - f_tilde @ (kf * f_tilde)
+    return position + rest + proof.dropped_e2 + proof.dropped_f
 
 
-def left_side(batch, evidence):
+def left_side(batch, proof):
     """V2' + rho V2 - |f'|^2/2 with lambda_max of each position."""
-    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.claim(scenario), largest, 2))(batch, evidence.lambda_max)
-    return np.asarray(evidence.dV + rho * evidence.V - 0.5 * jnp.sum(evidence.df**2, axis=-1))
+    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.claim(scenario), largest, 2))(batch, proof.lambda_max)
+    return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.df**2, axis=-1))
 
 
 # ---------------------------------------------------------------------------------------------------- states
@@ -72,16 +72,16 @@ def left_side(batch, evidence):
 @pytest.mark.parametrize(("reading", "observer", "dtype"), READINGS)
 def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, dtype):
     batch, t, state = random_loops(ij.astype(loop(reading, observer), dtype), nearest=0.998)
-    evidence = evidence_of(batch, t, state)
-    assert evidence.dV.dtype == dtype
-    assert not np.any(evidence.held)
-    error = np.abs(np.asarray(jax.jit(jax.vmap(proven_rate))(batch, t, state, evidence) - evidence.dV))
-    allowed = rounding(dtype) * np.asarray(evidence.terms)
+    proof = terms_of(batch, t, state)
+    assert proof.dV.dtype == dtype
+    assert not np.any(proof.held)
+    error = np.abs(np.asarray(jax.jit(jax.vmap(proven_rate))(batch, t, state, proof) - proof.dV))
+    allowed = rounding(dtype) * np.asarray(proof.terms)
     assert np.all(error <= allowed)
     # The tolerance is small beside what it judges, so that it hides nothing.
-    assert np.median(allowed / np.abs(evidence.dV)) < (1e-11 if dtype == "float64" else 5e-3)
-    assert np.any(np.asarray(evidence.dropped_e2) != 0) == (reading == "printed")
-    assert np.any(np.asarray(evidence.dropped_f) != 0) == (observer == "printed")
+    assert np.median(allowed / np.abs(proof.dV)) < (1e-11 if dtype == "float64" else 5e-3)
+    assert np.any(np.asarray(proof.dropped_e2) != 0) == (reading == "printed")
+    assert np.any(np.asarray(proof.dropped_f) != 0) == (observer == "printed")
 
 
 @pytest.mark.slow
@@ -90,10 +90,10 @@ def test_corrected_keeps_the_inequality_at_every_state(barrier):
     scenario = loop(barrier=barrier)
     for seed in range(4):
         batch, t, state = random_loops(scenario, seed, speed=30.0)
-        evidence = evidence_of(batch, t, state)
-        free = ~np.asarray(evidence.held)
+        proof = terms_of(batch, t, state)
+        free = ~np.asarray(proof.held)
         assert np.mean(free) > 0.9
-        left, allowed = left_side(batch, evidence), rounding("float64") * np.asarray(evidence.terms)
+        left, allowed = left_side(batch, proof), rounding("float64") * np.asarray(proof.terms)
         assert np.all(np.isfinite(left[free]))
         assert np.all(left[free] <= allowed[free])
 
@@ -115,7 +115,7 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
         initial=ij.Initial(q=0.5, dq=0.1 + 0.8),
     )
     scenario = canonical(ij.with_parameters(scenario, {"observer.eta0": -0.8}))
-    seen = jax.jit(evidence_at)(scenario, jnp.zeros(()), initial_state(scenario))
+    seen = jax.jit(terms_at)(scenario, jnp.zeros(()), initial_state(scenario))
     np.testing.assert_allclose([seen.e2[0], seen.f_tilde[0], seen.df[0]], 0.8, rtol=1e-12)
     rho = claims.rho(claims.claim(scenario), seen.lambda_max, 2)
     assert float(rho) == pytest.approx(rate, rel=1e-12)
@@ -144,14 +144,14 @@ def corrected_certificate(corrected_run) -> Certificate:
 @pytest.mark.slow
 def test_rate_along_the_run_is_its_difference_quotient(paper_run):
     _, stretches = look(jax.tree.map(np.asarray, paper_run))
-    seen = [jax.tree.map(lambda x, facts=facts: x[facts.recorded], facts.evidence) for facts in stretches]
-    evidence = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
-    V, h = evidence.V, 0.01
+    seen = [jax.tree.map(lambda x, trajectory=trajectory: x[trajectory.recorded], trajectory.proof) for trajectory in stretches]
+    proof = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
+    V, h = proof.V, 0.01
     quotient = (V[:-4] - 8 * V[1:-3] + 8 * V[3:-1] - V[4:]) / (12 * h)
     quiet = slice(100, None)  # from 1 s on, when the fastest modes have died out
-    np.testing.assert_allclose(evidence.dV[2:-2][quiet], quotient[quiet], atol=2e-6 * np.abs(evidence.dV[102:]).max() + 1e-9)
+    np.testing.assert_allclose(proof.dV[2:-2][quiet], quotient[quiet], atol=2e-6 * np.abs(proof.dV[102:]).max() + 1e-9)
     np.testing.assert_allclose(V, paper_run.V, rtol=1e-9)
-    np.testing.assert_allclose(evidence.f, paper_run.disturbance, atol=1e-10)
+    np.testing.assert_allclose(proof.f, paper_run.disturbance, atol=1e-10)
 
 
 def test_paper_run_keeps_the_printed_inequality(paper_certificate):
@@ -302,7 +302,7 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert sparse.numbers["F_d"] == pytest.approx(whole.numbers["F_d"], rel=1e-9)
     assert_alike(sparse, whole)
     # The steps after the last sample count too; and a long run, which is not kept in memory, gives the same.
-    monkeypatch.setattr(facts, "KEPT", 0)
+    monkeypatch.setattr(trajectory, "KEPT", 0)
     assert_alike(certify(run.scenario, decimated(shaken, 300)), whole)
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
 
@@ -389,7 +389,7 @@ def one_joint(plant):
     )
 
 
-evidence_there = jax.jit(evidence_at)
+terms_there = jax.jit(terms_at)
 
 
 @pytest.mark.parametrize(("changes", "steady"), [({}, True), ({"damping": 0.5}, False), ({"growth": 0.5}, False)])
@@ -397,11 +397,11 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, st
     scenario = canonical(one_joint(Growing(mass=[1.3], **changes)))
     apart = dataclasses.replace(scenario, model=jax.tree.map(jnp.copy, scenario.model))
     for one in (scenario, apart):
-        seen = evidence_there(one, jnp.asarray(0.15), initial_state(one)._replace(dq=jnp.array([0.3])))
+        seen = terms_there(one, jnp.asarray(0.15), initial_state(one)._replace(dq=jnp.array([0.3])))
         assert bool(seen.steady) == steady
         assert (float(jnp.abs(seen.df[0])) < 1e-9) == steady
     other = ij.with_parameters(scenario, {"model.mass": 1.2})
-    assert not evidence_there(other, jnp.asarray(0.15), initial_state(other)).steady
+    assert not terms_there(other, jnp.asarray(0.15), initial_state(other)).steady
 
 
 def pendulum(**changes):
@@ -472,11 +472,11 @@ def test_wrong_arguments_are_named(paper, corrected_run):
     with pytest.raises(ValueError, match="a Rollout, a study or None"):
         certify(paper, 3)
     with pytest.raises(ValueError, match="claim"):
-        falsify(dataclasses.replace(paper, observer=ij.observers.NoObserver()), {"initial.q": between(0.4, 0.7)})
+        counterexample(dataclasses.replace(paper, observer=ij.observers.NoObserver()), {"initial.q": between(0.4, 0.7)})
     with pytest.raises(ValueError, match="low < high"):
-        falsify(paper, {"initial.q": between(0.7, 0.4)})
+        counterexample(paper, {"initial.q": between(0.7, 0.4)})
     with pytest.raises(ValueError, match="bounded"):
-        falsify(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.1))})
+        counterexample(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.1))})
 
 
 # ---------------------------------------------------------------------------------------------------- many runs
@@ -562,12 +562,12 @@ def test_search_finds_the_gap_of_the_printed_law_only():
         "controller.K2": between(0.6, 20.0),
         "observer.kf": between(1.1, 40.0),
     }
-    found = falsify(ij.presets.printed_gap(), perturbations, starts=8)
+    found = counterexample(ij.presets.printed_gap(), perturbations, starts=8)
     assert found.growth > 0.3
     for path, perturbation in perturbations.items():
         low, high = perturbation.distribution.support()
         assert np.all((found.parameters[path] >= low) & (found.parameters[path] <= high))
-    none = falsify(ij.presets.printed_gap(reading="corrected"), perturbations, starts=8)
+    none = counterexample(ij.presets.printed_gap(reading="corrected"), perturbations, starts=8)
     assert none.growth < -1.0 + 1e-9
 
 
@@ -576,7 +576,7 @@ def test_search_finds_the_gap_of_the_printed_law_only():
     "perturbations", [{"initial.q": between(0.2, 1.2), "initial.dq": between(-4.0, 4.0)}, {"robot.mass": between(-1.0, 2.0)}]
 )
 def test_search_returns_what_can_be_run(perturbations):
-    found = falsify(ij.presets.printed_gap(), perturbations, starts=3)
+    found = counterexample(ij.presets.printed_gap(), perturbations, starts=3)
     assert np.isfinite(found.growth)
     assert not certify(found.scenario, ij.simulate(found.scenario, **SHORT)).traces.held[0]
 
@@ -585,7 +585,7 @@ def test_search_refuses_perturbations_without_a_start(paper):
     cases = ({"initial.q": between(1.1, 1.2)}, "start inside the bounds"), ({"robot.mass": between(-2.0, -1.0)}, "positive")
     for perturbations, words in cases:
         with pytest.raises(ValueError, match=rf"perturbations: got .*{next(iter(perturbations))}.*{words}.*Narrow"):
-            falsify(paper, perturbations, starts=2)
+            counterexample(paper, perturbations, starts=2)
 
 
 def test_search_takes_the_perturbations_of_a_study(paper):
@@ -598,10 +598,10 @@ def test_search_takes_the_perturbations_of_a_study(paper):
     assert cube.size == 3 and not cube.refused(np.ones(3))
 
 
-@pytest.mark.parametrize(("search", "old"), [(falsify, "ranges"), (ij.falsify, "sets")])
+@pytest.mark.parametrize(("search", "old"), [(counterexample, "ranges"), (ij.falsify, "sets")])
 def test_old_names_and_tuples_are_told_the_new_ones(paper, search, old):
     timing = {} if old == "ranges" else {"duration": 0.01}
-    with pytest.raises(ValueError, match=rf"{old}: got .*falsify\(\.\.\., perturbations=\.\.\.\)"):
+    with pytest.raises(ValueError, match=rf"{old}: got .*{search.__name__}\(\.\.\., perturbations=\.\.\.\)"):
         search(paper, **{old: {"initial.q": (0.4, 0.7)}}, **timing)
     with pytest.raises(ValueError, match=r"perturbations\['initial\.q'\].*ij\.value\(ij\.uniform\(0\.4, \[0\.7, 0\.8\]\)\)"):
         search(paper, {"initial.q": (0.4, np.array([0.7, 0.8]))}, **timing)
@@ -629,7 +629,7 @@ def test_certificate_draws_itself(paper_certificate):
         paper_certificate.plot(until=1e-6)
 
 
-def test_state_is_all_that_evidence_needs(paper_run):
+def test_state_is_all_that_the_terms_need(paper_run):
     state = LoopState(paper_run.q[7], paper_run.dq[7], (), paper_run.observer_state[7])
-    seen = jax.jit(evidence_at)(paper_run.scenario, paper_run.t[7], state)
+    seen = jax.jit(terms_at)(paper_run.scenario, paper_run.t[7], state)
     np.testing.assert_allclose(seen.V, paper_run.V[7], rtol=1e-10)

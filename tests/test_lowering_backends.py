@@ -19,7 +19,7 @@ from iblf_jax.lowering import toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning.quantities import Integral, Peak, Quantities
+from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 
 
 def _has_compiler() -> bool:
@@ -99,7 +99,7 @@ def test_a_spline_is_looked_up(backend):
     scenario, dt = canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)), jnp.asarray(1e-3)
     run = Run(50, "heun", 10)
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    assert execute.settled(backend, scenario, varied, (), dt, method="heun") == backend
+    assert execute.chosen_backend(backend, scenario, varied, (), dt, method="heun") == backend
     found, expected = (execute.run_batch(scenario, varied, (), dt, run, backend=b) for b in (backend, "vmap"))
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
@@ -193,7 +193,7 @@ def test_forward_sensitivities():
     directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
 
-    folds = (*standard()[:1], *as_folds((Quantities((Integral(), Peak(10.0))),), jnp.float64))
+    folds = (*standard()[:1], *as_folds((Quantities((TimeIntegral(), Peak(10.0))),), jnp.float64))
 
     def pushed(backend):
         return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, Run(60, "euler"), backend=backend))(scenario, varied)

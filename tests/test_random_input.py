@@ -281,7 +281,7 @@ def no_runs(monkeypatch):
         "certificates._certify._one",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
-    monkeypatch.setattr("iblf_jax.studies.blocks.settled", lambda *_, **__: "xla")
+    monkeypatch.setattr("iblf_jax.studies.blocks.chosen_backend", lambda *_, **__: "xla")
 
 
 @pytest.mark.parametrize("entry", ENTRIES)

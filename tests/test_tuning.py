@@ -20,9 +20,9 @@ from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import _tune, problem
 from iblf_jax.tuning.newton import box_step
-from iblf_jax.tuning.optimise import Evaluator, Loop, load_checkpoint, save_checkpoint
+from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
-from iblf_jax.tuning.quantities import Integral, Peak, Quantities
+from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 from iblf_jax.tuning.robust import Risk, combine
 
 jax.config.update("jax_enable_x64", True)
@@ -111,10 +111,10 @@ def test_reverse_mode_remembers_few_states(paper):
 @pytest.mark.slow
 def test_quantities_are_what_numpy_makes_of_the_records(paper):
     parts = (
-        Integral("error", joints=[1.0, 2.0], after=0.1),
-        Integral("torque"),
-        Integral("torque_rate"),
-        Integral("outside", tolerance=0.05),
+        TimeIntegral("error", joints=[1.0, 2.0], after=0.1),
+        TimeIntegral("torque"),
+        TimeIntegral("torque_rate"),
+        TimeIntegral("outside", tolerance=0.05),
         Peak(10.0, "torque"),
         Peak(0.1, "deficit", smoothing=0.05),
         Peak(0.1, "error", after=0.1),
@@ -255,9 +255,9 @@ class Cliff:
 
     def __call__(self, z):
         loss = np.where(z[:, 0] > 1, np.nan, -z[:, 0])
-        sound = np.isfinite(loss)
-        value = problem.Value(np.where(sound, loss, np.inf), loss, loss[:, None], z[:, :0], z[:, :0], loss, sound, loss)
-        return problem.Slope(value, np.where(sound[:, None], -np.ones_like(z), np.nan), np.zeros((len(z), 1, 1)))
+        valid = np.isfinite(loss)
+        value = problem.Value(np.where(valid, loss, np.inf), loss, loss[:, None], z[:, :0], z[:, :0], loss, valid, loss)
+        return problem.Slope(value, np.where(valid[:, None], -np.ones_like(z), np.nan), np.zeros((len(z), 1, 1)))
 
 
 @pytest.mark.parametrize("name", ["newton", "adam"])
@@ -268,7 +268,7 @@ def test_steps_that_are_not_finite_are_rejected(name):
     for _ in range(60):
         z, found = method.step(Cliff(), state)
         assert np.all(np.isfinite(z))
-        reached = max(reached, z[0, 0]) if found.value.sound[0] else reached
+        reached = max(reached, z[0, 0]) if found.value.valid[0] else reached
     assert 0.9 < reached <= 1.0
 
 
@@ -285,9 +285,9 @@ class Bowl:
             return jnp.where(z[0] > 1, jnp.nan, x[0] ** 2 + 30 * (x[1] - x[0] ** 2) ** 2)
 
         value, gradient = jax.vmap(jax.value_and_grad(loss))(lanes.z)
-        sound = jnp.isfinite(value)
+        valid = jnp.isfinite(value)
         empty = lanes.z[:, :0]
-        found = problem.Value(jnp.where(sound, value, jnp.inf), value, empty, empty, empty, value, sound, empty)
+        found = problem.Value(jnp.where(valid, value, jnp.inf), value, empty, empty, empty, value, valid, empty)
         return problem.Slope(found, gradient, jnp.zeros((len(value), 2, 2)))
 
     def row(self, s):
@@ -304,9 +304,9 @@ def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
     state = method.init(box.z[None])
     for _ in range(40):
         z, found = method.step(bowl, state)
-        assert found.value.sound[0]
+        assert found.value.valid[0]
     np.testing.assert_allclose(z[0], Bowl.bottom, atol=1e-6)
-    assert state["settled"][0] and 10 < bowl.evaluations < 400
+    assert state["converged"][0] and 10 < bowl.evaluations < 400
 
 
 class Corner:
@@ -314,8 +314,8 @@ class Corner:
 
     def __init__(self, starts):
         goal = jax.tree.map(jnp.asarray, objectives.peak_torque(1.0, smoothing=0.2))
-        self.shared = problem.Shared(None, goal, jnp.asarray(1e-3))
-        self.plan = problem.Plan((), (), 1, "euler", Risk("mean"), ())
+        self.shared = problem.ProblemInputs(None, goal, jnp.asarray(1e-3))
+        self.plan = problem.Formulation((), (), 1, "euler", Risk("mean"), ())
         self.lanes = problem.Lane(np.zeros((starts, 1)), np.zeros((starts, 1), np.uint32), np.ones((starts, 1)), np.zeros((starts, 0)), 1.0)
         self.needed, self.evaluations = np.ones(starts, bool), 0
 
@@ -360,19 +360,19 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
 @pytest.mark.slow
 def test_only_needed_starts_are_evaluated_in_groups_of_one_shape(nominal):
     lanes = nominal.lanes(np.arange(20.0)[:, None] * np.ones(6))
-    evaluator, shapes = Evaluator(nominal.plan, nominal.shared, lanes, "forward"), set()
+    evaluator, shapes = CountedProblem(nominal.plan, nominal.shared, lanes, "forward"), set()
 
     def derive(shared, lanes):
         shapes.add(lanes.z.shape)
-        z, sound = np.asarray(lanes.z), np.ones(len(lanes.z), bool)
-        return problem.Slope(problem.Value(*[z[:, 0]] * 6, sound, z), z, z[:, :, None])
+        z, valid = np.asarray(lanes.z), np.ones(len(lanes.z), bool)
+        return problem.Slope(problem.Value(*[z[:, 0]] * 6, valid, z), z, z[:, :, None])
 
     evaluator.derive = derive
     evaluator.needed[[3, 7]] = False
     found = evaluator(lanes.z)
     assert shapes == {(16, 6)} and evaluator.evaluations == 18
     np.testing.assert_array_equal(found.value.loss, np.where(evaluator.needed, np.arange(20.0), np.inf))
-    np.testing.assert_array_equal(found.value.sound, evaluator.needed)
+    np.testing.assert_array_equal(found.value.valid, evaluator.needed)
 
 
 @pytest.mark.slow
@@ -386,7 +386,7 @@ def test_lbfgs_tunes_the_paper_as_well_as_newton(paper):
 @pytest.mark.slow
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
-    assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["sound"][-1].all()
+    assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["valid"][-1].all()
     with pytest.raises(ValueError, match="Take a smaller dt"):
         ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
 
@@ -440,7 +440,7 @@ def test_common_random_numbers(paper):
     """The same draws for every start and every step; other seeds give others."""
     built = [_tune.build(paper, GAINS, objectives.tracking(scale=1.0), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
     z = np.stack([built[0].box.z] * 2)
-    losses = [np.asarray(Evaluator(p.plan, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
+    losses = [np.asarray(CountedProblem(p.plan, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
 
 

@@ -10,10 +10,10 @@ import jax
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.facts import Facts, Whole, look, same_structure, same_tree
 from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed
+from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
 from iblf_jax.core import checks
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.robots import joint_names
@@ -125,59 +125,61 @@ def _one(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
     whole, stretches = look(run)
     parts, traces = [], []
-    for facts in stretches:
-        parts.append(of_stretch(facts))
-        traces.append(_traces(facts))
+    for trajectory in stretches:
+        parts.append(of_stretch(trajectory))
+        traces.append(_traces(trajectory))
     lines = tuple(over_run(whole, parts))
     joined = Traces(*map(np.concatenate, zip(*traces, strict=True)))
     return Certificate(_heading(run.scenario), lines, _numbers(whole), joined, joints=joint_names(run.scenario.plant, run.n))
 
 
-def _numbers(facts: Whole) -> dict[str, Any]:
+def _numbers(trajectory: Whole) -> dict[str, Any]:
     """The constants of the claim."""
-    rho = {f"rho_{where}_case_{case}": value for (case, where), value in facts.rho.items()}
+    rho = {f"rho_{where}_case_{case}": value for (case, where), value in trajectory.rho.items()}
     return rho | {
-        "case": facts.case,
-        "F_m": facts.F_m,
-        "F_d": facts.F_d,
-        "rho2": facts.F_d**2 / 2,
-        "V2_start": facts.V_ends[0],
-        "V2_end": facts.V_ends[1],
-        "lambda_min_run": facts.lambda_min,
-        "lambda_max_run": facts.lambda_max,
-        "lambda_min_box": facts.box.lambda_min,
-        "lambda_max_box": facts.box.lambda_max,
-        "lambda_searched": facts.box.searched,
-        "q_of_lambda_max_box": facts.box.q_max,
-        "jump_times": facts.jumps,
-        "samples": facts.samples,
-        "samples_left_out": facts.left_out,
+        "case": trajectory.case,
+        "F_m": trajectory.F_m,
+        "F_d": trajectory.F_d,
+        "rho2": trajectory.F_d**2 / 2,
+        "V2_start": trajectory.V_ends[0],
+        "V2_end": trajectory.V_ends[1],
+        "lambda_min_run": trajectory.lambda_min,
+        "lambda_max_run": trajectory.lambda_max,
+        "lambda_min_box": trajectory.eigenvalues.lambda_min,
+        "lambda_max_box": trajectory.eigenvalues.lambda_max,
+        "lambda_searched": trajectory.eigenvalues.searched,
+        "q_of_lambda_max_box": trajectory.eigenvalues.q_max,
+        "jump_times": trajectory.jumps,
+        "samples": trajectory.samples,
+        "samples_left_out": trajectory.left_out,
     }
 
 
-def _traces(facts: Facts) -> Traces:
+def _traces(trajectory: Trajectory) -> Traces:
     """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim."""
-    sample, evidence, case = facts.sample, facts.evidence, applicable_case(facts.whole)
-    nothing = np.full(facts.t.shape, np.nan)
-    envelope, left = (nothing, nothing) if case is None else (facts.envelope[case].bound, left_side(facts, case))
+    sample, proof, case = trajectory.sample, trajectory.proof, applicable_case(trajectory.whole)
+    nothing = np.full(trajectory.t.shape, np.nan)
+    envelope, left = (nothing, nothing) if case is None else (trajectory.envelope[case].bound, left_side(trajectory, case))
     bounds = (
-        {"xi, by V1": np.full(sample.q.shape, np.nan), "e2": nothing, "f_tilde": nothing} if case is None else bounds_along(facts, envelope)
+        {"xi, by V1": np.full(sample.q.shape, np.nan), "e2": nothing, "f_tilde": nothing}
+        if case is None
+        else bounds_along(trajectory, envelope)
     )
     traces = Traces(
-        t=facts.t,
-        V=evidence.V,
+        t=trajectory.t,
+        V=proof.V,
         envelope=envelope,
-        left=np.where(evidence.held, np.nan, left),
-        dropped=evidence.dropped_e2 + evidence.dropped_f,
+        left=np.where(proof.held, np.nan, left),
+        dropped=proof.dropped_e2 + proof.dropped_f,
         xi=sample.xi,
         xi_bound=bounds["xi, by V1"],
-        e2=np.linalg.norm(evidence.e2, axis=1),
+        e2=np.linalg.norm(proof.e2, axis=1),
         e2_bound=bounds["e2"],
-        f_tilde=np.linalg.norm(evidence.f_tilde, axis=1),
+        f_tilde=np.linalg.norm(proof.f_tilde, axis=1),
         f_tilde_bound=bounds["f_tilde"],
-        held=evidence.held,
+        held=proof.held,
     )
-    return Traces(*(x[facts.recorded] for x in traces))
+    return Traces(*(x[trajectory.recorded] for x in traces))
 
 
 def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], count: int) -> Certificate:

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.facts import Facts, Whole
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
 from iblf_jax.certificates.retrace import STRETCH
+from iblf_jax.certificates.trajectory import Trajectory, Whole
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.scenario import Scenario
 
@@ -71,13 +71,13 @@ def _worst(same: list[Line]) -> Line:
     return dataclasses.replace(worst, value=max(values)) if worst.value is not None and values else worst
 
 
-def of_stretch(facts: Facts) -> tuple[list[Line], dict[str, float]]:
+def of_stretch(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
     """The lines that are about instants, for one stretch, and the largest share that each dropped term has of its margin there."""
-    lines = assumptions(facts)
-    lines += [inequality(facts, case) for case in claims.CASES]
-    lines += [envelope(facts, case) for case in claims.CASES]
-    terms, shares = dropped(facts)
-    return [*lines, *bounds(facts), *terms, conclusion(facts)], shares
+    lines = assumptions(trajectory)
+    lines += [inequality(trajectory, case) for case in claims.CASES]
+    lines += [envelope(trajectory, case) for case in claims.CASES]
+    terms, shares = dropped(trajectory)
+    return [*lines, *bounds(trajectory), *terms, conclusion(trajectory)], shares
 
 
 def why_not(whole: Whole, case: int) -> str:
@@ -98,20 +98,20 @@ def applicable_case(whole: Whole) -> int | None:
     return next((case for case in claims.CASES if not why_not(whole, case)), None)
 
 
-def left_side(facts: Facts, case: int) -> np.ndarray:
+def left_side(trajectory: Trajectory, case: int) -> np.ndarray:
     """The left side of the differential inequality at every step, (T,) [1/s]."""
-    evidence = facts.evidence
-    left = evidence.dV + facts.whole.rho[case, "run"] * evidence.V
-    return left if case == 1 else left - 0.5 * np.sum(evidence.df**2, axis=1)
+    proof = trajectory.proof
+    left = proof.dV + trajectory.whole.rho[case, "run"] * proof.V
+    return left if case == 1 else left - 0.5 * np.sum(proof.df**2, axis=1)
 
 
-def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, description: Description) -> Line:
+def judged(trajectory: Trajectory, margins: np.ndarray, tolerances: np.ndarray | float, description: Description) -> Line:
     """A line from margins at every step, (T,) or (T, n), with NaN where nothing is claimed."""
-    if np.all(facts.evidence.held):
+    if np.all(trajectory.proof.held):
         return Line(verdict=HOLDS, margin=np.inf, **description)
     margins = np.asarray(margins, float)
     tolerances = np.broadcast_to(np.asarray(tolerances, float), margins.shape)
-    claimed = ~(facts.evidence.held if margins.ndim == 1 else np.broadcast_to(facts.evidence.held[:, None], margins.shape))
+    claimed = ~(trajectory.proof.held if margins.ndim == 1 else np.broadcast_to(trajectory.proof.held[:, None], margins.shape))
     broken = claimed & ~(margins >= -tolerances)
     watched = np.where(broken if np.any(broken) else claimed, np.nan_to_num(margins, nan=-np.inf), np.inf)
     place = np.unravel_index(np.argmin(watched), margins.shape)
@@ -119,7 +119,7 @@ def judged(facts: Facts, margins: np.ndarray, tolerances: np.ndarray | float, de
         verdict=FAILS if np.any(broken) else HOLDS,
         margin=float(margins[place]),
         tolerance=float(tolerances[place]),
-        time=float(facts.t[place[0]]),
+        time=float(trajectory.t[place[0]]),
         joint=int(place[1]) if margins.ndim == 2 else None,
         **description,
     )
@@ -135,10 +135,10 @@ def _excluded(whole: Whole) -> str:
     return "; ".join(notes)
 
 
-def assumptions(facts: Facts) -> list[Line]:
+def assumptions(trajectory: Trajectory) -> list[Line]:
     """Bounds of Assumption 1 along the run, and feasibility of the reference, Assumption 2."""
-    whole, sample, evidence = facts.whole, facts.sample, facts.evidence
-    size, speed = np.linalg.norm(evidence.f, axis=1), np.linalg.norm(evidence.df, axis=1)
+    whole, sample, proof = trajectory.whole, trajectory.sample, trajectory.proof
+    size, speed = np.linalg.norm(proof.f, axis=1), np.linalg.norm(proof.df, axis=1)
     lines = []
     for name, statement, values, unit in (
         ("f bounded", "|f| <= F_m", size, "N m"),
@@ -148,14 +148,14 @@ def assumptions(facts: Facts) -> list[Line]:
         jumps = "" if name == "f bounded" or not whole.jumps.size else f"Assumption 1 is broken by a jump of f: {_excluded(whole)}"
         verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
         lines.append(
-            Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(facts.t[at]), note=jumps)
+            Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(trajectory.t[at]), note=jumps)
         )
     room = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     row, joint = np.unravel_index(np.argmin(room), room.shape)
     feasible: Description = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
-    line = _plain(feasible, float(room[row, joint]), joint=int(joint), time=float(facts.t[row]))
+    line = _plain(feasible, float(room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
     lines.append(_as_status(whole, line, Status.INFEASIBLE_REFERENCE))
-    if facts.t[0] == 0:
+    if trajectory.t[0] == 0:
         start = np.minimum(sample.q[0] - sample.lower[0], sample.upper[0] - sample.q[0])
         inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
         lines.append(_plain(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
@@ -206,33 +206,35 @@ def rates(whole: Whole, case: int) -> list[Line]:
         if reason or whole.claim is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        largest = whole.lambda_max if where == "run" else whole.box.lambda_max
+        largest = whole.lambda_max if where == "run" else whole.eigenvalues.lambda_max
         terms = np.asarray(claims.rho_terms(whole.claim, jnp.asarray(largest), case))
         least = ("the decay rate of V1", "K2 over lambda_max(M0)", "kf")[int(np.argmin(terms))]
-        note = f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.box.searched})" if where == "box" else "") + f"; set by {least}"
+        note = (
+            f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.eigenvalues.searched})" if where == "box" else "") + f"; set by {least}"
+        )
         counts = not (case == 2 and whole.case == 1)
         lines.append(_plain(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
     return lines
 
 
-def inequality(facts: Facts, case: int) -> Line:
+def inequality(trajectory: Trajectory, case: int) -> Line:
     """The differential inequality, at every step."""
     description: Description = {"name": f"inequality, case {case}", "equation": INEQUALITY[case], "statement": LEFT[case], "unit": "1/s"}
-    reason = why_not(facts.whole, case)
+    reason = why_not(trajectory.whole, case)
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
-    tolerance = facts.whole.eps * (facts.evidence.terms + facts.whole.rho[case, "run"] * facts.evidence.V)
-    return judged(facts, -left_side(facts, case), tolerance, {**description, "note": _excluded(facts.whole)})
+    tolerance = trajectory.whole.eps * (trajectory.proof.terms + trajectory.whole.rho[case, "run"] * trajectory.proof.V)
+    return judged(trajectory, -left_side(trajectory, case), tolerance, {**description, "note": _excluded(trajectory.whole)})
 
 
-def envelope(facts: Facts, case: int) -> Line:
+def envelope(trajectory: Trajectory, case: int) -> Line:
     """The envelope of V2, at every step."""
     description: Description = {"name": f"envelope, case {case}", "equation": ENVELOPE[case], "statement": ENVELOPED[case]}
-    reason = why_not(facts.whole, case)
+    reason = why_not(trajectory.whole, case)
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
-    upper = facts.envelope[case]
-    return judged(facts, upper.bound - facts.evidence.V, upper.tolerance, {**description, "note": _excluded(facts.whole)})
+    upper = trajectory.envelope[case]
+    return judged(trajectory, upper.bound - trajectory.proof.V, upper.tolerance, {**description, "note": _excluded(trajectory.whole)})
 
 
 @jax.jit
@@ -242,22 +244,22 @@ def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | Non
     return None if stated is None else jax.vmap(lambda t, V: stated(V, scenario.setting.tube(t)))(t, V)
 
 
-def bounds_along(facts: Facts, V: np.ndarray) -> dict[str, np.ndarray]:
+def bounds_along(trajectory: Trajectory, V: np.ndarray) -> dict[str, np.ndarray]:
     """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
     places = np.minimum(np.arange(STRETCH), V.size - 1)  # one program for stretches of every size
-    by_barrier = _xi_bound(facts.whole.run.scenario, facts.t[places], jnp.asarray(V[places], facts.t.dtype))
+    by_barrier = _xi_bound(trajectory.whole.run.scenario, trajectory.t[places], jnp.asarray(V[places], trajectory.t.dtype))
     return {
-        "xi, by V1": np.full(facts.sample.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier)[: V.size],
-        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], facts.sample.q.shape),
-        "e2": np.sqrt(2 * V / facts.whole.lambda_min),
+        "xi, by V1": np.full(trajectory.sample.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier)[: V.size],
+        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], trajectory.sample.q.shape),
+        "e2": np.sqrt(2 * V / trajectory.whole.lambda_min),
         "f_tilde": np.sqrt(2 * V),
     }
 
 
-def bounds(facts: Facts) -> list[Line]:
+def bounds(trajectory: Trajectory) -> list[Line]:
     """The bounds on xi, e2 and f_tilde that follow from the envelope of the case at hand."""
-    case = applicable_case(facts.whole)
-    shown = case or facts.whole.case
+    case = applicable_case(trajectory.whole)
+    shown = case or trajectory.whole.case
     descriptions: list[Description] = [
         {
             "name": "xi, by V1",
@@ -269,21 +271,21 @@ def bounds(facts: Facts) -> list[Line]:
         {"name": "f_tilde", "equation": BOUNDS[shown], "statement": "|f_tilde| <= sqrt(2 Vbar)", "unit": "N m"},
     ]
     if case is None:
-        reason = why_not(facts.whole, facts.whole.case)
+        reason = why_not(trajectory.whole, trajectory.whole.case)
         return [Line(verdict=NOT_APPLICABLE, note=reason, **description) for description in descriptions]
-    upper, evidence = facts.envelope[case], facts.evidence
-    tight, wide = bounds_along(facts, upper.bound), bounds_along(facts, upper.bound + upper.tolerance)
-    sizes = {"xi, by V1": np.abs(evidence.xi), "xi": np.abs(evidence.xi)}
-    sizes |= {"e2": np.linalg.norm(evidence.e2, axis=1), "f_tilde": np.linalg.norm(evidence.f_tilde, axis=1)}
+    upper, proof = trajectory.envelope[case], trajectory.proof
+    tight, wide = bounds_along(trajectory, upper.bound), bounds_along(trajectory, upper.bound + upper.tolerance)
+    sizes = {"xi, by V1": np.abs(proof.xi), "xi": np.abs(proof.xi)}
+    sizes |= {"e2": np.linalg.norm(proof.e2, axis=1), "f_tilde": np.linalg.norm(proof.f_tilde, axis=1)}
     lines = []
     for description in descriptions:
         name = description["name"]
-        reason = _no_xi_bound(tight) if name.startswith("xi") and not np.all(evidence.held) else ""
+        reason = _no_xi_bound(tight) if name.startswith("xi") and not np.all(proof.held) else ""
         if reason and (name == "xi" or np.all(np.isnan(tight["xi, by V1"]))):
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(facts.whole)) if x)
-        lines.append(judged(facts, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
+        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(trajectory.whole)) if x)
+        lines.append(judged(trajectory, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
     return lines
 
 
@@ -295,45 +297,50 @@ def _no_xi_bound(tight: dict[str, np.ndarray]) -> str:
     return "" if np.all(stronger | np.isnan(tight["xi"])) else "xi^2/2 <= V1 (Theorem 1) is not so for this barrier"
 
 
-def dropped(facts: Facts) -> tuple[list[Line], dict[str, float]]:
+def dropped(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
     """The size of the terms that the printed proof drops, against the margin that it leaves, and their largest share of it."""
-    law, evidence, case = claims.law_of(facts.whole.run.scenario), facts.evidence, applicable_case(facts.whole)
+    law, proof, case = claims.law_of(trajectory.whole.run.scenario), trajectory.proof, applicable_case(trajectory.whole)
     described = (
-        ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", evidence.dropped_e2),
-        ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", evidence.dropped_f),
+        ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", proof.dropped_e2),
+        ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", proof.dropped_f),
     )
-    exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(facts))
+    exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(trajectory))
     lines, shares = [], {}
     for (name, equation, statement, term), none_dropped in zip(described, exact, strict=True):
         description: Description = {"name": name, "equation": equation, "statement": statement, "unit": "1/s", "counts": False}
-        reason = facts.whole.no_claim or facts.whole.no_run or none_dropped or ("" if case else why_not(facts.whole, facts.whole.case))
+        reason = (
+            trajectory.whole.no_claim
+            or trajectory.whole.no_run
+            or none_dropped
+            or ("" if case else why_not(trajectory.whole, trajectory.whole.case))
+        )
         if reason or case is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        proven = evidence.dropped_e2 + evidence.dropped_f - left_side(facts, case)
-        tolerance = facts.whole.eps * evidence.terms
-        free = ~evidence.held
+        proven = proof.dropped_e2 + proof.dropped_f - left_side(trajectory, case)
+        tolerance = trajectory.whole.eps * proof.terms
+        free = ~proof.held
         shares[name] = float(np.max(np.where(free, term / np.maximum(proven, tolerance), 0.0)))
         largest = float(np.max(np.abs(term[free]), initial=0.0))
-        lines.append(judged(facts, proven - term, tolerance, {**description, "value": largest}))
+        lines.append(judged(trajectory, proven - term, tolerance, {**description, "value": largest}))
     return lines, shares
 
 
-def _exact_observer(facts: Facts) -> str:
-    return "exact: the observer has momentum form" if type(facts.whole.run.scenario.observer).__name__ == "Momentum" else ""
+def _exact_observer(trajectory: Trajectory) -> str:
+    return "exact: the observer has momentum form" if type(trajectory.whole.run.scenario.observer).__name__ == "Momentum" else ""
 
 
-def conclusion(facts: Facts) -> Line:
+def conclusion(trajectory: Trajectory) -> Line:
     """Properties (I) and (II): every joint inside its bounds, at every step."""
     description: Description = {"name": "joints inside", "equation": "(I), (II)", "statement": "|xi_i| < 1: -k_l < e1 < k_u"}
-    room = 1.0 - np.abs(facts.sample.xi)
+    room = 1.0 - np.abs(trajectory.sample.xi)
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
-    case = applicable_case(facts.whole)
-    line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(facts.t[at]))
-    line = _as_status(facts.whole, line, Status.BOUND_VIOLATED)
-    unclaimed = case is not None and _xi_bound(facts.whole.run.scenario, facts.t[:1], facts.evidence.V[:1]) is None
+    case = applicable_case(trajectory.whole)
+    line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
+    line = _as_status(trajectory.whole, line, Status.BOUND_VIOLATED)
+    unclaimed = case is not None and _xi_bound(trajectory.whole.run.scenario, trajectory.t[:1], trajectory.proof.V[:1]) is None
     if case is None or unclaimed:
-        reason = NO_BOUND if unclaimed else why_not(facts.whole, facts.whole.case)
+        reason = NO_BOUND if unclaimed else why_not(trajectory.whole, trajectory.whole.case)
         note = f"no claim, only seen ({reason})"
         return Line(**{**vars(line), "verdict": NOT_APPLICABLE, "note": note})
     return line

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.evidence import along_run
+from iblf_jax.certificates.proof_terms import along_run
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
@@ -37,8 +37,8 @@ class Stretch(NamedTuple):
     t: np.ndarray
     sample: Any
     """Their `Sample`."""
-    evidence: Any
-    """Their `Evidence`."""
+    proof: Any
+    """Their `ProofTerms`."""
     defect: np.ndarray
     """The integrator's error in V2 over one step from each."""
     recorded: np.ndarray
@@ -80,8 +80,8 @@ def grid(run: Any) -> tuple[int, int]:
         raise checks.fail("run.t", run.t, f"0 and whole multiples of run.dt, {dt:g} s, at equal distances", "Simulate it again.")
     last = (t.size - 1) * every if run.steps is None else run.steps
     if not last > 0 or not 0 <= last - (t.size - 1) * every < every:
-        mend = "Simulate it again with record_every so small that there are two."
-        raise checks.fail("run", f"{t.size} recorded samples of {run.steps} steps", "samples that cover the run", mend)
+        remedy = "Simulate it again with record_every so small that there are two."
+        raise checks.fail("run", f"{t.size} recorded samples of {run.steps} steps", "samples that cover the run", remedy)
     return every, last
 
 
@@ -150,8 +150,8 @@ def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> St
     t = index.astype(run.t.dtype) * run.dt
     padded = jax.tree.map(lambda x: x[places], (t, states))
     found = along_run(run.scenario, *padded, run.dt, method=run.method)
-    evidence, sample, defect = jax.tree.map(lambda x: np.asarray(x)[:size], found)
-    return Stretch(t, sample, evidence, defect, index % every == 0)
+    proof, sample, defect = jax.tree.map(lambda x: np.asarray(x)[:size], found)
+    return Stretch(t, sample, proof, defect, index % every == 0)
 
 
 def _check_arrival(run: Any, recorded: LoopState, made: LoopState, rows: np.ndarray) -> None:
@@ -177,9 +177,9 @@ def _compare(run: Any, name: str, kept: np.ndarray, made: np.ndarray, rows: np.n
     if far.any():
         k = int(np.argmax(far))
         where = f"{name} of sample {int(rows[k])} (t = {float(run.t[rows[k]]):.6g} s)"
-        mend = f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, made again {made[k]}. "
-        mend += "Simulate it again; a loop that amplifies rounding that much needs record_every=1."
-        raise checks.fail("run", "samples that its scenario does not give", "the run of run.scenario", mend)
+        remedy = f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, made again {made[k]}. "
+        remedy += "Simulate it again; a loop that amplifies rounding that much needs record_every=1."
+        raise checks.fail("run", "samples that its scenario does not give", "the run of run.scenario", remedy)
 
 
 def check_status(run: Any, margin: float) -> None:
@@ -189,5 +189,5 @@ def check_status(run: Any, margin: float) -> None:
     unseen = flagged and margin > 0 and run.steps is None
     if flagged == (not margin > 0) or unseen or abs(margin) <= tolerances(run)["position"]:
         return
-    mend = f"All its steps, made again, have a smallest margin of {margin:.3g} rad. Simulate it again."
-    raise checks.fail("run.status", describe(int(run.status)), "the status of run.scenario", mend)
+    remedy = f"All its steps, made again, have a smallest margin of {margin:.3g} rad. Simulate it again."
+    raise checks.fail("run.status", describe(int(run.status)), "the status of run.scenario", remedy)

@@ -29,7 +29,7 @@ SETTLED = 0.01
 """rad; the tolerance of the metric settling_time."""
 
 
-class Claim(NamedTuple):
+class PaperClaim(NamedTuple):
     """One claim of the paper and what the runs say."""
 
     claim: str
@@ -38,7 +38,7 @@ class Claim(NamedTuple):
     numbers: dict[str, Any]
 
 
-def paper_claims(runs: Pair) -> list[Claim]:
+def paper_claims(runs: Pair) -> list[PaperClaim]:
     """Every claim, judged.
 
     Args:
@@ -71,24 +71,24 @@ def _metric(runs: Pair, name: str) -> dict[str, np.ndarray]:
     return {label: np.asarray(run.metrics[name]) for label, run in runs.items()}
 
 
-def bounds_kept(runs: Pair) -> Claim:
+def bounds_kept(runs: Pair) -> PaperClaim:
     """The constraint boundaries are not broken."""
     margins = _metric(runs, "margin")
     flagged = [name for name, run in runs.items() if int(run.status) & int(Status.BOUND_VIOLATED)]
     held = not flagged and all(np.all(m > 0) for m in margins.values())
     detail = f"smallest distance to a bound, joint by joint: {_versus(margins, 'rad')}."
-    return Claim("Neither law violates its time-varying asymmetric bounds.", held, detail, {"margin [rad]": margins})
+    return PaperClaim("Neither law violates its time-varying asymmetric bounds.", held, detail, {"margin [rad]": margins})
 
 
-def both_track(runs: Pair) -> Claim:
+def both_track(runs: Pair) -> PaperClaim:
     """The robot tracks the reference under both laws."""
     times = _metric(runs, "settling_time")
     held = all(np.all(np.isfinite(x)) for x in times.values())
     detail = f"|e1| stays under {SETTLED:g} rad from: {_versus(times, 's')}."
-    return Claim("Both laws track the reference.", held, detail, {"settling_time [s]": times})
+    return PaperClaim("Both laws track the reference.", held, detail, {"settling_time [s]": times})
 
 
-def faster(runs: Pair) -> Claim:
+def faster(runs: Pair) -> PaperClaim:
     """The trajectory converges more quickly under the proposed law."""
     times = _metric(runs, "settling_time")
     proposed, compared = times.values()
@@ -96,19 +96,19 @@ def faster(runs: Pair) -> Claim:
     detail = f"settling times {_versus(times, 's')}"
     if held and np.all(np.isfinite(compared)):
         detail += f": sooner by {each_joint(100.0 * (1.0 - proposed / compared), '%')}"
-    return Claim("The integral form converges faster.", held, f"{detail}.", {"settling_time [s]": times})
+    return PaperClaim("The integral form converges faster.", held, f"{detail}.", {"settling_time [s]": times})
 
 
-def more_accurate(runs: Pair) -> Claim:
+def more_accurate(runs: Pair) -> PaperClaim:
     """The control accuracy is slightly higher, the tracking error smaller."""
     rmse = _metric(runs, "rmse")
     late = {name: _late_peak(run, run.e1) for name, run in runs.items()}
     held = all(bool(np.all(a < b)) for a, b in (tuple(rmse.values()), tuple(late.values())))
     detail = f"rms of e1 {_versus(rmse, 'rad')}; largest late |e1| {_versus(late, 'rad')}."
-    return Claim("The integral form is slightly more accurate.", held, detail, {"rmse [rad]": rmse, "late |e1| [rad]": late})
+    return PaperClaim("The integral form is slightly more accurate.", held, detail, {"rmse [rad]": rmse, "late |e1| [rad]": late})
 
 
-def overshoot_of_e2(runs: Pair) -> Claim:
+def overshoot_of_e2(runs: Pair) -> PaperClaim:
     """The overshoot of the velocity error is greater in the initial stage."""
     swings = {}
     for name, run in runs.items():
@@ -117,7 +117,7 @@ def overshoot_of_e2(runs: Pair) -> Claim:
     proposed, compared = swings.values()
     detail = f"how far e2 swings past zero in the first {INITIAL_STAGE:g} s: {_versus(swings, 'rad/s')}."
     held = bool(np.all(proposed > compared))
-    return Claim("The integral form overshoots more in e2 at the start.", held, detail, {"overshoot of e2 [rad/s]": swings})
+    return PaperClaim("The integral form overshoots more in e2 at the start.", held, detail, {"overshoot of e2 [rad/s]": swings})
 
 
 def _estimate_errors(runs: Pair) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -126,7 +126,7 @@ def _estimate_errors(runs: Pair) -> tuple[dict[str, np.ndarray], dict[str, np.nd
     return late, {name: np.abs(np.asarray(run.disturbance)).max(axis=0) for name, run in runs.items()}
 
 
-def estimate_follows(runs: Pair) -> Claim:
+def estimate_follows(runs: Pair) -> PaperClaim:
     """The observer's estimate tends to the uncertain term."""
     late, peak = _estimate_errors(runs)
     held = all(bool(np.all(late[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
@@ -135,12 +135,12 @@ def estimate_follows(runs: Pair) -> Claim:
         f"largest late |f - f_hat|: {_versus(late, 'N m')}; as a share of the peak of |f|: {_versus(share, '%')} "
         f"(held if under {100 * ESTIMATE_SHARE:g} %; the observer lags by 1/kf, so about |f'|/kf remains)."
     )
-    return Claim(
+    return PaperClaim(
         "The observer's estimate tends to the uncertain term.", held, detail, {"late |f - f_hat| [N m]": late, "peak |f| [N m]": peak}
     )
 
 
-def small_neighbourhood(runs: Pair) -> Claim:
+def small_neighbourhood(runs: Pair) -> PaperClaim:
     """The error signals e1, e2 and f_tilde tend to a very small neighbourhood of zero."""
     e1 = {name: _late_peak(run, run.e1) for name, run in runs.items()}
     e2 = {name: _late_peak(run, run.e2) for name, run in runs.items()}
@@ -157,7 +157,7 @@ def small_neighbourhood(runs: Pair) -> Claim:
         f"f_tilde under {100 * ESTIMATE_SHARE:g} % of the peak of |f|)."
     )
     numbers = {"late |e1| [rad]": e1, "late |e2| [rad/s]": e2, "late |f_tilde| [N m]": f_tilde}
-    return Claim("The error signals tend to a very small neighbourhood of zero.", held, detail, numbers)
+    return PaperClaim("The error signals tend to a very small neighbourhood of zero.", held, detail, numbers)
 
 
 def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +172,7 @@ def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(V1), np.asarray(xi)
 
 
-def theorem_1(runs: Pair) -> Claim:
+def theorem_1(runs: Pair) -> PaperClaim:
     """Theorem 1, xi^2/2 <= V1 <= xi^2/(1 - xi^2), along the run of the integral form."""
     from iblf_jax.barriers import Integral
 
@@ -188,7 +188,7 @@ def theorem_1(runs: Pair) -> Claim:
         f"{low[at]:.4g} <= {V1[at]:.4g} <= {high[at]:.4g}."
     )
     numbers = {"samples": V1.size, "broken": broken, "largest |xi|": abs(xi[at]), "lower": low[at], "V1": V1[at], "upper": high[at]}
-    return Claim("Theorem 1 holds along the run: xi^2/2 <= V1 <= xi^2/(1 - xi^2).", broken == 0, detail, numbers)
+    return PaperClaim("Theorem 1 holds along the run: xi^2/2 <= V1 <= xi^2/(1 - xi^2).", broken == 0, detail, numbers)
 
 
 def remark(runs: Pair) -> str:

@@ -75,8 +75,8 @@ def _check_exists(name: str) -> None:
     from iblf_jax.presets import PRESETS
 
     if not Path(name).is_file():
-        mend = did_you_mean(name, PRESETS) if not name.endswith(".toml") else "Give the path of a scenario file."
-        raise ValueError(f"{name}: no such file, and no such preset. {mend}")
+        remedy = did_you_mean(name, PRESETS) if not name.endswith(".toml") else "Give the path of a scenario file."
+        raise ValueError(f"{name}: no such file, and no such preset. {remedy}")
 
 
 def assignments(option: str, words: list[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from iblf_jax.cli._common import metrics_table, output_folder, verdict, write_js
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from iblf_jax.cli._claims import Claim
+    from iblf_jax.cli._claims import PaperClaim
     from iblf_jax.simulation.results import Rollout
 
 NAMES = {"integral": "integral BLF", "log": "log-BLF"}
@@ -80,7 +80,7 @@ def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[s
     return runs, {"first": first, "again": both()[1]}
 
 
-def _print_claims(claims: list[Claim], note: str) -> None:
+def _print_claims(claims: list[PaperClaim], note: str) -> None:
     print("What the paper claims, and what these runs show")
     for i, claim in enumerate(claims, 1):
         print(f"{i}. {'HELD        ' if claim.held else 'DID NOT HOLD'}  {claim.claim}")
@@ -89,7 +89,7 @@ def _print_claims(claims: list[Claim], note: str) -> None:
 
 
 def _write_data(
-    folder: Path, args: argparse.Namespace, runs: dict[str, Rollout], claims: list[Claim], note: str, seconds: dict[str, float]
+    folder: Path, args: argparse.Namespace, runs: dict[str, Rollout], claims: list[PaperClaim], note: str, seconds: dict[str, float]
 ) -> None:
     import jax
 

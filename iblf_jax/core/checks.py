@@ -1,4 +1,4 @@
-"""Host-side checks: each failure is a ValueError that names the field, what came, what was expected, and the mend.
+"""Host-side checks: each failure is a ValueError that names the field, what came, what was expected, and the remedy.
 
 Values that JAX is tracing have no number yet; every check passes them by, so the same constructors and entry
 points work under `jit`, `vmap` and `grad`.  What can only be known inside a run is in `status`, not here.
@@ -91,9 +91,9 @@ def shown(value: Any) -> str:
     return line(text, "value")
 
 
-def fail(field: str, got: Any, expected: str, mend: str = "") -> ValueError:
-    """The one form of error message: field, value, expectation and mend, in one line."""
-    return ValueError(f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}." + (f" {line(mend)}" if mend else ""))
+def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
+    """The one form of error message: field, value, expectation and remedy, in one line."""
+    return ValueError(f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}." + (f" {line(remedy)}" if remedy else ""))
 
 
 def renamed(**names: str) -> Callable[[F], F]:
@@ -199,7 +199,7 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
         raise fail(name, value, "one of " + ", ".join(repr(x) for x in allowed))
 
 
-def conforms(name: str, value: Any, protocol: type, mend: str = "", optional: tuple[str, ...] = ()) -> None:
+def conforms(name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()) -> None:
     """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks for, except `optional`."""
     members = {x for x in (*vars(protocol), *getattr(protocol, "__annotations__", {})) if not x.startswith("_")}
     public = protocol.__module__.removesuffix("._base").replace("iblf_jax.simulation.", "iblf_jax.")
@@ -209,7 +209,7 @@ def conforms(name: str, value: Any, protocol: type, mend: str = "", optional: tu
     bare = value is None or isinstance(value, str | bytes | tuple | list | dict | jax.Array | np.ndarray) or _is_number_like(value)
     missing = sorted(x for x in members - set(optional) if bare or not hasattr(value, x))
     if bare or missing:
-        raise fail(name, value, expected, " ".join(x for x in (mend, "" if bare else f"It lacks {', '.join(missing)}.") if x))
+        raise fail(name, value, expected, " ".join(x for x in (remedy, "" if bare else f"It lacks {', '.join(missing)}.") if x))
     if any(leaf is value for leaf in jax.tree.leaves(value)):
         raise fail(name, value, expected, "JAX does not know its class: decorate it with iblf_jax.component.")
 
@@ -242,8 +242,8 @@ def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> flo
     """A finite positive Python float (or 0, if that may be) from a user's argument, or a ValueError."""
     expected = f"a {'number >= 0' if zero else 'positive number'} [{unit}]"
     if isinstance(value, jax.core.Tracer):
-        mend = "It decides how many steps are compiled: use a Python number, or static_argnames in your jit."
-        raise fail(name, value, expected, mend)
+        remedy = "It decides how many steps are compiled: use a Python number, or static_argnames in your jit."
+        raise fail(name, value, expected, remedy)
     array_like = isinstance(value, np.generic | np.ndarray | jax.Array)
     if isinstance(value, bool) or not (array_like or isinstance(value, numbers.Real)):
         raise fail(name, value, expected)
@@ -269,11 +269,11 @@ def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None 
     return number
 
 
-def fits(name: str, count: int, bytes_each: float, mend: str = "") -> None:
+def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
     """Raises if `count` things of that size are more than this machine's memory holds; says how many it does."""
     most = int(memory() // max(1, bytes_each))
     if count > most:
-        raise fail(name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", mend)
+        raise fail(name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", remedy)
 
 
 def memory() -> int:

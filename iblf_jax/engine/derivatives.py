@@ -26,8 +26,9 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.engine.batch import Batch, Executor, begin, end
 from iblf_jax.engine.step import Carry, Form, Inputs, Outcome, Run, advance
 from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, initial_state
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
+from iblf_jax.simulation.signals import Sample
 
 FLAGS = ("guard_active", "saturated")
 """Fields of a sample that are no numbers."""

@@ -235,7 +235,7 @@ def run_batch_jvp(
     return with_fallback(backend, run_on, plain)
 
 
-def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds: Any, dt: jax.Array, *, method: str) -> str:
+def chosen_backend(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds: Any, dt: jax.Array, *, method: str) -> str:
     """The backend that a batch will run on, fallbacks and their warnings included; builds the kernels if it is a compiled one.
 
     Args:
@@ -249,12 +249,12 @@ def settled(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds: 
       ValueError: an unknown backend.
     """
     flat, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
-    return _settled(backend, method, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
+    return _chosen_backend(backend, method, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
 
 
 @lru_cache(maxsize=64)
-def _settled(backend: str, method: str, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
-    """`settled` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
+def _chosen_backend(backend: str, method: str, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
+    """`chosen_backend` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
 
     def trace(leaves):
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)

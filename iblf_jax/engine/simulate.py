@@ -74,7 +74,7 @@ def simulate(
       A `Rollout` with T = steps // record_every + 1 samples.
 
     Raises:
-      ValueError: bad arguments; the message names the field, the value and the mend.
+      ValueError: bad arguments; the message names the field, the value and the remedy.
       SimulationError: with `throw`, when a bound was violated, the state ran away or the step was too large.
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
@@ -84,8 +84,8 @@ def simulate(
     steps = checks.whole_steps(duration, dt)
     record_every, throw = checks.recorded_every(record_every, steps), checks.flag("throw", throw)
     if steps // record_every > MOST_SAMPLES:
-        mend = f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all the same."
-        raise checks.fail("record_every", record_every, f"at most {MOST_SAMPLES} recorded samples of {steps} steps", mend)
+        remedy = f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all the same."
+        raise checks.fail("record_every", record_every, f"at most {MOST_SAMPLES} recorded samples of {steps} steps", remedy)
     scenario = canonical(scenario)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario.n)

@@ -24,12 +24,9 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.simulation import accuracy, integrators, stability
-from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, initial_state
-from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
-
-RECORDED = tuple(f.name for f in dataclasses.fields(Rollout) if f.name in Sample._fields and f.name != "dt")
-"""Names of the quantities that a run records."""
+from iblf_jax.simulation.signals import SIGNALS, Sample
 
 
 class Run(NamedTuple):
@@ -204,7 +201,7 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
 
 def record_of(sample: Sample, state: LoopState):
     """What is kept of a sample, and the states of law and observer."""
-    return {name: getattr(sample, name) for name in RECORDED}, state.controller, state.observer
+    return {name: getattr(sample, name) for name in SIGNALS}, state.controller, state.observer
 
 
 @dataclasses.dataclass(frozen=True)

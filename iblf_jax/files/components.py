@@ -4,7 +4,7 @@ Nothing here knows a robot or a law by name.  A component's table has one key a 
 hold any member of a family; the family is read from the field's annotation (`barrier: Barrier`), its members from the family's
 MEMBERS.  So a new member, or a law that holds another law, needs no change here.
 
-Every refusal is a ValueError that names the dotted key, what came, what was expected, and the mend.
+Every refusal is a ValueError that names the dotted key, what came, what was expected, and the remedy.
 """
 
 from __future__ import annotations

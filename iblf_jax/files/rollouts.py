@@ -26,27 +26,10 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.files.values import Words
 from iblf_jax.simulation.paths import parameters
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.signals import SIGNALS
 
 if TYPE_CHECKING:
     import xarray
-
-FIELDS = {
-    "q": ("rad", "joint position"),
-    "dq": ("rad/s", "joint velocity"),
-    "tau": ("N m", "applied torque"),
-    "e1": ("rad", "position error q - q_d"),
-    "e2": ("rad/s", "velocity error dq - alpha"),
-    "xi": ("1", "position error relative to its bound"),
-    "q_d": ("rad", "reference position"),
-    "dq_d": ("rad/s", "reference velocity"),
-    "lower": ("rad", "lower bound of q"),
-    "upper": ("rad", "upper bound of q"),
-    "alpha": ("rad/s", "virtual velocity"),
-    "disturbance": ("N m", "lumped uncertain term f"),
-    "disturbance_estimate": ("N m", "estimate of the uncertain term"),
-    "V": ("1", "Lyapunov function V2"),
-}
-"""Recorded field -> unit and description."""
 
 STATES = {"controller_state": "state of the law, in its own unit", "observer_state": "state of the observer, in its own unit"}
 """Recorded state -> description."""
@@ -155,10 +138,12 @@ def _own_dims(name: str, shape: tuple[int, ...], n: int) -> tuple[str, ...]:
 
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
-    for name, (unit, description) in FIELDS.items():
+    for name, signal in SIGNALS.items():
+        if name == "t":
+            continue
         value = np.asarray(getattr(run, name))
         dims = (*batch, "time", *_own_dims(name, value.shape[len(batch) + 1 :], run.n))
-        variables[name] = (dims, value, _attrs(unit, description))
+        variables[name] = (dims, value, _attrs(signal.unit, signal.meaning))
     return variables
 
 

@@ -18,7 +18,7 @@ or its robot is read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `robot_
 
 `[run]` (duration, dt, method, record_every) is optional and says how to run it.  A scalar stands for one number a joint.  `dtype`
 is there only if the scenario's precision differs from JAX's at the time.  Everything is checked: an unknown table, key or kind, a
-wrong type or shape, a missing key each is a ValueError that names the file, the dotted key, what came, what was expected and the mend.
+wrong type or shape, a missing key each is a ValueError that names the file, the dotted key, what came, what was expected and the remedy.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def load_scenario(path: str | os.PathLike) -> Scenario:
       path: a file in the format at the head of this module.
 
     Raises:
-      ValueError: the file is not TOML or does not describe a scenario; the message names file, key and mend.
+      ValueError: the file is not TOML or does not describe a scenario; the message names file, key and remedy.
       OSError: the file cannot be read.
     """
     return load_scenario_file(path).scenario
@@ -137,13 +137,13 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
 
 def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
     """Raises ValueError if the tables do not give the scenario back."""
-    expected, mend = "one scenario that its tables give back", "Save the runs of a batch one by one."
+    expected, remedy = "one scenario that its tables give back", "Save the runs of a batch one by one."
     try:
         same = _equal(from_dict(tables).scenario, scenario)
     except ValueError as error:
-        raise checks.fail("scenario", Words(f"leaves that a scenario cannot have ({error})"), expected, mend) from error
+        raise checks.fail("scenario", Words(f"leaves that a scenario cannot have ({error})"), expected, remedy) from error
     if not same:
-        raise checks.fail("scenario", Words("leaves that change on the way"), expected, mend)
+        raise checks.fail("scenario", Words("leaves that change on the way"), expected, remedy)
 
 
 def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None) -> str:
@@ -199,7 +199,7 @@ def from_dict(data: dict[str, Any], source: str = "", *, other_tables: Iterable[
       folder: of the file, which the paths of robots' files are relative to.
 
     Raises:
-      ValueError: anything that does not fit; the message names source, dotted key and mend.
+      ValueError: anything that does not fit; the message names source, dotted key and remedy.
     """
     try:
         data = {key: value for key, value in as_table(data, "file").items() if key not in set(other_tables)}
@@ -240,8 +240,8 @@ _OTHER = {"plant": "model", "model": "plant"}
 def _from_preset(data: dict[str, Any]) -> Scenario:
     for name in COMPONENTS:
         if name in data:
-            mend = f"Change its numbers in [parameters], or take the full text: python -m iblf_jax presets {data['preset']} --toml."
-            raise checks.fail(name, Words("this table beside preset"), "a preset, or a scenario written out", mend)
+            remedy = f"Change its numbers in [parameters], or take the full text: python -m iblf_jax presets {data['preset']} --toml."
+            raise checks.fail(name, Words("this table beside preset"), "a preset, or a scenario written out", remedy)
     known_keys(data, "", ("preset", "arguments", "parameters", "run", "dtype"))
     return preset_scenario(data["preset"], as_table(data.get("arguments", {}), "arguments"))
 

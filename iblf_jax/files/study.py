@@ -62,7 +62,7 @@ def load_study_file(path: str | os.PathLike, kind: str) -> StudyFile:
       kind: "study" or "sweep": the table that it must have.
 
     Raises:
-      ValueError: the file is not TOML or does not describe such a study; the message names file, key and mend.
+      ValueError: the file is not TOML or does not describe such a study; the message names file, key and remedy.
       OSError: it cannot be read.
     """
     checks.one_of("kind", kind, tuple(OPTIONS))
@@ -160,7 +160,7 @@ def _perturbation(table: Any, path: str) -> Perturbation:
 
 
 def _said_as_now(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:
-    """The mend for the spelling that tuning files once had, { factor = { uniform = [0.7, 1.3] } }, with the user's own numbers."""
+    """The remedy for the spelling that tuning files once had, { factor = { uniform = [0.7, 1.3] } }, with the user's own numbers."""
     name, given = next(iter(old.items()), ("", None))
     if len(old) != 1 or name not in distributions.MEMBERS:
         return SUCH_AS

@@ -53,7 +53,7 @@ from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
 from iblf_jax.tuning.parameters import tunable
-from iblf_jax.tuning.result import Setup, TuneResult
+from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
 
 components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
@@ -82,7 +82,7 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
       path: a file in the format at the head of this module.
 
     Raises:
-      ValueError: the file is not TOML or does not describe a tuning; the message names file, key and mend.
+      ValueError: the file is not TOML or does not describe a tuning; the message names file, key and remedy.
       OSError: the file cannot be read.
     """
     data, source = read_toml(path), os.fspath(path)
@@ -236,7 +236,7 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     """The result that `save_tuning` encoded."""
     start = from_dict(data["start"]).scenario
     values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
-    setup = Setup(
+    setup = TuneSetup(
         objective=checked(components.decode_fields(Objective, data["objective"], "objective")),
         perturbations={key: components.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
         risk=as_risk(Risk(*data["risk"])),

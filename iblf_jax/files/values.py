@@ -1,6 +1,6 @@
 """What a text file can hold, checked: tables, numbers, strings, lists, each against what was expected of it.
 
-Every refusal is a ValueError that names the dotted key, what came, what was expected, and the mend.
+Every refusal is a ValueError that names the dotted key, what came, what was expected, and the remedy.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def inline_table(table: dict[str, Any]) -> str:
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
-    """The mend for a misspelt word: the nearest known ones, or all of them."""
+    """The remedy for a misspelt word: the nearest known ones, or all of them."""
     words = [str(word) for word in known]
     close = difflib.get_close_matches(str(name), words, n=2, cutoff=0.6)
     if close:

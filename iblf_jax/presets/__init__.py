@@ -81,7 +81,8 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
 
     The paper's arm, reference and bounds without disturbance, so that V2 should fall at once.  The gains are inside (3.17) and (3.25),
     near their lower limits; the joints move fast, 4 rad/s.  There the terms that the printed proof drops outweigh what it leaves, and
-    V2 grows.  Found by `certificates.falsify` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded; f_hat(0) = (-0.5, 1.4) N m.
+    V2 grows.  Found by `certificates.counterexample` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded;
+    f_hat(0) = (-0.5, 1.4) N m.
 
     Args:
       reading: "printed" or "corrected"; the same gains and the same start, f_hat(0) included.

@@ -75,9 +75,9 @@ class _Reader:
         builder, parser = ET.TreeBuilder(), expat.ParserCreate()
         depth = 0
 
-        def fail(problem: str, mend: str = "") -> ValueError:
+        def fail(problem: str, remedy: str = "") -> ValueError:
             where = f"line {parser.CurrentLineNumber} of {str(path)!r}"
-            return ValueError(f"{where}: {problem}." + (f" {mend}" if mend else ""))
+            return ValueError(f"{where}: {problem}." + (f" {remedy}" if remedy else ""))
 
         def start(tag: str, attributes: dict[str, str]) -> None:
             nonlocal depth
@@ -134,16 +134,16 @@ class _Reader:
         return data
 
 
-def contents(field: str, path: Path, most: int, expected: str, mend: str = "") -> bytes:
+def contents(field: str, path: Path, most: int, expected: str, remedy: str = "") -> bytes:
     """What a file holds, no more than a byte beyond `most`; ValueError, with `field`, unless it is a file that can be read."""
     try:
         if not path.is_file():
             found = "It is a directory." if path.is_dir() else "It is not a file." if path.exists() else "Nothing is there."
-            raise checks.fail(field, str(path), expected, f"{found} {mend}")
+            raise checks.fail(field, str(path), expected, f"{found} {remedy}")
         with path.open("rb") as file:
             return file.read(most + 1)
     except OSError as error:
-        raise checks.fail(field, str(path), expected, f"It cannot be read: {error}. {mend}") from None
+        raise checks.fail(field, str(path), expected, f"It cannot be read: {error}. {remedy}") from None
 
 
 def label(element: ET.Element) -> str:

@@ -33,7 +33,7 @@ class Links(NamedTuple):
     carrier: dict[int, int]
     """Body -> that link, -1 for the base."""
 
-    def settled(self, joints: dict[str, Any], repairs: Repairs) -> Links:
+    def physical(self, joints: dict[str, Any], repairs: Repairs) -> Links:
         """The links, those mended that would leave the mass matrix singular.
 
         Args:
@@ -56,8 +56,8 @@ class Links(NamedTuple):
                 repairs.meet(Fault(f"link {self.names[i]!r}", "no mass", self._massless(i, "Give it an inertial, or fix its joint."), kept))
         return links
 
-    def _massless(self, i: int, mend: str) -> ValueError:
-        return checks.fail(f"link {self.names[i]!r}", Shown("no mass"), "a mass [kg] of each link that moves", mend)
+    def _massless(self, i: int, remedy: str) -> ValueError:
+        return checks.fail(f"link {self.names[i]!r}", Shown("no mass"), "a mass [kg] of each link that moves", remedy)
 
     def _compact(self, i: int, repairs: Repairs) -> Links:
         """The links, with link i as a compact body where it is a point, or a rod along its joint."""

@@ -65,7 +65,7 @@ def load(
       are infinite where the file has none.
 
     Raises:
-      ValueError: what is wrong with the file or the chain; the message names the element and the mend.
+      ValueError: what is wrong with the file or the chain; the message names the element and the remedy.
       ImportError: the extra `robots` is not installed.
 
     Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
@@ -131,8 +131,8 @@ class _Chain(NamedTuple):
         for name, mimic in file.mimics.items():
             if name in moving or mimic.master in moving:
                 coupled = name if name in moving else mimic.master
-                mend = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
-                error = checks.fail(f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", mend)
+                remedy = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
+                error = checks.fail(f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", remedy)
                 repairs.meet(
                     Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself" if name in moving else "one that is locked")
                 )
@@ -164,7 +164,7 @@ class _Chain(NamedTuple):
         joints = tree.of_joints(self.joints)
         links = tree.welded(self.base, self.joints, self.held, repairs)
         tree.check_closed(links, self.joints, tendons, repairs)
-        links = links.settled(joints, repairs)
+        links = links.physical(joints, repairs)
         p, R = links.frames[self.tip]
         tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
         return Arm(

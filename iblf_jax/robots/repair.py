@@ -68,7 +68,7 @@ class Weight(NamedTuple):
     nearest: np.ndarray | None = None
     """The inertia to take in its place, where there is a fault that can be mended."""
 
-    def settled(self, repairs: Repairs) -> Weight:
+    def physical(self, repairs: Repairs) -> Weight:
         """The weight to count, its fault met."""
         if self.fault is None:
             return self
@@ -112,8 +112,8 @@ def judged(where: str, mass: float, J: np.ndarray) -> Weight:
     if mass == 0:
         if not np.any(J):
             return Weight()
-        mend = "Give it its mass, or remove its inertia: tools differ in what they make of this."
-        error = checks.fail(f"{where}: inertial", Shown("an inertia without a mass"), "both or neither", mend)
+        remedy = "Give it its mass, or remove its inertia: tools differ in what they make of this."
+        error = checks.fail(f"{where}: inertial", Shown("an inertia without a mass"), "both or neither", remedy)
         nearest = thickened(J, 0.0)
         return Weight(
             0.0,
@@ -129,6 +129,6 @@ def judged(where: str, mass: float, J: np.ndarray) -> Weight:
     if moments[0] < -rounding:
         error = checks.fail(field, shown, "a positive definite inertia [kg m^2]", "A body that moves needs one.")
     else:
-        mend = "No body has such an inertia: look at the units, the signs and the frame."
-        error = checks.fail(field, shown, "none above the sum of the two others", mend)
+        remedy = "No body has such an inertia: look at the units, the signs and the frame."
+        error = checks.fail(field, shown, "none above the sum of the two others", remedy)
     return Weight(mass, J, Fault(field, shown, error, moments_of(nearest)), nearest)

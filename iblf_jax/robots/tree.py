@@ -138,8 +138,8 @@ class Tree:
         m, name = self.model, self.joint_names[j]
         if m.jnt_type[j] not in (HINGE, SLIDE):
             kind = "free" if m.jnt_type[j] == FREE else "ball"
-            mend = "Take a base beyond it." if kind == "free" else "Write it as three hinges."
-            raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), "a hinge or slide between base and tip", mend)
+            remedy = "Take a base beyond it." if kind == "free" else "Write it as three hinges."
+            raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), "a hinge or slide between base and tip", remedy)
         stiffness = float(m.jnt_stiffness[j])
         if stiffness:
             where = f"joint {name!r}: stiffness"
@@ -209,7 +209,7 @@ class Tree:
         m = self.model
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
         own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
-        mass, inertia, *_ = own.settled(repairs)
+        mass, inertia, *_ = own.physical(repairs)
         compensated = float(m.body_gravcomp[body])
         if compensated and mass:
             where, expected = f"body {self.bodies[body]!r}: gravcomp", "0: compensation of gravity is not modelled, it is the law's to do"
@@ -274,17 +274,17 @@ class Tree:
     def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
         for j in sorted(coupled):
             name = self.joint_names[j]
-            mend = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
-            error = checks.fail(where, Shown(f"joint {name!r} tied to another"), "joints that move by themselves", mend)
+            remedy = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
+            error = checks.fail(where, Shown(f"joint {name!r} tied to another"), "joints that move by themselves", remedy)
             repairs.meet(Fault(f"joint {name!r}", f"one tied to another by {where}", error, "one that moves by itself"))
 
     def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
         """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its links closes the chain."""
         if len({links.carrier.get(b, -1) for b in bodies}) > 1:
             tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
-            mend = "A closed chain has no serial one: cut it open, or lock its joints."
+            remedy = "A closed chain has no serial one: cut it open, or lock its joints."
             to = "no tie: a motion-capture body is no link" if any(self.model.body_mocapid[b] >= 0 for b in bodies) else ""
-            repairs.meet(Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", mend), to))
+            repairs.meet(Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", remedy), to))
 
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:

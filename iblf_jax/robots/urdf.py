@@ -113,8 +113,8 @@ def _is_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element], parent
     for name, joint in joints.items():
         child = _end(joint, "child", links)
         if child in seen:
-            mend = "A closed chain has no serial one: cut it open at a joint."
-            raise checks.fail(f"link {child!r}", Shown(f"two parents, by joints {seen[child]!r} and {name!r}"), "one parent", mend)
+            remedy = "A closed chain has no serial one: cut it open at a joint."
+            raise checks.fail(f"link {child!r}", Shown(f"two parents, by joints {seen[child]!r} and {name!r}"), "one parent", remedy)
         seen[child] = name
     roots = [name for name in links if name not in parent_of]
     if len(roots) > 1:
@@ -222,8 +222,8 @@ def _words(numbers: list[float]) -> str:
 
 def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
     if kind not in MOVING:
-        mend = "Floating and planar joints are not part of a serial arm." if kind in ("floating", "planar") else ""
-        raise checks.fail(f"{where}: type", kind, "revolute, continuous, prismatic or fixed", mend)
+        remedy = "Floating and planar joints are not part of a serial arm." if kind in ("floating", "planar") else ""
+        raise checks.fail(f"{where}: type", kind, "revolute, continuous, prismatic or fixed", remedy)
     axis = _one(joint, "axis")
     direction = floats(f"{where}: axis", axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3)
     if not np.linalg.norm(direction) > 1e-6:
@@ -237,8 +237,8 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
     if limit is None:
         if endless:
             return []
-        mend = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
-        error = checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", mend)
+        remedy = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
+        error = checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", remedy)
         return [Fault(f"{where}: limit", "nothing", error, "no limits")]
     names = ("effort",) if endless else ("lower", "upper", "effort")
     values = {name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0] for name in names}

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.robots import at_time, friction_torque
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample
 
 
 class LoopState(NamedTuple):
@@ -29,40 +30,6 @@ class LoopState(NamedTuple):
     dq: jax.Array
     controller: Any
     observer: Any
-
-
-class Sample(NamedTuple):
-    """The loop at one instant: what is recorded, and what metrics fold over.  Vectors are (n,)."""
-
-    t: jax.Array
-    """Time, () [s]."""
-    dt: jax.Array
-    """The time that this sample stands for in a sum over time, () [s]: the step, and 0 for the last sample."""
-    q: jax.Array
-    dq: jax.Array
-    tau: jax.Array
-    """Torque that was applied [N m]."""
-    e1: jax.Array
-    """q - q_d [rad]."""
-    e2: jax.Array
-    """q' - alpha [rad/s]."""
-    xi: jax.Array
-    """Error relative to its bound [1]; inside the bounds if |xi| < 1."""
-    q_d: jax.Array
-    dq_d: jax.Array
-    lower: jax.Array
-    upper: jax.Array
-    alpha: jax.Array
-    gravity: jax.Array
-    """G0(q), what holding the model still takes [N m]."""
-    disturbance: jax.Array
-    """The lumped uncertain term f of (2.1) [N m]."""
-    disturbance_estimate: jax.Array
-    """f_hat [N m]."""
-    V: jax.Array
-    """V2, ()."""
-    guard_active: jax.Array
-    saturated: jax.Array
 
 
 def initial_state(scenario: Scenario) -> LoopState:

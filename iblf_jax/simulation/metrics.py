@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.simulation.accuracy import UNITS
-from iblf_jax.simulation.closed_loop import Sample
 from iblf_jax.simulation.scenario import fit_joints
+from iblf_jax.simulation.signals import Sample
 
 
 class Fold(Protocol):

@@ -165,8 +165,8 @@ def expand(path: str) -> list[str]:
 def _unknown(scenario: Scenario, path: str) -> ValueError:
     known = [p.path for p in parameters(scenario)]
     close = difflib.get_close_matches(path, known, n=3)
-    mend = f"Did you mean {', '.join(close)}?" if close else "ij.parameters(scenario) lists them."
-    return checks.fail("path", path, "the path of a leaf of this scenario", mend)
+    remedy = f"Did you mean {', '.join(close)}?" if close else "ij.parameters(scenario) lists them."
+    return checks.fail("path", path, "the path of a leaf of this scenario", remedy)
 
 
 def get(scenario: Scenario, path: str) -> Any:
@@ -320,7 +320,7 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
       A new Scenario of the same structure, so that nothing recompiles.
 
     Raises:
-      ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the mend.
+      ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the remedy.
     """
     _need_component(scenario)
     if not isinstance(values, Mapping):

@@ -16,6 +16,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import SIGNALS
 
 
 @jax.tree_util.register_dataclass
@@ -62,47 +63,20 @@ class Metrics(Mapping):
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 
 
+_Signals: Any = dataclasses.make_dataclass("_Signals", [(name, jax.Array) for name in SIGNALS], frozen=True, eq=False)
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rollout:
+class Rollout(_Signals):
     """One run of a scenario, or many: every array below has a leading run axis then.
 
-    Sizes: T recorded samples, n joints.  Recorded samples are every `record_every`-th step from t = 0; metrics and status
-    cover every step.
+    Its signals, `run.t`, `run.q`, `run.tau` ..., are those of `simulation.signals`, (T,) or (T, n) for T recorded samples and n
+    joints.  Recorded samples are every `record_every`-th step from t = 0; metrics and status cover every step.
     """
 
     scenario: Scenario
     """What was run."""
-    t: jax.Array
-    """Time, (T,) [s]."""
-    q: jax.Array
-    """Position, (T, n) [rad]."""
-    dq: jax.Array
-    """Velocity, (T, n) [rad/s]."""
-    tau: jax.Array
-    """Applied torque, (T, n) [N m]."""
-    e1: jax.Array
-    """Position error q - q_d, (T, n) [rad]."""
-    e2: jax.Array
-    """Velocity error q' - alpha, (T, n) [rad/s]."""
-    xi: jax.Array
-    """Position error relative to its bound, (T, n) [1]."""
-    q_d: jax.Array
-    """Reference, (T, n) [rad]."""
-    dq_d: jax.Array
-    """Its velocity, (T, n) [rad/s]."""
-    lower: jax.Array
-    """Lower bound of q, (T, n) [rad]."""
-    upper: jax.Array
-    """Upper bound of q, (T, n) [rad]."""
-    alpha: jax.Array
-    """Virtual velocity, (T, n) [rad/s]."""
-    disturbance: jax.Array
-    """Lumped uncertain term f of (2.1), (T, n) [N m]."""
-    disturbance_estimate: jax.Array
-    """Its estimate f_hat, (T, n) [N m]."""
-    V: jax.Array
-    """Lyapunov function V2 of (3.12), (T,)."""
     controller_state: Any
     """State of the law, time axis first; `()` if it has none."""
     observer_state: Any

@@ -48,7 +48,7 @@ PARTS = (
     ("observer", Observer, "iblf_jax.observers has them; NoObserver() for none.", ()),
     ("disturbance", Disturbance, "iblf_jax.disturbances has them; Nothing() for none.", ()),
 )
-"""Field, protocol, mend and what may be missing, for each part of a scenario that may be a user's own."""
+"""Field, protocol, remedy and what may be missing, for each part of a scenario that may be a user's own."""
 
 
 @component
@@ -84,8 +84,8 @@ class Scenario:
         """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
-        for name, protocol, mend, optional in PARTS:
-            checks.conforms(f"Scenario.{name}", getattr(self, name), protocol, mend, optional)
+        for name, protocol, remedy, optional in PARTS:
+            checks.conforms(f"Scenario.{name}", getattr(self, name), protocol, remedy, optional)
         if not isinstance(self.initial, Initial):
             raise checks.fail("Scenario.initial", self.initial, "an Initial", "Such as Initial(q=[0.8, 0.8]).")
         if not isinstance(self.bounds, Bounds):
@@ -193,7 +193,7 @@ def canonical(scenario: Scenario) -> Scenario:
 
     Raises:
       ValueError: a leaf is not finite or has the wrong sign, a mass matrix is not positive definite, the start is outside
-        its bounds or faster than VELOCITY_LIMIT; the message names the field, the value and the mend.
+        its bounds or faster than VELOCITY_LIMIT; the message names the field, the value and the remedy.
     """
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")

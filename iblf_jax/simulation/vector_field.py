@@ -19,8 +19,9 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
-from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, initial_state
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.signals import Sample
 
 
 @component
@@ -108,7 +109,7 @@ class VectorField:
           x: state, (m,).
 
         Returns:
-          `closed_loop.Sample`; its vectors are (n,).
+          `signals.Sample`; its vectors are (n,).
 
         Raises:
           ValueError: as the field itself.
@@ -133,7 +134,7 @@ def vector_field(scenario: Scenario) -> VectorField:
       A `VectorField`: called for the rate; `start`, `names`, `pack`, `unpack` and `sample` for the rest.
 
     Raises:
-      ValueError: as `simulate`, for a scenario that cannot run; the message names the field, the value and the mend.
+      ValueError: as `simulate`, for a scenario that cannot run; the message names the field, the value and the remedy.
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
@@ -162,8 +163,8 @@ def _unpack(scenario: Scenario, x: jax.Array) -> LoopState:
     leaves, structure = jax.tree.flatten(_layout(scenario))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])
     if x.ndim < 1 or x.shape[-1] != ends[-1]:
-        mend = "VectorField.names says what its entries are; of a SciPy solution give solution.y.T."
-        raise checks.fail("x", x, f"shape (..., {ends[-1]})", f"Its shape is {x.shape}. {mend}")
+        remedy = "VectorField.names says what its entries are; of a SciPy solution give solution.y.T."
+        raise checks.fail("x", x, f"shape (..., {ends[-1]})", f"Its shape is {x.shape}. {remedy}")
     parts = jnp.split(x, ends[:-1], axis=-1)
     return jax.tree.unflatten(structure, [part.reshape(*x.shape[:-1], *leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
 

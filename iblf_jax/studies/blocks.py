@@ -23,7 +23,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, flag
-from iblf_jax.engine.execute import run_batch, settled
+from iblf_jax.engine.execute import chosen_backend, run_batch
 from iblf_jax.engine.step import Run
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
@@ -36,7 +36,7 @@ MOST_IN_FLIGHT = 4
 """Blocks that are queued on a device at once: enough to keep it busy."""
 
 
-class Program(NamedTuple):
+class StudyRun(NamedTuple):
     """What is compiled; static."""
 
     targets: tuple[Target, ...]
@@ -45,7 +45,7 @@ class Program(NamedTuple):
     backend: str
 
 
-class Shared(NamedTuple):
+class StudyInputs(NamedTuple):
     """What all runs share; traced."""
 
     cases: Cases
@@ -79,7 +79,7 @@ def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.where(admissible.reshape(admissible.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(mark, x.dtype))
 
 
-def _draws(program: Program, shared: Shared, lanes: Lanes):
+def _draws(program: StudyRun, shared: StudyInputs, lanes: Lanes):
     """The leaves that a block's runs replace, the draws, and whether they were admissible."""
 
     def one(lane: Lanes):
@@ -90,18 +90,18 @@ def _draws(program: Program, shared: Shared, lanes: Lanes):
     return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
 
 
-def with_settled_backend(program: Program, shared: Shared, lanes: Lanes) -> Program:
+def with_chosen_backend(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> StudyRun:
     """The program with the backend that its blocks will run on in place of "auto" or one that is not available.
 
     Raises:
       ValueError: an unknown backend.
     """
     varied, _, _ = jax.eval_shape(partial(_draws, program), shared, lanes)
-    backend = settled(program.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=program.method)
+    backend = chosen_backend(program.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=program.method)
     return program._replace(backend=backend)
 
 
-def _block(program: Program, shared: Shared, lanes: Lanes) -> Results:
+def _block(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
     """Draws and runs one block."""
     varied, drawn, admissible = _draws(program, shared, lanes)
     run = Run(program.steps, program.method)
@@ -111,7 +111,7 @@ def _block(program: Program, shared: Shared, lanes: Lanes) -> Results:
     return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
 
 
-def _record_block(program: Program, shared: Shared, lanes: Lanes, record_every: int):
+def _record_block(program: StudyRun, shared: StudyInputs, lanes: Lanes, record_every: int):
     """Positions of a block's runs, (B, T, n), and their status."""
     varied, _, admissible = _draws(program, shared, lanes)
     run = Run(program.steps, program.method, record_every)
@@ -121,15 +121,15 @@ def _record_block(program: Program, shared: Shared, lanes: Lanes, record_every: 
 
 
 @partial(jax.jit, static_argnames=("program", "record_every"))
-def _execute(shared: Shared, lanes: Lanes, *, program: Program, record_every: int | None = None):
+def _execute(shared: StudyInputs, lanes: Lanes, *, program: StudyRun, record_every: int | None = None):
     if record_every is None:
         return _block(program, shared, lanes)
     return _record_block(program, shared, lanes, record_every)
 
 
 def run_blocks(
-    program: Program,
-    shared: Shared,
+    program: StudyRun,
+    shared: StudyInputs,
     lanes_of: Callable[[np.ndarray], Lanes],
     blocks: Sequence[int],
     *,
@@ -167,7 +167,7 @@ def run_blocks(
         yield _harvest(*waiting.popleft())
 
 
-def _compile(program: Program, record_every: int | None, copies: list[Shared], lanes: list[Lanes]) -> None:
+def _compile(program: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]) -> None:
     """Compiles the block for several devices at the same time; tracing is done once and shared."""
     if len(copies) < 2:
         return

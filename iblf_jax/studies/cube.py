@@ -1,4 +1,4 @@
-"""The unit cube behind bounded perturbations: where `ij.falsify` and `ij.certificates.falsify` look for the worst.
+"""The unit cube behind bounded perturbations: where `ij.falsify` and `ij.certificates.counterexample` look for the worst.
 
 Run i of a study draws u and has the values F^-1(u); a search takes the u itself, in [0, 1]^d, as its unknown.  So a search looks at the
 same perturbations as a study, within the ends of their distributions.
@@ -74,11 +74,11 @@ class Cube:
             raise self.nothing(f"None of {BATCHES * count} random points is; the last: {reason} Narrow or move the ranges.")
         return np.resize(np.array(found), (count, self.size))
 
-    def nothing(self, mend: str) -> ValueError:
+    def nothing(self, remedy: str) -> ValueError:
         """The error for perturbations in which there is nothing to look at."""
         ranges = {path: p.range(np.asarray(get(self.cases.scenario, path))) for path, p in self.cases.perturbations.items()}
         shown = {path: (np.asarray(low).tolist(), np.asarray(high).tolist()) for path, (low, high) in ranges.items()}
-        return checks.fail("perturbations", shown, "ranges with admissible values in them", mend)
+        return checks.fail("perturbations", shown, "ranges with admissible values in them", remedy)
 
 
 _values = jax.jit(Cube.values)

@@ -111,8 +111,8 @@ def initialize(
     except ValueError as error:
         _end_with_a_code(None, watcher)
         _say_bye(watcher)
-        mend = "Start the processes with srun." if "SLURM_JOB_ID" in os.environ else "Give coordinator, num_processes and process_id."
-        raise ValueError(f"No cluster was found that says where the processes meet: {error} {mend}") from error
+        remedy = "Start the processes with srun." if "SLURM_JOB_ID" in os.environ else "Give coordinator, num_processes and process_id."
+        raise ValueError(f"No cluster was found that says where the processes meet: {error} {remedy}") from error
     except RuntimeError as error:
         _end_with_a_code(None, watcher)
         _say_bye(watcher)

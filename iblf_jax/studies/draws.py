@@ -111,7 +111,7 @@ def plan(
 
 
 def _said_properly(given: Any) -> str:
-    """The mend for a range or a distribution in the place of a perturbation, with the user's numbers."""
+    """The remedy for a range or a distribution in the place of a perturbation, with the user's numbers."""
     if isinstance(given, tuple | list) and len(given) == 2 and checks.is_concrete(given):
         low, high = (checks.shown(np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x) for x in given)
         return f"Say how the draw acts on the leaf: for values between two ends ij.value(ij.uniform({low}, {high}))."

@@ -77,7 +77,7 @@ def monte_carlo(
       A `Study`: metrics, status and samples of every run, run axis first.
 
     Raises:
-      ValueError: bad arguments; the message names the field, the value and the mend.
+      ValueError: bad arguments; the message names the field, the value and the remedy.
 
     Source: design of this package.
     """

@@ -153,8 +153,8 @@ def sensitivity(
         rng = np.random.default_rng(setup.seed)
         found = stats.sobol_indices(func=evaluate, n=points, dists=[stats.uniform()] * len(names), rng=rng)
         if np.ptp(np.concatenate(values[:2])) == 0:  # those of the runs whose variance all is divided by
-            mend = "Choose another output, wider distributions or more points."
-            raise checks.fail(label, float(values[0][0]), "an output that is not the same in all runs", mend)
+            remedy = "Choose another output, wider distributions or more points."
+            raise checks.fail(label, float(values[0][0]), "an output that is not the same in all runs", remedy)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # where an index is the same in every resample SciPy warns and gives NaN for its interval
             ends = found.bootstrap(confidence_level=0.95)

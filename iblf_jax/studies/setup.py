@@ -15,25 +15,26 @@ from iblf_jax.core import checks
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.blocks import Program, Results, Shared, _execute, block_size, with_settled_backend
+from iblf_jax.studies.blocks import Results, StudyInputs, StudyRun, _execute, block_size, with_chosen_backend
 from iblf_jax.studies.designs import check_seed, split, unit_points
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Lanes, plan, sample_size
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setup:
     """A study's arguments.  Cases are numbered: case = point * runs + run, with one point unless it is a sweep."""
 
-    program: Program
-    shared: Shared
+    program: StudyRun = dataclasses.field(metadata={"static": True})
+    shared: StudyInputs
     perturbations: dict[str, Perturbation]
     """As the user gave them."""
-    seed: int
-    runs: int
+    seed: int = dataclasses.field(metadata={"static": True})
+    runs: int = dataclasses.field(metadata={"static": True})
     """Runs at each point."""
-    sampler: str = "independent"
-    replicates: int = 1
+    sampler: str = dataclasses.field(default="independent", metadata={"static": True})
+    replicates: int = dataclasses.field(default=1, metadata={"static": True})
     designed: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Path -> uniform numbers of every run, for samplers with a design."""
     points: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
@@ -89,7 +90,7 @@ def prepare(
         shapes = sample_size(targets, by_path)
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
-    program = Program(targets, steps, method, backend)
-    shared = Shared(Cases(scenario, by_path, jax.random.key(seed)), folds, step)
+    program = StudyRun(targets, steps, method, backend)
+    shared = StudyInputs(Cases(scenario, by_path, jax.random.key(seed)), folds, step)
     setup = Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
-    return dataclasses.replace(setup, program=with_settled_backend(program, shared, setup.lanes(np.arange(block_size()))))
+    return dataclasses.replace(setup, program=with_chosen_backend(program, shared, setup.lanes(np.arange(block_size()))))

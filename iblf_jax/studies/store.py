@@ -311,14 +311,14 @@ def open_store(
         found += differences({"unit": store.unit}, {"unit": unit})
     if found:
         tied = any(text.startswith("kernel.") for text in found)
-        mend = (
+        remedy = (
             "A native kernel is tied to processor and compiler: go on on a machine of the same kind, or choose another path, "
             'with backend="xla" if machines of several kinds are to share it.'
             if tied
             else "Go on with the same arguments, or choose another path."
         )
         more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
-        raise StoreError(f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. {mend}")
+        raise StoreError(f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. {remedy}")
     if not os.access(place, os.W_OK):
         raise _why(place, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
     return store

@@ -43,7 +43,7 @@ VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Run:
+class OneRun:
     """One run of a study."""
 
     index: int
@@ -67,7 +67,8 @@ class Study:
     """Largest measured mode of the closed loop, (N,) [1/s]."""
     samples: dict[str, Any]
     """Path -> the value of that leaf in each run, (N, ...), in the leaf's unit."""
-    setup: Setup = dataclasses.field(metadata={"static": True})
+    setup: Setup
+    """What was asked for."""
 
     @classmethod
     def of(cls, setup: Setup, results: Results) -> Study:
@@ -116,10 +117,10 @@ class Study:
             raise IndexError(f"run {checks.shown(index)}: the study has runs 0 to {self.runs - 1}")
         return int(index) % self.runs
 
-    def __getitem__(self, index: int) -> Run:
+    def __getitem__(self, index: int) -> OneRun:
         """One run: its metrics, status and drawn values."""
         i = self._index(index)
-        return Run(i, jax.tree.map(lambda x: x[i], self.metrics), int(self.status[i]), {path: x[i] for path, x in self.samples.items()})
+        return OneRun(i, jax.tree.map(lambda x: x[i], self.metrics), int(self.status[i]), {path: x[i] for path, x in self.samples.items()})
 
     @property
     def failed(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import block_size, run_blocks
 from iblf_jax.studies.config import describe_component
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 
     from iblf_jax.studies.study import Study
 
-RECORDED = {"q": "rad", "e1": "rad"}
-"""What bands are made of, and its unit."""
+BANDS = ("q", "e1")
+"""Signals that bands are made of."""
 
 
 def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
@@ -111,7 +112,7 @@ def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exc
     if not used.any():
         raise checks.fail("runs", count, "at least one run that is not left out", "Take more runs, or exclude_failed=False.")
     dims = ("quantile", "time", "joint")
-    variables: dict[str, Any] = {name: (dims, _quantile(whole[name][used], levels), {"units": unit}) for name, unit in RECORDED.items()}
+    variables: dict[str, Any] = {name: (dims, _quantile(whole[name][used], levels), {"units": SIGNALS[name].unit}) for name in BANDS}
     edges: dict[str, Any] = {"lower": np.max, "upper": np.min, "q_d": np.median}
     for name, edge in edges.items():
         words = {"lower": "tightest lower bound", "upper": "tightest upper bound", "q_d": "median reference"}[name]

@@ -108,7 +108,7 @@ def sweep(
       a bound at t = 0 already, which no law could keep, from violations of the law; it is there if `first_violation_time` is.
 
     Raises:
-      ValueError: bad arguments; the message names the field, the value and the mend.
+      ValueError: bad arguments; the message names the field, the value and the remedy.
       StoreError: a store of another configuration, a foreign or unwritable one, a full disk.  What was written stays valid.
       Interrupted: Ctrl-C or SIGTERM with a store, after the unit at hand; the message says how to go on.
 

@@ -2,7 +2,7 @@
 
 The contract of a family is the Protocol in its `_base.py` (or at the head of its file).  Each checker here takes an
 instance, a user's own from a notebook cell too, and either returns None or raises a `ContractError` that lists everything
-it found, each with the mend:
+it found, each with the remedy:
 
     @ij.component
     class MyLaw:

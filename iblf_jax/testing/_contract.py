@@ -24,7 +24,7 @@ STEP = 1e-6
 
 
 class ContractError(AssertionError):
-    """A member that does not fit its family; the message lists what is missing or wrong, and the mend of each."""
+    """A member that does not fit its family; the message lists what is missing or wrong, and the remedy of each."""
 
 
 class Findings:
@@ -35,16 +35,16 @@ class Findings:
         self.family = family
         self.problems: list[str] = []
 
-    def add(self, problem: str, mend: str = "") -> None:
+    def add(self, problem: str, remedy: str = "") -> None:
         """Writes one problem down, once."""
-        text = f"{problem}." + (f" {mend}" if mend else "")
+        text = f"{problem}." + (f" {remedy}" if remedy else "")
         if text not in self.problems:
             self.problems.append(text)
 
-    def require(self, condition: Any, problem: str, mend: str = "") -> bool:
+    def require(self, condition: Any, problem: str, remedy: str = "") -> bool:
         """Writes the problem down unless the condition holds; returns whether it holds."""
         if not bool(condition):
-            self.add(problem, mend)
+            self.add(problem, remedy)
         return bool(condition)
 
     def stop_if_any(self) -> None:
@@ -83,9 +83,9 @@ def _is_component(findings: Findings, member: Any) -> None:
         findings.stop_if_any()
     for path, leaf in jax.tree_util.tree_leaves_with_path(member):
         numeric = isinstance(leaf, jax.Array | np.ndarray | np.generic | float) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-        mend = "Make it a floating-point array, or declare it with iblf_jax.static if it is structure"
+        remedy = "Make it a floating-point array, or declare it with iblf_jax.static if it is structure"
         findings.require(
-            numeric, f"the leaf {jax.tree_util.keystr(path).lstrip('.')} is {checks.shown(leaf)}, not a floating-point number", mend
+            numeric, f"the leaf {jax.tree_util.keystr(path).lstrip('.')} is {checks.shown(leaf)}, not a floating-point number", remedy
         )
     try:
         rebuilt = jax.tree.unflatten(structure, [object() for _ in leaves])
@@ -93,8 +93,8 @@ def _is_component(findings: Findings, member: Any) -> None:
         same = again == structure and hash(again) == hash(structure)
         findings.require(same, "it does not keep its structure when JAX takes it apart and puts it together")
     except Exception as error:
-        mend = "JAX rebuilds it with placeholders: convert and check in `check(self)` of a component, never in __init__ or __post_init__"
-        findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", mend)
+        remedy = "JAX rebuilds it with placeholders: convert and check in `check(self)` of a component, never in __init__ or __post_init__"
+        findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", remedy)
 
 
 def _has_members(findings: Findings, member: Any, protocol: type, optional: tuple[str, ...]) -> None:
@@ -119,12 +119,12 @@ def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
         return jax.eval_shape(call, *args)
     except Exception as error:
         first = str(error).strip().split("\n")[0]
-        mend = (
+        remedy = (
             "It is called with tracers: use jax.numpy, and `jnp.where` in place of `if`"
             if isinstance(error, jax.errors.JAXTypeError)
             else ""
         )
-        findings.add(f"{label} raised {type(error).__name__}: {first}", mend)
+        findings.add(f"{label} raised {type(error).__name__}: {first}", remedy)
         return None
 
 
@@ -214,13 +214,13 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
         difference = (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * STEP)
         scale = max(1.0, float(np.max(np.abs(difference), initial=0)), float(np.max(np.abs(values[name]), initial=0)))
         apart = float(np.max(np.abs(slope - difference), initial=0))
-        mend = "Is something rounded, cut off, stopped (stop_gradient) or given a wrong custom derivative?"
-        findings.require(apart <= rtol * scale, f"the derivative of {name} differs from its finite difference by {apart:.2g}", mend)
+        remedy = "Is something rounded, cut off, stopped (stop_gradient) or given a wrong custom derivative?"
+        findings.require(apart <= rtol * scale, f"the derivative of {name} differs from its finite difference by {apart:.2g}", remedy)
     along = float(_dot(weights, forward))
     size = max([1.0, *(float(np.max(np.abs(x), initial=0)) for x in forward.values())])
     off = abs(float(reverse) - along)
-    mend = "Look at custom derivatives and at jnp.where over infinities"
-    findings.require(off <= 1e-8 * size * max(1, len(forward)), f"forward and reverse derivative differ by {off:.2g}", mend)
+    remedy = "Look at custom derivatives and at jnp.where over infinities"
+    findings.require(off <= 1e-8 * size * max(1, len(forward)), f"forward and reverse derivative differ by {off:.2g}", remedy)
 
 
 def _dot(a: Any, b: Any) -> Any:
@@ -253,8 +253,8 @@ def _float32(findings, outputs, values, point) -> None:
     result = function(small)
     for name, value in result.items():
         if jnp.issubdtype(values[name].dtype, jnp.floating):
-            mend = "Make constants with the dtype of an argument, jnp.zeros_like(q), or keep them plain Python numbers"
-            if findings.require(value.dtype == jnp.float32, f"{name} is {value.dtype} for float32 arguments", mend):
+            remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q), or keep them plain Python numbers"
+            if findings.require(value.dtype == jnp.float32, f"{name} is {value.dtype} for float32 arguments", remedy):
                 scale = max(1.0, float(np.max(np.abs(values[name]), initial=0)))
                 off = float(np.max(np.abs(np.asarray(value, float) - np.asarray(values[name])), initial=0))
                 findings.require(off <= 5e-3 * scale, f"{name} in float32 is off by {off:.2g}")

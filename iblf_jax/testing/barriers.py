@@ -31,12 +31,12 @@ def check_barrier(barrier: Any) -> None:
       barrier: an instance.
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
     """
     with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
         guard, uses_o = barrier.guard, barrier.uses_o
-        mend = "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
-        findings.require(isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf), f"guard is {guard!r}", mend)
+        remedy = "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
+        findings.require(isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf), f"guard is {guard!r}", remedy)
         findings.require(isinstance(uses_o, bool), f"uses_o is {uses_o!r}", "It must be a bool of the class, uses_o: ClassVar[bool]")
         findings.stop_if_any()
         barrier = in_dtype(barrier, "float64")
@@ -97,12 +97,12 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     got = {name: np.asarray(value) for name, value in numbers.items()}
     xi = np.asarray(XI)[:, None] + 0 * got["xi"]
     words = {"V1": "value", "slope": "slope", "alpha": "virtual_velocity"}
-    mend = "Evaluate at iblf_jax.barriers.guarded_error; mind removable singularities at e1 = 0 (double jnp.where)"
+    remedy = "Evaluate at iblf_jax.barriers.guarded_error; mind removable singularities at e1 = 0 (double jnp.where)"
     for prefix, text in (("", ""), ("d", "the forward derivative of "), ("r", "the reverse derivative of ")):
         for name, word in words.items():
             bad = ~np.isfinite(got[prefix + name])
             where = f"xi = {xi[bad][0]:.12g}" if np.any(bad) else ""
-            findings.require(not np.any(bad), f"{text}{word} is not finite at {where}", mend)
+            findings.require(not np.any(bad), f"{text}{word} is not finite at {where}", remedy)
         findings.stop_if_any()
     zero = np.abs(xi) == 0
     findings.require(np.all(np.abs(got["V1"][zero]) < 1e-12), "V1 is not 0 at e1 = 0", "Subtract its value there")
@@ -116,8 +116,8 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     clear = np.abs(np.abs(xi) - (1 - guard)) > 1e-3 * guard
     off = np.abs(got["dV1"] - got["slope"]) / np.maximum(1.0, np.abs(got["slope"]))
     worst = float(np.max(off[clear]))
-    mend = "Beyond the guard V1 must go on along its tangent: V1(e) + slope(e) (e1 - e)"
-    findings.require(worst < 1e-8, f"the slope is not dV1/dq (relative error {worst:.2g})", mend)
+    remedy = "Beyond the guard V1 must go on along its tangent: V1(e) + slope(e) (e1 - e)"
+    findings.require(worst < 1e-8, f"the slope is not dV1/dq (relative error {worst:.2g})", remedy)
     inside = np.abs(xi) < 1 - 2 * guard
     growth = float(np.max(got["decay"][inside]))
     findings.require(growth <= 1e-9, f"V1 grows at rate {growth:.3g} along q' = alpha", "alpha must make slope . alpha + dV1/dt negative")

@@ -31,7 +31,7 @@ def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
       scenario: the surroundings to try it in; the paper's simulation if not given.
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: surroundings that are no scenario.
     """
     scenario = scenario_or_the_papers(scenario)
@@ -77,10 +77,10 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
     command, rate = answer
     for name in ("tau", "alpha", "V1"):
         ok = has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape)
-        mend = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
+        remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
         if ok:
             got = getattr(command, name).dtype
-            findings.require(got == q.dtype, f"Command.{name} is {got} for {q.dtype} arguments", mend)
+            findings.require(got == q.dtype, f"Command.{name} is {got} for {q.dtype} arguments", remedy)
     for name in ("guard_active", "saturated"):
         has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape, jnp.bool_)
     same_structure(findings, "the rate that command returns" + kind, rate, state)
@@ -108,11 +108,11 @@ def _at_the_wall(findings: Findings, scenario: Scenario) -> None:
         return jax.vmap(at)(xis)
 
     values, forward, reverse = numbers(scenario, jnp.asarray(XI))
-    mend = "Near and past the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay finite"
+    remedy = "Near and past the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay finite"
     for label, tree in (("the command", values), ("its forward derivative", forward), ("its reverse derivative", reverse)):
         finite = np.all([np.all(np.isfinite(np.asarray(x).reshape(len(XI), -1)), axis=1) for x in jax.tree.leaves(tree)], axis=0)
         where = ", ".join(f"{xi:g}" for xi, ok in zip(XI, finite, strict=True) if not ok)
-        findings.require(np.all(finite), f"{label} is not finite at xi = {where}", mend)
+        findings.require(np.all(finite), f"{label} is not finite at xi = {where}", remedy)
     findings.require(np.all(np.asarray(values[2]) >= 0), "V1 is negative somewhere", "It is a Lyapunov function; zeros if the law has none")
 
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.simulation.closed_loop import Sample
 from iblf_jax.simulation.metrics import Fold
+from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of
 
 LENGTH = 40
@@ -22,7 +22,7 @@ def check_fold(fold: Any) -> None:
       fold: an instance.
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
     """
     with examine(fold, "Fold", Fold) as findings:
         units = fold.units
@@ -95,8 +95,8 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
     if result is None:
         return
     if findings.require(isinstance(result, dict), f"finish(acc) gives {type(result).__name__}", "It must be a dict from name to array"):
-        mend = "Every name needs a unit, and every unit a name"
-        findings.require(set(result) == set(fold.units), f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}", mend)
+        remedy = "Every name needs a unit, and every unit a name"
+        findings.require(set(result) == set(fold.units), f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}", remedy)
 
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:

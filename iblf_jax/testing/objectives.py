@@ -43,7 +43,7 @@ def check_objective(objective: Any, *, scenario: Scenario | None = None, duratio
       duration: of the run [s], as `tune` will have it.
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: what it is tried on is no scenario, or not for a time.
     """
     scenario, duration = scenario_or_the_papers(scenario), checks.positive_number("duration", duration, "s")

@@ -24,7 +24,7 @@ def check_observer(observer: Any, *, model: Any = None) -> None:
       model: the robot that it knows; the customary two-link arm if not given.
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: a model that is no robot.
     """
     if model is not None:

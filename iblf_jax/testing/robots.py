@@ -26,7 +26,7 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
       q: configurations to look at, (m, n) [rad or m]; random ones if not given.
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: configurations that are none, or none of this robot.
     """
     with examine(robot, "Robot", Robot) as findings:
@@ -98,9 +98,9 @@ def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[st
 
 
 def _physics(findings: Findings, got: dict[str, np.ndarray]) -> None:
-    def small(name, scale, problem, mend):
+    def small(name, scale, problem, remedy):
         size = float(np.max(np.abs(got[name])))
-        findings.require(size <= TOLERANCE * max(1.0, float(scale)), f"{problem} (by {size:.2g})", mend)
+        findings.require(size <= TOLERANCE * max(1.0, float(scale)), f"{problem} (by {size:.2g})", remedy)
 
     scale = np.max(np.abs(got["M"]))
     motion = max(np.max(np.abs(got["skew_scale"])), scale)

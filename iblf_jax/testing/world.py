@@ -58,7 +58,7 @@ def check_reference(reference: Any, *, n: int | None = None, duration: float = 2
       duration: stretch of time to look at [s].
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: an argument beside the reference that is none.
     """
     n, duration = _surroundings(n, duration)
@@ -87,7 +87,7 @@ def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> No
       duration: stretch of time to look at [s].
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: an argument beside the side that is none.
     """
     n, duration = _surroundings(n, duration)
@@ -120,7 +120,7 @@ def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None,
       duration: stretch of time to look at [s].
 
     Raises:
-      ContractError: lists what does not hold, with the mend.
+      ContractError: lists what does not hold, with the remedy.
       ValueError: an argument beside the disturbance that is none.
     """
     _, duration = _surroundings(None, duration)
@@ -146,5 +146,5 @@ def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None,
         findings.stop_if_any()
         jump = find_jump(lambda t: fitted.torque(t, q, dq, plant, model), 0.0, duration, tuple(known))
         at = "" if jump is None else f"{jump:.6g}"
-        mend = "Return that time in jump_times(): the envelopes of Theorem 2 restart there"
-        findings.require(jump is None, f"the torque jumps at t = {at} s, which jump_times() does not say", mend)
+        remedy = "Return that time in jump_times(): the envelopes of Theorem 2 restart there"
+        findings.require(jump is None, f"the torque jumps at t = {at} s, which jump_times() does not say", remedy)

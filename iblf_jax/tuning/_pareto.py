@@ -28,7 +28,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.progress import bar
 from iblf_jax.tuning._tune import build, make_method, way_in
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.optimise import Evaluator, Loop
+from iblf_jax.tuning.optimise import CountedProblem, Loop
 from iblf_jax.tuning.parameters import Block, Tunable, names_of, values_at
 from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN
 from iblf_jax.tuning.robust import Risk
@@ -47,7 +47,7 @@ class Front:
     """Gains of each point, (P, p), in their units."""
     names: tuple[str, ...]
     tried: np.ndarray
-    """(a, b) of every sound trial, (N, 2)."""
+    """(a, b) of every valid trial, (N, 2)."""
     first: np.ndarray
     """(a, b) at the start, (2,)."""
     start: Scenario
@@ -130,7 +130,7 @@ def pareto(
     share = np.linspace(1 - MOST_WEIGHT, MOST_WEIGHT, points) if points > 1 else np.array([0.5])
     lanes = problem.lanes(z)._replace(weights=jnp.asarray(np.stack([share, 1 - share], axis=1), problem.shared.dt.dtype))
     loop = Loop(
-        Evaluator(problem.plan, problem.shared, lanes, "forward"), make_method("newton", problem.box, iterations, tolerance, 0.1), z
+        CountedProblem(problem.plan, problem.shared, lanes, "forward"), make_method("newton", problem.box, iterations, tolerance, 0.1), z
     )
     loop.rescue = partial(way_in, problem, seed)
     with bar(progress, iterations, unit="steps") as shown:
@@ -149,7 +149,7 @@ def _pair(objectives: Any) -> Objective:
 
 def _front(problem, loop: Loop, seconds: float) -> Front:
     history = {name: np.stack(x) for name, x in loop.history.items()}
-    kept = history["sound"] & (history["margin"] > 0) & (np.max(np.maximum(history["excess"], 0.0), axis=-1, initial=0.0) <= 0)
+    kept = history["valid"] & (history["margin"] > 0) & (np.max(np.maximum(history["excess"], 0.0), axis=-1, initial=0.0) <= 0)
     if not np.any(kept):
         raise checks.fail(
             "objectives", "no trial that keeps bounds and requirements", "at least one", "Loosen them, or tune to them first."

@@ -25,10 +25,10 @@ from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
-from iblf_jax.tuning.optimise import FIRST_MU, Evaluator, Loop, fingerprint, load_checkpoint, save_checkpoint
+from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN, Lane, Plan, Shared, Slope, gradient, slope, value
-from iblf_jax.tuning.result import Setup, TuneResult
+from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN, Formulation, Lane, ProblemInputs, Slope, gradient, slope, value
+from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
 OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
@@ -91,7 +91,7 @@ def tune(
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
       starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch; at each
         sharpening the better half goes on.
-      sharpenings: how many times the smoothing of the objective's peaks is divided by 4, each time once the starts have settled; 0 where
+      sharpenings: how many times the smoothing of the objective's peaks is divided by 4, each time once the starts have converged; 0 where
         nothing is smoothed, and with adam.
       iterations: steps of the optimiser at most.
       tolerance: relative change of the loss below which a start has settled.
@@ -108,7 +108,7 @@ def tune(
       A `TuneResult`: scenario, history, report, plot.
 
     Raises:
-      ValueError: bad arguments, or a start that cannot be integrated with this step; the message names the mend.
+      ValueError: bad arguments, or a start that cannot be integrated with this step; the message names the remedy.
 
     Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
     """
@@ -135,7 +135,7 @@ def tune(
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = starting_points(problem.box, starts, seed)
     # The line search of L-BFGS is a loop of JAX's around the problem.
-    evaluator = Evaluator(problem.plan._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
+    evaluator = CountedProblem(problem.plan._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
     stages = sharpenings if method_.settles and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
@@ -155,7 +155,7 @@ def tune(
 
         stopped = loop.run(iterations, tolerance=tolerance, patience=patience, on_step=on_step)
     _check_found(loop, problem)
-    setup = Setup(
+    setup = TuneSetup(
         problem.shared.objective,
         dict(perturbations or {}),
         problem.plan.risk,
@@ -176,7 +176,7 @@ def tune(
 class Problem:
     """A tuning problem, checked and ready to be evaluated."""
 
-    def __init__(self, plan: Plan, shared: Shared, box: Box, runs: int):
+    def __init__(self, plan: Formulation, shared: ProblemInputs, box: Box, runs: int):
         self.plan, self.shared, self.box, self.runs = plan, shared, box, runs
 
     def lanes(self, z: np.ndarray) -> Lane:
@@ -207,8 +207,8 @@ def build(
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
-    plan_ = Plan(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
-    problem = Problem(plan_, Shared(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
+    plan_ = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
+    problem = Problem(plan_, ProblemInputs(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
     if not is_complete(goal):
         derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient
         start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), plan=plan_).value.exact[0])
@@ -252,7 +252,7 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
     Past the wall the motion is chaotic, and its gradient points nowhere.  So SCREENED points of the box are looked at, values
     only, and the starts are those that break the requirements and the bounds least.
     """
-    if found.value.sound[0] and found.value.margin[0] > 0:
+    if found.value.valid[0] and found.value.margin[0] > 0:
         return None
     rng = np.random.default_rng([seed, 2])
     low = np.where(np.isfinite(problem.box.low), problem.box.low, problem.box.z - 3 * SPREAD)
@@ -260,14 +260,14 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
     seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), plan=problem.plan))
     broken = np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
-    order = np.lexsort((seen.objective, broken, ~seen.sound))
+    order = np.lexsort((seen.objective, broken, ~seen.valid))
     return points[order[: len(z)]]
 
 
 def _show(shown: Any, loop: Loop) -> None:
     shown.update(1)
     last = {name: x[-1] for name, x in loop.history.items()}
-    s = int(np.argmin(np.where(last["sound"], last["loss"], np.inf)))
+    s = int(np.argmin(np.where(last["valid"], last["loss"], np.inf)))
     shown.set_postfix_str(f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin {last['margin'][s]:.3g} rad")
 
 
@@ -287,7 +287,7 @@ def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
     return np.where(log, np.exp(np.where(log, z, 0.0)), z)
 
 
-def _result(problem: Problem, loop: Loop, setup: Setup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
+def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
     state, blocks = loop.state, problem.plan.blocks
     best = min(range(len(state["best_key"])), key=lambda s: tuple(state["best_key"][s]))
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}

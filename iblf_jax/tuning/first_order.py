@@ -1,6 +1,6 @@
 """The methods of optax: adam with a schedule, and L-BFGS with its line search, on coordinates that are squashed into the box.
 
-A step to where a run is unsound is rejected: adam goes back to where it was and halves its rate, for good; the line search of L-BFGS
+A step to where a run is invalid is rejected: adam goes back to where it was and halves its rate, for good; the line search of L-BFGS
 takes the loss there for very large.  They suit many parameters (reverse mode) and runs that are drawn anew at every step; for few
 gains `newton` needs fewer rollouts.
 """
@@ -17,7 +17,7 @@ import optax
 
 from iblf_jax.tuning.parameters import Box, squash, unsquash
 
-UNSOUND_LOSS = 1e6
+INVALID_LOSS = 1e6
 """What a line search sees in place of an infinite loss."""
 
 
@@ -43,27 +43,27 @@ class Adam:
         w = np.stack([unsquash(x, self.box) for x in z])
         inner = jax.tree.map(np.asarray, jax.vmap(self.optimiser.init)(jnp.asarray(w)))
         starts = len(z)
-        return {"w": w, "safe": w.copy(), "inner": inner, "slower": np.ones(starts), "settled": np.zeros(starts, bool)}
+        return {"w": w, "safe": w.copy(), "inner": inner, "slower": np.ones(starts), "converged": np.zeros(starts, bool)}
 
     def restart(self, state, start: int) -> None:
         """Nothing is kept that a change of the loss would make wrong."""
 
     def step(self, evaluate: Any, state):
-        """Evaluates, moves, and goes back where the last move made a run unsound.
+        """Evaluates, moves, and goes back where the last move made a run invalid.
 
         Args and returns as `Newton.step`.
         """
         z, pull = squashed(self.box, state["w"])
         found = evaluate(z)
         gradient = pull(found.gradient)
-        sound = np.isfinite(found.value.loss) & np.all(np.isfinite(gradient), axis=1)
-        move, inner = self.update(jnp.asarray(np.where(sound[:, None], gradient, 0.0)), state["inner"])
-        keep = jax.tree.map(lambda new, old: np.where(sound.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old), inner, state["inner"])
+        valid = np.isfinite(found.value.loss) & np.all(np.isfinite(gradient), axis=1)
+        move, inner = self.update(jnp.asarray(np.where(valid[:, None], gradient, 0.0)), state["inner"])
+        keep = jax.tree.map(lambda new, old: np.where(valid.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old), inner, state["inner"])
         state["inner"] = jax.tree.map(np.asarray, keep)
-        state["slower"] = np.where(sound, state["slower"], 0.5 * state["slower"])
-        state["safe"] = np.where(sound[:, None], state["w"], state["safe"])
+        state["slower"] = np.where(valid, state["slower"], 0.5 * state["slower"])
+        state["safe"] = np.where(valid[:, None], state["w"], state["safe"])
         back = 0.5 * (state["w"] + state["safe"])
-        state["w"] = np.where(sound[:, None], state["w"] + state["slower"][:, None] * np.asarray(move), back)
+        state["w"] = np.where(valid[:, None], state["w"] + state["slower"][:, None] * np.asarray(move), back)
         return z, found
 
 
@@ -82,16 +82,16 @@ class LBFGS:
         """The state before the first step."""
         w = np.stack([unsquash(x, self.box) for x in z])
         inner = jax.tree.map(np.array, jax.vmap(self.optimiser.init)(jnp.asarray(w)))
-        return {"w": w, "inner": inner, "loss": np.full(len(z), np.inf), "settled": np.zeros(len(z), bool)}
+        return {"w": w, "inner": inner, "loss": np.full(len(z), np.inf), "converged": np.zeros(len(z), bool)}
 
     def restart(self, state, start: int) -> None:
         """Forget curvature and line search of one start."""
         _put(state["inner"], self.optimiser.init(jnp.asarray(state["w"][start])), start)
-        state["settled"][start] = False
+        state["converged"][start] = False
 
     def retire(self, state, start: int) -> None:
         """No more line searches from one start."""
-        state["settled"][start] = True
+        state["converged"][start] = True
 
     def _search(self, shared, lanes, w, inner, *, derive):
         """One line search for one start; lanes has one row."""
@@ -100,8 +100,8 @@ class LBFGS:
             z, pull = jax.vjp(partial(squash, box=self.box), w)
             found = derive(shared, lanes._replace(z=z[None]))
             loss, gradient = found.value.loss[0], pull(found.gradient[0])[0]
-            sound = jnp.isfinite(loss) & jnp.all(jnp.isfinite(gradient))
-            return jnp.where(sound, loss, UNSOUND_LOSS), jnp.where(sound, gradient, 0.0)
+            valid = jnp.isfinite(loss) & jnp.all(jnp.isfinite(gradient))
+            return jnp.where(valid, loss, INVALID_LOSS), jnp.where(valid, gradient, 0.0)
 
         @jax.custom_jvp
         def loss(w):
@@ -118,7 +118,7 @@ class LBFGS:
 
     def step(self, evaluate: Any, state):
         """One line search for every start; args and returns as `Newton.step`."""
-        for s in np.flatnonzero(~state["settled"]).tolist():
+        for s in np.flatnonzero(~state["converged"]).tolist():
             shared, lanes = evaluate.row(s)
             inner = jax.tree.map(lambda x, s=s: jnp.asarray(x[s]), state["inner"])
             w, inner = self.compiled(shared, lanes, jnp.asarray(state["w"][s]), inner, derive=evaluate.derive)
@@ -128,7 +128,7 @@ class LBFGS:
         z, _ = squashed(self.box, state["w"])
         found = evaluate(z)
         drop = state["loss"] - found.value.loss
-        state["settled"] |= np.abs(drop) < self.tolerance * np.maximum(1e-3, np.abs(found.value.loss))
+        state["converged"] |= np.abs(drop) < self.tolerance * np.maximum(1e-3, np.abs(found.value.loss))
         state["loss"] = np.array(found.value.loss)
         return z, found
 

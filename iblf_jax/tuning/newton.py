@@ -6,7 +6,7 @@ for nothing, and A makes up for what it leaves out (the second derivatives of th
     A <- A + r r^T / (r.s),      r = (g_new - g) - B s,
 
 also after steps that are rejected.  The step minimises the model over |s_i| <= delta and the limits of the gains; delta grows and
-shrinks with how well the model foretold the loss.  A trial that makes a run unsound has an infinite loss, so it is rejected and
+shrinks with how well the model foretold the loss.  A trial that makes a run invalid has an infinite loss, so it is rejected and
 delta shrinks: numbers that are not finite never reach z.
 
 Source: J. E. Dennis, D. M. Gay, R. E. Welsch, ACM Trans. Math. Softw. 7 (1981) 348-368 (structured secant updates);
@@ -61,18 +61,18 @@ class Newton:
             "secant": square.copy(),
             "radius": np.full(starts, self.radius),
             "fresh": np.zeros(starts, bool),
-            "settled": np.zeros(starts, bool),
+            "converged": np.zeros(starts, bool),
         }
 
     def restart(self, state: dict[str, np.ndarray], start: int) -> None:
         """After a change of the loss: evaluate again at the same z before the next step."""
-        state["fresh"][start], state["settled"][start] = False, False
+        state["fresh"][start], state["converged"][start] = False, False
         state["secant"][start] = 0.0
         state["radius"][start] = max(state["radius"][start], 0.1 * self.radius)
 
     def retire(self, state: dict[str, np.ndarray], start: int) -> None:
         """One start is given up: no more trials."""
-        state["settled"][start] = True
+        state["converged"][start] = True
 
     def step(self, evaluate: Any, state: dict[str, np.ndarray]):
         """One trial for every start.
@@ -94,7 +94,7 @@ class Newton:
     def _plan(self, state, s: int) -> tuple[np.ndarray, float]:
         """The next trial of one start, and what the model foretells; the point itself where there is no model yet."""
         z = state["z"][s]
-        if not state["fresh"][s] or not np.isfinite(state["loss"][s]) or state["settled"][s]:
+        if not state["fresh"][s] or not np.isfinite(state["loss"][s]) or state["converged"][s]:
             return z, 0.0
         reach = state["radius"][s]
         low, high = np.maximum(self.box.low - z, -reach), np.minimum(self.box.high - z, reach)
@@ -103,18 +103,18 @@ class Newton:
 
     def _judge(self, state, s: int, trial: np.ndarray, foretold: float, found) -> None:
         loss, gradient, matrix = (float(found.value.loss[s]), found.gradient[s], found.hessian[s])
-        sound = np.isfinite(loss) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(matrix))
-        if state["settled"][s]:
+        valid = np.isfinite(loss) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(matrix))
+        if state["converged"][s]:
             return
         if not state["fresh"][s]:
             state["fresh"][s] = True
-            if sound:
+            if valid:
                 state["loss"][s], state["gradient"][s], state["matrix"][s] = loss, gradient, matrix
-            state["settled"][s] = not sound
+            state["converged"][s] = not valid
             return
         step = trial - state["z"][s]
-        gain = (state["loss"][s] - loss) / foretold if sound and foretold > 0 else -np.inf
-        if sound:
+        gain = (state["loss"][s] - loss) / foretold if valid and foretold > 0 else -np.inf
+        if valid:
             self._learn(state, s, step, gradient)
         if gain > 1e-4:
             state["z"][s], state["loss"][s], state["gradient"][s], state["matrix"][s] = trial, loss, gradient, matrix
@@ -124,7 +124,7 @@ class Newton:
         elif gain > 0.7 and size > 0.9 * state["radius"][s]:
             state["radius"][s] = min(2 * state["radius"][s], LARGEST_RADIUS)
         small = self.tolerance * max(1e-3, abs(state["loss"][s]))
-        state["settled"][s] = foretold < small or size < 1e-7
+        state["converged"][s] = foretold < small or size < 1e-7
 
     def _learn(self, state, s: int, step: np.ndarray, gradient: np.ndarray) -> None:
         """The symmetric rank-one update of the secant part."""

@@ -27,7 +27,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.simulation.metrics import Fold
-from iblf_jax.tuning.quantities import Integral, MetricResult, Peak, Quantity
+from iblf_jax.tuning.quantities import MetricResult, Peak, Quantity, TimeIntegral
 
 
 @component
@@ -229,17 +229,17 @@ def tracking(*, joints: Any = 1.0, after: Any = 0.0, scale: Any = None) -> Objec
 
     Source: the ISE criterion, textbook.
     """
-    return _plain("tracking", Integral("error", joints, after), scale)
+    return _plain("tracking", TimeIntegral("error", joints, after), scale)
 
 
 def effort(*, joints: Any = 1.0, scale: Any = None) -> Objective:
     """Integral of the squared torque, int |tau|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2 s."""
-    return _plain("effort", Integral("torque", joints), scale)
+    return _plain("effort", TimeIntegral("torque", joints), scale)
 
 
 def torque_rate(*, joints: Any = 1.0, scale: Any = None) -> Objective:
     """Integral of the squared rate of the torque, int |tau'|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2/s."""
-    return _plain("torque_rate", Integral("torque_rate", joints), scale)
+    return _plain("torque_rate", TimeIntegral("torque_rate", joints), scale)
 
 
 def settle(tolerance: Any = 0.01, *, joints: Any = 1.0, scale: Any = 1.0) -> Objective:
@@ -252,7 +252,7 @@ def settle(tolerance: Any = 0.01, *, joints: Any = 1.0, scale: Any = 1.0) -> Obj
       joints: weight of each joint, one number or (n,).
       scale: in s.
     """
-    return _plain("settle", Integral("outside", joints, tolerance=tolerance), scale)
+    return _plain("settle", TimeIntegral("outside", joints, tolerance=tolerance), scale)
 
 
 def peak_torque(limit: Any = None, *, sharpness: Any = 20.0, smoothing: Any = 0.01, joints: Any = 1.0) -> Objective:

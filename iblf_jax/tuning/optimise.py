@@ -1,6 +1,6 @@
 """The loop of a tuning: steps of a method, multipliers, sharper and sharper peaks, the best so far, early stop, checkpoint and resume.
 
-Requirements are driven in by an augmented Lagrangian: whenever a start has settled (or after INNER steps),
+Requirements are driven in by an augmented Lagrangian: whenever a start has converged (or after INNER steps),
 
     lam <- max(0, lam + mu G),     mu <- 5 mu where the largest G has not fallen to a quarter,
 
@@ -8,7 +8,7 @@ so a start that breaks them finds its way in while the penalty stays finite ever
 objective among those that keep the requirements and the bounds, or, while none does, the one that breaks them least.
 
 The smooth maximum in the loss lies above the maximum by smoothing times a logarithm, so its bottom is not where the maximum's is; but it
-is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once all starts have settled at the
+is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once all starts have converged at the
 tolerance ROUGH (or after INNER steps, HASTY where several are left to choose from), the smoothing is divided by SHARPER, the better half of
 the starts goes on and the others are given up.  What counts as the best is judged without smoothing throughout.
 
@@ -30,7 +30,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.tuning import problem
 from iblf_jax.tuning.objectives import sharper
-from iblf_jax.tuning.problem import Lane, Plan, Shared, Slope
+from iblf_jax.tuning.problem import Formulation, Lane, ProblemInputs, Slope
 
 INNER = 12
 """Steps at most between two updates of the multipliers, for methods that settle; others take this many."""
@@ -46,17 +46,17 @@ LANES = 16
 """Runs that are evaluated at once at least, where starts run out one by one: what a processor's vectors hold."""
 
 
-class Evaluator:
+class CountedProblem:
     """The compiled problem on the host: coordinates in, NumPy arrays out; counts what it did."""
 
-    def __init__(self, plan: Plan, shared: Shared, lanes: Lane, mode: str):
+    def __init__(self, plan: Formulation, shared: ProblemInputs, lanes: Lane, mode: str):
         self.plan, self.shared, self.lanes = plan, shared, lanes
         self.derive = Derive(problem.slope if mode == "forward" else problem.gradient, plan)
         self.evaluations = 0
         starts, runs = lanes.index.shape
         self.group = min(starts, -(-LANES // runs))
         self.needed = np.ones(starts, bool)
-        """Which starts are evaluated; the others come back unsound."""
+        """Which starts are evaluated; the others come back invalid."""
 
     def __call__(self, z: np.ndarray) -> Slope:
         """Value and derivatives at z, (S, p), a group of needed starts at a time, so that all calls are of one compiled shape."""
@@ -71,13 +71,13 @@ class Evaluator:
         found = jax.tree.map(lambda *x: np.concatenate(x)[: len(wanted)], *parts)
         return found if len(wanted) == len(z) else _spread(found, wanted, len(z))
 
-    def row(self, s: int) -> tuple[Shared, Lane]:
+    def row(self, s: int) -> tuple[ProblemInputs, Lane]:
         """What belongs to one start."""
         return self.shared, jax.tree.map(lambda x: np.asarray(x)[s : s + 1], self.lanes)
 
 
 def _spread(found: Slope, rows: np.ndarray, starts: int) -> Slope:
-    """What was found for some starts, among all of them; the others are unsound, with losses that are infinite."""
+    """What was found for some starts, among all of them; the others are invalid, with losses that are infinite."""
 
     def placed(x: np.ndarray) -> np.ndarray:
         whole = np.full((starts, *x.shape[1:]), np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
@@ -85,17 +85,17 @@ def _spread(found: Slope, rows: np.ndarray, starts: int) -> Slope:
         return whole
 
     found = jax.tree.map(placed, found)
-    found.value.loss[~found.value.sound] = np.inf
+    found.value.loss[~found.value.valid] = np.inf
     return found
 
 
 class Derive:
     """A compiled problem with its plan; hashable by both, so that it can be static."""
 
-    def __init__(self, function: Callable, plan: Plan):
+    def __init__(self, function: Callable, plan: Formulation):
         self.function, self.plan = function, plan
 
-    def __call__(self, shared: Shared, lanes: Lane) -> Slope:
+    def __call__(self, shared: ProblemInputs, lanes: Lane) -> Slope:
         """Value and derivatives of every lane."""
         return self.function(shared, lanes, plan=self.plan)
 
@@ -109,7 +109,7 @@ class Derive:
 class Loop:
     """State of a tuning, all of it arrays in `state`; `run` goes on from wherever it is."""
 
-    def __init__(self, evaluator: Evaluator, method: Any, z: np.ndarray, *, resample: bool = False, sharpenings: int = 0):
+    def __init__(self, evaluator: CountedProblem, method: Any, z: np.ndarray, *, resample: bool = False, sharpenings: int = 0):
         self.evaluator, self.method, self.resample = evaluator, method, resample
         self.smoothest, self.sharpenings = evaluator.shared.objective, sharpenings
         starts, count = len(z), len(evaluator.plan.shares)
@@ -199,7 +199,7 @@ class Loop:
     def _keep_best(self, z: np.ndarray, found: Slope, tolerance: float) -> bool:
         state, improved = self.state, False
         for s in range(len(z)):
-            if not found.value.sound[s]:
+            if not found.value.valid[s]:
                 continue
             excess = found.value.exact_excess[s]
             broken = float(np.max(np.maximum(excess, 0.0), initial=0.0)) + max(-float(found.value.margin[s]), 0.0)
@@ -224,7 +224,7 @@ class Loop:
             "excess": value.exact_excess,
             "margin": value.margin,
             "gradient_norm": np.linalg.norm(found.gradient, axis=-1),
-            "sound": value.sound,
+            "valid": value.valid,
             "evaluations": self.state["evaluations"],
         }
         for name, x in entries.items():
@@ -233,17 +233,17 @@ class Loop:
     def _outer(self, s: int, found: Slope) -> None:
         """Updates the multipliers of one start when it is time, or marks it finished."""
         state = self.state
-        settled = bool(state["method"]["settled"][s])
+        converged = bool(state["method"]["converged"][s])
         state["since"][s] += 1
-        if state["finished"][s] or not (settled or state["since"][s] >= INNER):
+        if state["finished"][s] or not (converged or state["since"][s] >= INNER):
             return
-        if state["lam"].shape[1] == 0 or not found.value.sound[s]:
-            state["finished"][s] = settled
+        if state["lam"].shape[1] == 0 or not found.value.valid[s]:
+            state["finished"][s] = converged
             return
         excess = found.value.excess[s]
         new = np.maximum(0.0, state["lam"][s] + state["mu"][s] * excess)
         worst = float(np.max(np.maximum(excess, -state["lam"][s] / state["mu"][s])))
-        if settled and (abs(worst) < 1e-3 or state["outer"][s] >= OUTER):
+        if converged and (abs(worst) < 1e-3 or state["outer"][s] >= OUTER):
             state["finished"][s] = True
             return
         if max(worst, 0.0) > 0.25 * state["worst"][s]:
@@ -257,7 +257,7 @@ class Loop:
 # ---------------------------------------------------------------------------------------------------------------- checkpoints
 
 
-def fingerprint(plan: Plan, shared: Shared, options: Any) -> str:
+def fingerprint(plan: Formulation, shared: ProblemInputs, options: Any) -> str:
     """A hash of everything that a checkpoint must agree with."""
     cases = shared.cases._replace(key=jax.random.key_data(shared.cases.key))
     leaves, structure = jax.tree.flatten(shared._replace(cases=cases))
@@ -292,8 +292,8 @@ def load_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
         with np.load(place) as file:
             arrays = {name: file[name] for name in file.files}
     except Exception as error:  # torn, another kind of file, or one that only looks like a zip
-        mend = f"It cannot be read ({type(error).__name__}: {error}): delete it or name another file."
-        raise checks.fail("checkpoint", str(path), "a checkpoint of tune", mend) from error
+        remedy = f"It cannot be read ({type(error).__name__}: {error}): delete it or name another file."
+        raise checks.fail("checkpoint", str(path), "a checkpoint of tune", remedy) from error
     if str(arrays.get("fingerprint")) != mark:
         raise checks.fail(
             "checkpoint",

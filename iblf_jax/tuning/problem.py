@@ -33,11 +33,11 @@ from iblf_jax.tuning.tangents import by_coordinates
 
 FORWARD_MOST = 32
 """Up to so many numbers forward mode is used, above it reverse mode."""
-UNSOUND = Status.NOT_FINITE | Status.STEP_TOO_LARGE
+INVALID = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 """Runs with these flags have no loss: a step that makes one is rejected."""
 
 
-class Plan(NamedTuple):
+class Formulation(NamedTuple):
     """What is compiled; static."""
 
     blocks: tuple[Block, ...]
@@ -55,7 +55,7 @@ class Plan(NamedTuple):
     """Whether they are called from a loop of JAX's."""
 
 
-class Shared(NamedTuple):
+class ProblemInputs(NamedTuple):
     """What all starts share; traced."""
 
     cases: Cases
@@ -81,7 +81,7 @@ class Value(NamedTuple):
     """A problem at one z."""
 
     loss: Any
-    """L, infinite where a run was unsound."""
+    """L, infinite where a run was invalid."""
     objective: Any
     """L without requirements and without smoothing: what results are compared by."""
     terms: Any
@@ -92,7 +92,7 @@ class Value(NamedTuple):
     """G_r from the exact ones."""
     margin: Any
     """The smallest margin of all runs [rad]."""
-    sound: Any
+    valid: Any
     exact: Any
     """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the margin."""
 
@@ -112,7 +112,7 @@ def fold_of(objective: Objective, dtype) -> tuple[Quantities, ...]:
     return (jax.tree.map(lambda x: jnp.asarray(x, dtype), Quantities(parts)),)
 
 
-def _varied(plan: Plan, shared: Shared, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
+def _varied(plan: Formulation, shared: ProblemInputs, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
     """Path -> value for one run."""
     point = {path: x.astype(shared.dt.dtype) for path, x in values_at(plan.blocks, z).items()}
     if not plan.targets:
@@ -121,7 +121,7 @@ def _varied(plan: Plan, shared: Shared, z: jax.Array, index: jax.Array) -> dict[
     return merge(shared.cases.scenario, point, made)
 
 
-def _of_lanes(plan: Plan, shared: Shared, lanes: Lane):
+def _of_lanes(plan: Formulation, shared: ProblemInputs, lanes: Lane):
     """Path -> values (S, B, ...)."""
     one = partial(_varied, plan, shared)
     return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(lanes.z, lanes.index)
@@ -135,39 +135,39 @@ def _penalty(excess: jax.Array, lam: jax.Array, mu: jax.Array) -> jax.Array:
     return jnp.sum(jnp.maximum(0.0, lam + mu * excess) ** 2 - lam**2) / (2 * mu)
 
 
-def _excesses(plan: Plan, objective: Objective, quantities: jax.Array) -> jax.Array:
+def _excesses(plan: Formulation, objective: Objective, quantities: jax.Array) -> jax.Array:
     each = jax.vmap(objective.excesses)(quantities)
     found = [worst_share(each[:, r], share) for r, share in enumerate(plan.shares)]
     return jnp.stack(found) if found else jnp.zeros((0,), quantities.dtype)
 
 
-def _objective(plan: Plan, shared: Shared, lane: Lane, smooth: jax.Array) -> jax.Array:
+def _objective(plan: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
     terms = jax.vmap(shared.objective.values)(smooth)
     terms = jnp.log(terms) if plan.scalarisation == "log" else terms
     return combine(plan.risk, terms @ lane.weights)
 
 
-def _loss(plan: Plan, shared: Shared, lane: Lane, smooth: jax.Array) -> jax.Array:
+def _loss(plan: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
     """L of one start, from the quantities of its runs (B, K)."""
     objective = _objective(plan, shared, lane, smooth)
     return objective + _penalty(_excesses(plan, shared.objective, smooth), lane.lam, lane.mu)
 
 
-def _value(plan: Plan, shared: Shared, lane: Lane, smooth, exact, status) -> Value:
-    sound = jnp.all(status & int(UNSOUND) == 0) & jnp.all(jnp.isfinite(smooth))
+def _value(plan: Formulation, shared: ProblemInputs, lane: Lane, smooth, exact, status) -> Value:
+    valid = jnp.all(status & int(INVALID) == 0) & jnp.all(jnp.isfinite(smooth))
     return Value(
-        jnp.where(sound, _loss(plan, shared, lane, smooth), jnp.inf),
+        jnp.where(valid, _loss(plan, shared, lane, smooth), jnp.inf),
         _objective(plan, shared, lane, exact),
         jnp.mean(jax.vmap(shared.objective.values)(exact), axis=0),
         _excesses(plan, shared.objective, smooth),
         _excesses(plan, shared.objective, exact),
         -jnp.max(exact[:, -1]),
-        sound,
+        valid,
         jnp.mean(exact, axis=0),
     )
 
 
-def _slope(plan: Plan, shared: Shared, lane: Lane, outcome, tangents, products) -> Slope:
+def _slope(plan: Formulation, shared: ProblemInputs, lane: Lane, outcome, tangents, products) -> Slope:
     """Loss, gradient and Gauss-Newton matrix of one start; arrays of its B runs."""
     smooth, exact, weight = (outcome.metrics[name] for name in Quantities.units)
     pull = jax.grad(partial(_loss, plan, shared, lane))
@@ -182,7 +182,7 @@ def _slope(plan: Plan, shared: Shared, lane: Lane, outcome, tangents, products) 
 
 
 @partial(jax.jit, static_argnames="plan")
-def value(shared: Shared, lanes: Lane, *, plan: Plan) -> Value:
+def value(shared: ProblemInputs, lanes: Lane, *, plan: Formulation) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
     fold = fold_of(shared.objective, shared.dt.dtype)
     varied = _flat(_of_lanes(plan, shared, lanes))
@@ -195,7 +195,7 @@ def value(shared: Shared, lanes: Lane, *, plan: Plan) -> Value:
 
 
 @partial(jax.jit, static_argnames="plan")
-def slope(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
+def slope(shared: ProblemInputs, lanes: Lane, *, plan: Formulation) -> Slope:
     """The problem with gradient (S, p) and Gauss-Newton matrix (S, p, p), by forward mode."""
     fold = fold_of(shared.objective, shared.dt.dtype)
     one, overlap = partial(_varied, plan, shared), partial(same_place, shared.cases.scenario)
@@ -212,7 +212,7 @@ def slope(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
 
 
 @partial(jax.jit, static_argnames="plan")
-def gradient(shared: Shared, lanes: Lane, *, plan: Plan) -> Slope:
+def gradient(shared: ProblemInputs, lanes: Lane, *, plan: Formulation) -> Slope:
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
 
     def one_run(lane: Lane, index):

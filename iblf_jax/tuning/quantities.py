@@ -2,13 +2,13 @@
 
 Two kinds cover what gains are tuned for, over a signal y(t), a vector:
 
-    Integral   sum_k dt |y(t_k)|^2
-    Peak       max_k max_i y_i(t_k), in the loss as T log sum_k sum_i exp(y_i(t_k) / T), which is smooth and never below it
+    TimeIntegral   sum_k dt |y(t_k)|^2
+    Peak           max_k max_i y_i(t_k), in the loss as T log sum_k sum_i exp(y_i(t_k) / T), which is smooth and never below it
 
 Both also give the matrix of their second derivatives without the second derivatives of the motion (Gauss-Newton), from the tangents
 y_u of their signal (`derivatives.Outer`):
 
-    Integral   2 sum dt y_u . y_v             Peak   (sum_w y_u y_v - mean_u mean_v) / T,  w the weights of the smooth maximum
+    TimeIntegral   2 sum dt y_u . y_v         Peak   (sum_w y_u y_v - mean_u mean_v) / T,  w the weights of the smooth maximum
 
 `MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`, `finish`, and for second-order methods
 `curvature` and `hessian`; `iblf_jax.testing.check_objective` looks at it.
@@ -25,8 +25,8 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine.derivatives import Outer
-from iblf_jax.simulation.closed_loop import Sample
 from iblf_jax.simulation.metrics import Fold
+from iblf_jax.simulation.signals import Sample
 
 FAR = 1e6
 """Where a peak starts, below everything; in units of its scale."""
@@ -73,7 +73,7 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax
 
 
 @component
-class Integral:
+class TimeIntegral:
     """sum_k dt |y(t_k)|^2 over the samples with t >= after.
 
     Args:
@@ -91,7 +91,7 @@ class Integral:
 
     def check(self) -> None:
         """Raises ValueError for an unknown signal."""
-        checks.one_of("Integral.signal", self.signal, tuple(self.units))
+        checks.one_of("TimeIntegral.signal", self.signal, tuple(self.units))
 
     def _at(self, acc, sample: Sample) -> jax.Array:
         y = self.joints * signal_of(self.signal, sample, acc[1], self.tolerance)
@@ -224,7 +224,7 @@ class MetricResult:
         return value, value, jnp.ones_like(value)
 
 
-MEMBERS = {"integral": Integral, "peak": Peak, "metric_result": MetricResult}
+MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult}
 """Every quantity by the name that a tuning file gives it."""
 
 

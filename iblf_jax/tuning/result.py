@@ -22,7 +22,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.problem import NUMBERS_A_RUN, UNSOUND
+from iblf_jax.tuning.problem import INVALID, NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
@@ -49,7 +49,7 @@ def _slice(scenario, changes, folds, dt, *, steps, method, backend):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Setup:
+class TuneSetup:
     """What a tuning was asked for, as far as its report needs it."""
 
     objective: Objective
@@ -82,7 +82,7 @@ class TuneResult:
     names: tuple[str, ...]
     """What each coordinate is called, (p,)."""
     history: dict[str, np.ndarray]
-    """Per step, (steps, starts, ...): loss, objective, terms, excess of the requirements, margin [rad], gradient_norm, sound, z and
+    """Per step, (steps, starts, ...): loss, objective, terms, excess of the requirements, margin [rad], gradient_norm, valid, z and
     x (the gains tried, in their units); evaluations is (steps,)."""
     best_start: int
     """Which of the starts won."""
@@ -92,13 +92,13 @@ class TuneResult:
     mode: str
     """"forward" or "reverse"."""
     seconds: float
-    setup: Setup
+    setup: TuneSetup
 
     @property
     def objective(self) -> float:
         """The objective at the tuned gains, on the runs that it was tuned on."""
-        sound = self.history["sound"] & np.all(np.abs(self.history["x"] - self.tuned) <= 1e-12 * np.abs(self.tuned), axis=-1)
-        return float(np.min(np.where(sound, self.history["objective"], np.inf)))
+        valid = self.history["valid"] & np.all(np.abs(self.history["x"] - self.tuned) <= 1e-12 * np.abs(self.tuned), axis=-1)
+        return float(np.min(np.where(valid, self.history["objective"], np.inf)))
 
     @property
     def tuned(self) -> np.ndarray:
@@ -182,7 +182,7 @@ class TuneResult:
           span: each axis reaches from exp(-span) to exp(span) times the tuned number.
 
         Returns:
-          Values of the first (points,), of the second (points,), and the objective (points, points), infinite where a run is unsound.
+          Values of the first (points,), of the second (points,), and the objective (points, points), infinite where a run is invalid.
 
         Raises:
           ValueError: an unknown name.
@@ -203,8 +203,8 @@ class TuneResult:
         options = {"steps": steps, "method": setup.method, "backend": setup.backend}
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), **options)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
-        sound = np.asarray(outcome.status) & int(UNSOUND) == 0
-        return a, b, np.where(sound, np.asarray(values), np.inf).reshape(points, points)
+        valid = np.asarray(outcome.status) & int(INVALID) == 0
+        return a, b, np.where(valid, np.asarray(values), np.inf).reshape(points, points)
 
     def plot(self, **options):
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as `plotting.tuning`."""

@@ -14,7 +14,7 @@ The printed proof drops two terms of V2', which this module measures:
     observer (3.11) as printed: - f_tilde^T kf M0' q'          since f_tilde' = f' - kf f_tilde - kf M0' q'
 
 Rounding: V2' is a sum of large terms that cancel, so the error of it is some units of the last place of those terms, whose sizes
-are added up in `Evidence.terms`.
+are added up in `ProofTerms.terms`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from iblf_jax.certificates.claims import law_of
 from iblf_jax.controllers import Backstepping
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
-from iblf_jax.simulation.closed_loop import LoopState, Sample, evaluate, rate
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
 from iblf_jax.simulation.integrators import step
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample
 
 ROUNDING = 2.0
 """Units of the last place by which V2' may be off, relative to the sizes of its terms; 0.1 is the most that was seen (tests)."""
@@ -39,7 +40,7 @@ UNCHANGED = 8.0
 """Units of the last place by which a torque may differ and still be the same."""
 
 
-class Evidence(NamedTuple):
+class ProofTerms(NamedTuple):
     """The loop at one instant; every field has a leading time axis along a run."""
 
     V: jax.Array
@@ -100,8 +101,8 @@ def _alike(one: Any, other: Any) -> jax.Array:
     return jnp.all(jnp.stack(same)) if same else jnp.ones((), bool)
 
 
-def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
-    """The evidence at one state; pure, for `vmap` over states, times and gains.
+def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
+    """The proof at one state; pure, for `vmap` over states, times and gains.
 
     Args:
       scenario: canonical scenario of n joints.
@@ -111,8 +112,8 @@ def evidence_at(scenario: Scenario, t: jax.Array, state: LoopState) -> Evidence:
     return observed(scenario, t, state)[0]
 
 
-def observed(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Evidence, Sample]:
-    """The evidence at one state, as `evidence_at`, and the sample that a run records there."""
+def observed(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[ProofTerms, Sample]:
+    """The proof at one state, as `terms_at`, and the sample that a run records there."""
     along = rate(scenario, t, state)
     now, ahead, sample = jax.jvp(partial(_probe, scenario), (t, state), (jnp.ones_like(t), along), has_aux=True)
     M0 = scenario.model.mass_matrix(state.q)
@@ -121,7 +122,7 @@ def observed(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Eviden
     eigenvalues = jnp.linalg.eigvalsh(M0)
     dropped_e2, dropped_f = _dropped(scenario, dM0, state.dq, now["e2"], f_tilde)
     terms, df_terms, V_terms = _sizes(scenario, t, state, M0, now, ahead, f_tilde)
-    evidence = Evidence(
+    proof = ProofTerms(
         V=now["V"],
         dV=ahead["V"],
         f=now["disturbance"],
@@ -139,7 +140,7 @@ def observed(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Eviden
         df_terms=df_terms,
         V_terms=V_terms,
     )
-    return evidence, sample
+    return proof, sample
 
 
 def _limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
@@ -203,7 +204,7 @@ def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, me
 
 @partial(jax.jit, static_argnames="method")
 def along_run(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str):
-    """The evidence, the sample and the integrator's error in V2 over one step, at every state; time axis first."""
+    """The proof, the sample and the integrator's error in V2 over one step, at every state; time axis first."""
 
     def one(t, state):
         return *observed(scenario, t, state), defect(scenario, t, state, dt, method)

@@ -1,4 +1,4 @@
-"""One run as the certificate sees it: evidence at every step, the constants of the claim, and the envelope of V2.
+"""One run as the certificate sees it: proof at every step, the constants of the claim, and the envelope of V2.
 
     case 1:  V2(t) <= V2(s) exp(-rho (t - s)) for t >= s                                                                 (3.20)
     case 2:  V2(t) <= V2(s) exp(-rho (t - s)) + rho2/rho,   rho2 = F_d^2/2, F_d = sup |f'| over the run                  (3.28)
@@ -6,7 +6,7 @@
 The claim holds from any instant s on.  So where f jumps (Assumption 1 is broken there), and where the guard or a torque limit was at
 work, the envelope starts anew at the next step.
 
-A run is not the exact solution: the envelope is widened by the integrator's own error in V2 (`evidence.defect`), carried along at the
+A run is not the exact solution: the envelope is widened by the integrator's own error in V2 (`proof.defect`), carried along at the
 rate of the claim, and by rounding, so that V2 may be followed down to where it is only noise.
 
 All steps are looked at, whatever the run recorded (`retrace`), twice: rho and F_d are known after the first time only.  A run of few
@@ -22,8 +22,8 @@ import jax
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.box import Extremes, eigenvalues_over
-from iblf_jax.certificates.evidence import rounding
+from iblf_jax.certificates.eigenvalues import Extremes, eigenvalues_over
+from iblf_jax.certificates.proof_terms import rounding
 from iblf_jax.certificates.retrace import DISBELIEVED, Stretch, believed, check_status, grid, stretches
 from iblf_jax.core.status import describe
 from iblf_jax.simulation.scenario import Scenario
@@ -76,7 +76,7 @@ class Whole(NamedTuple):
     lambda_min: float
     """Smallest eigenvalue of M0 along the run [kg m^2]."""
     lambda_max: float
-    box: Extremes
+    eigenvalues: Extremes
     claim: claims.Claim | None
     samples: int
     """Steps that were looked at, and the last instant."""
@@ -86,18 +86,18 @@ class Whole(NamedTuple):
     """V2 at the first and at the last."""
 
 
-class Facts(NamedTuple):
+class Trajectory(NamedTuple):
     """A stretch of a run with everything that the lines are made of."""
 
     whole: Whole
     t: np.ndarray
     sample: Any
-    evidence: Any
+    proof: Any
     recorded: np.ndarray
     envelope: dict[int, Envelope]
 
 
-def look(run: Any) -> tuple[Whole, Iterator[Facts]]:
+def look(run: Any) -> tuple[Whole, Iterator[Trajectory]]:
     """What is known of one run, its arrays on the host, and its stretches one after the other."""
     seen: Iterable[Stretch] = list(stretches(run)) if grid(run)[1] <= KEPT else stretches(run)
     whole = _whole(run, seen)
@@ -117,16 +117,16 @@ class _Tally:
 
     def add(self, stretch: Stretch) -> None:
         """Takes a stretch into account; what is no number stays none."""
-        sample, evidence = stretch.sample, stretch.evidence
+        sample, proof = stretch.sample, stretch.proof
         self.low, self.high = np.minimum(self.low, sample.lower.min(axis=0)), np.maximum(self.high, sample.upper.max(axis=0))
         self.margin = np.minimum(self.margin, np.minimum(sample.q - sample.lower, sample.upper - sample.q).min())
-        self.F_m = np.maximum(self.F_m, np.linalg.norm(evidence.f, axis=1).max())
-        self.F_d = np.maximum(self.F_d, np.linalg.norm(evidence.df, axis=1).max())
-        self.lambda_min = np.minimum(self.lambda_min, evidence.lambda_min.min())
-        self.lambda_max = np.maximum(self.lambda_max, evidence.lambda_max.max())
-        self.steady = self.steady and bool(evidence.steady.all())
-        self.V_ends = (evidence.V[0] if self.samples == 0 else self.V_ends[0], evidence.V[-1])
-        self.samples, self.left_out = self.samples + stretch.t.size, self.left_out + int(evidence.held.sum())
+        self.F_m = np.maximum(self.F_m, np.linalg.norm(proof.f, axis=1).max())
+        self.F_d = np.maximum(self.F_d, np.linalg.norm(proof.df, axis=1).max())
+        self.lambda_min = np.minimum(self.lambda_min, proof.lambda_min.min())
+        self.lambda_max = np.maximum(self.lambda_max, proof.lambda_max.max())
+        self.steady = self.steady and bool(proof.steady.all())
+        self.V_ends = (proof.V[0] if self.samples == 0 else self.V_ends[0], proof.V[-1])
+        self.samples, self.left_out = self.samples + stretch.t.size, self.left_out + int(proof.held.sum())
 
 
 def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
@@ -141,12 +141,12 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
         no_run = f"the run is not to be believed: {describe(int(run.status) & int(DISBELIEVED))}"
     no_claim = claims.why_no_claim(run.scenario)
     constants = None if no_claim else claims.claim(run.scenario)
-    box = eigenvalues_over(run.scenario.model, tally.low, tally.high)
+    eigenvalues = eigenvalues_over(run.scenario.model, tally.low, tally.high)
     case = 1 if tally.steady else 2
     rates = {}
     if constants is not None:
         for each in claims.CASES:
-            for where, largest in (("run", tally.lambda_max), ("box", box.lambda_max)):
+            for where, largest in (("run", tally.lambda_max), ("box", eigenvalues.lambda_max)):
                 rates[each, where] = float(claims.rho(constants, largest, each))
     return Whole(
         run=run,
@@ -160,7 +160,7 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
         F_d=0.0 if case == 1 else float(tally.F_d),
         lambda_min=float(tally.lambda_min),
         lambda_max=float(tally.lambda_max),
-        box=box,
+        eigenvalues=eigenvalues,
         claim=constants,
         samples=tally.samples,
         left_out=tally.left_out,
@@ -168,18 +168,18 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
     )
 
 
-def _facts(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Facts]:
+def _facts(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Trajectory]:
     """The second look: the stretches, with the envelopes that run through them."""
     anchors: dict[int, Anchor] = {}
     t, held = np.zeros(0), np.zeros(0, bool)
     for stretch in seen:
-        starts = starts_of(np.append(t, stretch.t), np.append(held, stretch.evidence.held), whole.jumps)[t.size :]
-        t, held = stretch.t[-1:], stretch.evidence.held[-1:]
+        starts = starts_of(np.append(t, stretch.t), np.append(held, stretch.proof.held), whole.jumps)[t.size :]
+        t, held = stretch.t[-1:], stretch.proof.held[-1:]
         envelopes = {}
         if whole.claim is not None:
             for case in claims.CASES:
                 envelopes[case], anchors[case] = _envelope(whole, case, stretch, starts, anchors.get(case))
-        yield Facts(whole, stretch.t, stretch.sample, stretch.evidence, stretch.recorded, envelopes)
+        yield Trajectory(whole, stretch.t, stretch.sample, stretch.proof, stretch.recorded, envelopes)
 
 
 def same_structure(one: Any, other: Any) -> bool:
@@ -209,7 +209,7 @@ def starts_of(t: np.ndarray, held: np.ndarray, jumps: np.ndarray) -> np.ndarray:
 def _envelope(whole: Whole, case: int, stretch: Stretch, starts: np.ndarray, before: Anchor | None) -> tuple[Envelope, Anchor]:
     """The envelope of V2 and its tolerance along a stretch; NaN at held steps, and everywhere if the rate is not positive."""
     rate, rho2 = whole.rho[case, "run"], 0.0 if case == 1 else whole.F_d**2 / 2
-    t, V, noise = stretch.t, stretch.evidence.V, NOISE * float(np.finfo(stretch.evidence.V.dtype).eps) * stretch.evidence.V_terms
+    t, V, noise = stretch.t, stretch.proof.V, NOISE * float(np.finfo(stretch.proof.V.dtype).eps) * stretch.proof.V_terms
     if before is None:
         before = Anchor(t[0], V[0], noise[0], 0.0)
     # Index of the step at which the envelope started, 0 for one before this stretch.
@@ -223,6 +223,6 @@ def _envelope(whole: Whole, case: int, stretch: Stretch, starts: np.ndarray, bef
     if not rate > 0:
         nothing = np.full(t.size, np.nan)
         return Envelope(nothing, nothing), after
-    bound = np.where(stretch.evidence.held, np.nan, start_V * np.exp(-rate * (t - start_t)) + rho2 / rate)
+    bound = np.where(stretch.proof.held, np.nan, start_V * np.exp(-rate * (t - start_t)) + rho2 / rate)
     widened = np.sqrt(2 * (bound + np.asarray(sums))) + start_noise + noise
     return Envelope(bound, 0.5 * widened**2 - bound), after

@@ -4,10 +4,10 @@ The inequality is a statement about states, so a counterexample is one state: th
 
     V2' - 1/2 |f'|^2 <= -Q,   Q = sum_i rate_i V1_i + e2^T (K2 - I/2) e2 + f_tilde^T (kf - I) f_tilde >= rho V2,           (3.24)
 
-and `falsify` climbs  g = (V2' - 1/2 |f'|^2) / Q  at t = 0 over perturbations of the scenario (`studies.cube`), from many starting points,
-with the exact gradient.  Where the proof is exact g never exceeds -1, whatever is varied.  g > -1 breaks (3.24); g > 0 breaks the claim
-itself, (3.18) and (3.26) for every rho > 0: V2 grows where the theorem has it fall.  For law and observer as printed such starts exist,
-because the terms dropped from the proof grow with the cube of the joint velocity, and Q with its square.
+and `counterexample` climbs  g = (V2' - 1/2 |f'|^2) / Q  at t = 0 over perturbations of the scenario (`studies.cube`), from many starting
+points, with the exact gradient.  Where the proof is exact g never exceeds -1, whatever is varied.  g > -1 breaks (3.24); g > 0 breaks
+the claim itself, (3.18) and (3.26) for every rho > 0: V2 grows where the theorem has it fall.  For law and observer as printed such starts
+exist, because the terms dropped from the proof grow with the cube of the joint velocity, and Q with its square.
 
 What cannot be run (a start outside its bounds, a negative mass) and where nothing is claimed (the guard or a torque limit at work) is no
 counterexample: such points are passed over.
@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.box import maximise
-from iblf_jax.certificates.evidence import evidence_at
+from iblf_jax.certificates.eigenvalues import maximise
+from iblf_jax.certificates.proof_terms import terms_at
 from iblf_jax.core import checks
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
@@ -34,7 +34,7 @@ from iblf_jax.studies.distributions import Perturbation
 
 
 class Counterexample(NamedTuple):
-    """The worst that `falsify` found."""
+    """The worst that `counterexample` found."""
 
     scenario: Scenario
     parameters: dict[str, np.ndarray]
@@ -50,7 +50,7 @@ def relative_growth(scenario: Scenario) -> jax.Array:
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     """The growth at the start, and whether the guard or a torque limit is at work there."""
-    seen = evidence_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
+    seen = terms_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
     constants = claims.claim(scenario)
     M0 = scenario.model.mass_matrix(scenario.initial.q)
     V1 = seen.V - 0.5 * (seen.e2 @ (M0 @ seen.e2) + seen.f_tilde @ seen.f_tilde)
@@ -60,7 +60,7 @@ def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
 
 
 @checks.renamed(ranges="perturbations")
-def falsify(scenario: Scenario, perturbations: Mapping[str, Perturbation], *, starts: int = 16, seed: int = 0) -> Counterexample:
+def counterexample(scenario: Scenario, perturbations: Mapping[str, Perturbation], *, starts: int = 16, seed: int = 0) -> Counterexample:
     """Climbs to the start and gains at which V2' - 1/2 |f'|^2 is largest relative to -Q of the proof.                    (3.24)
 
     Args:
