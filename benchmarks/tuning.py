@@ -135,7 +135,7 @@ class Judge:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """J at points (S, p) or (p,)."""
-        found = problem.value(self.built.shared, self.built.lanes(np.atleast_2d(points)), plan=self.built.plan)
+        found = problem.value(self.built.shared, self.built.lanes(np.atleast_2d(points)), formulation=self.built.formulation)
         losses = np.where(np.asarray(found.sound), np.asarray(found.objective) - self.offset, 1e6)
         losses = np.where(np.isfinite(losses), losses, 1e6)
         self.seen += losses.tolist()
@@ -154,7 +154,7 @@ def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) ->
     options = {"bounds": [built.box.low.tolist(), built.box.high.tolist()], "seed": seed, "verbose": -9, "maxfevals": evaluations}
     search = cma.CMAEvolutionStrategy(built.box.z, 0.5, options)
     size = search.popsize
-    problem.value(built.shared, built.lanes(np.stack([built.box.z] * size)), plan=built.plan)  # compile
+    problem.value(built.shared, built.lanes(np.stack([built.box.z] * size)), formulation=built.formulation)  # compile
     judge = Judge(built, offset)
     while not search.stop() and len(judge.seen) < evaluations:
         points = search.ask()
@@ -210,8 +210,8 @@ def compare(name: str, quick: bool, starts: int, seeds: int) -> tuple[list[list[
     built = _tune.build(scenario, parameters, loss.objective(SMOOTHING), None, 1, 0, "mean", timing)
     lanes, size = built.lanes(np.stack([built.box.z] * starts)), len(built.box.z)
     calls = {
-        "value": lambda: problem.value(built.shared, lanes, plan=built.plan),
-        "slope": lambda: problem.slope(built.shared, lanes, plan=built.plan),
+        "value": lambda: problem.value(built.shared, lanes, formulation=built.formulation),
+        "slope": lambda: problem.slope(built.shared, lanes, formulation=built.formulation),
     }
     seconds = interleaved(calls, 2 if quick else 20)
     cost = seconds["slope"] / seconds["value"]

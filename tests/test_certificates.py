@@ -302,7 +302,7 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert sparse.numbers["F_d"] == pytest.approx(whole.numbers["F_d"], rel=1e-9)
     assert_alike(sparse, whole)
     # The steps after the last sample count too; and a long run, which is not kept in memory, gives the same.
-    monkeypatch.setattr(trajectory, "KEPT", 0)
+    monkeypatch.setattr(trajectory, "CERTIFY_KEPT", 0)
     assert_alike(certify(run.scenario, decimated(shaken, 300)), whole)
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
 

@@ -58,11 +58,11 @@ def central(f, z, h=1e-5):
 def test_forward_and_reverse_equal_finite_differences(nominal):
     z = nominal.box.z
     lanes = nominal.lanes(z[None])
-    forward = problem.slope(nominal.shared, lanes, plan=nominal.plan)
-    reverse = problem.gradient(nominal.shared, lanes, plan=nominal.plan)
+    forward = problem.slope(nominal.shared, lanes, formulation=nominal.formulation)
+    reverse = problem.gradient(nominal.shared, lanes, formulation=nominal.formulation)
 
     def loss(z):
-        return np.asarray(problem.value(nominal.shared, nominal.lanes(z[None]), plan=nominal.plan).loss[0])
+        return np.asarray(problem.value(nominal.shared, nominal.lanes(z[None]), formulation=nominal.formulation).loss[0])
 
     expected = central(loss, z)
     scale = np.max(np.abs(expected))
@@ -76,17 +76,17 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
 def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v, with e1_u by finite differences of recorded runs."""
     lanes = nominal.lanes(nominal.box.z[None])
-    found = problem.slope(nominal.shared, lanes, plan=nominal.plan)
+    found = problem.slope(nominal.shared, lanes, formulation=nominal.formulation)
 
     def errors(z):
-        values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.plan.blocks}
+        values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.formulation.blocks}
         return np.asarray(ij.simulate(ij.with_parameters(paper, values), **SHORT).e1)[:-1]
 
     J = central(errors, nominal.box.z)
     expected = 2 * SHORT["dt"] * np.einsum("utn,vtn->uv", J, J)
     only = ij.objectives.Objective((nominal.shared.objective.terms[0],))
     shared = nominal.shared._replace(objective=only)
-    one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), plan=nominal.plan)
+    one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), formulation=nominal.formulation)
     np.testing.assert_allclose(one.hessian[0] * only.terms[0].scale, expected, rtol=1e-5, atol=1e-9 * np.max(expected))
     assert np.all(np.isfinite(found.hessian))
 
@@ -96,11 +96,11 @@ def test_reverse_mode_remembers_few_states(paper):
     """Temporary memory of the gradient grows like the cube root of the number of steps, and stays below 2 sqrt(T) states."""
     sizes = {}
     for steps in (500, 4000):
-        plan = _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3})
-        compiled = problem.gradient.lower(plan.shared, plan.lanes(plan.box.z[None]), plan=plan.plan).compile()
+        built = _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3})
+        compiled = problem.gradient.lower(built.shared, built.lanes(built.box.z[None]), formulation=built.formulation).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
-    folds = problem.fold_of(plan.shared.objective, jnp.float64)
-    inputs = Inputs(canonical(paper), folds, plan.shared.dt, plan.shared.dt)
+    folds = problem.fold_of(built.shared.objective, jnp.float64)
+    inputs = Inputs(canonical(paper), folds, built.shared.dt, built.shared.dt)
     state = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(carry_shapes(Batch.of(inputs, None), "rk4")))
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
@@ -315,7 +315,7 @@ class Corner:
     def __init__(self, starts):
         goal = jax.tree.map(jnp.asarray, objectives.peak_torque(1.0, smoothing=0.2))
         self.shared = problem.ProblemInputs(None, goal, jnp.asarray(1e-3))
-        self.plan = problem.Formulation((), (), 1, "euler", Risk("mean"), ())
+        self.formulation = problem.Formulation((), (), 1, "euler", Risk("mean"), ())
         self.lanes = problem.Lane(np.zeros((starts, 1)), np.zeros((starts, 1), np.uint32), np.ones((starts, 1)), np.zeros((starts, 0)), 1.0)
         self.needed, self.evaluations = np.ones(starts, bool), 0
 
@@ -360,7 +360,7 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
 @pytest.mark.slow
 def test_only_needed_starts_are_evaluated_in_groups_of_one_shape(nominal):
     lanes = nominal.lanes(np.arange(20.0)[:, None] * np.ones(6))
-    evaluator, shapes = CountedProblem(nominal.plan, nominal.shared, lanes, "forward"), set()
+    evaluator, shapes = CountedProblem(nominal.formulation, nominal.shared, lanes, "forward"), set()
 
     def derive(shared, lanes):
         shapes.add(lanes.z.shape)
@@ -440,7 +440,7 @@ def test_common_random_numbers(paper):
     """The same draws for every start and every step; other seeds give others."""
     built = [_tune.build(paper, GAINS, objectives.tracking(scale=1.0), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
     z = np.stack([built[0].box.z] * 2)
-    losses = [np.asarray(CountedProblem(p.plan, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
+    losses = [np.asarray(CountedProblem(p.formulation, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
 
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
-from iblf_jax.certificates.retrace import STRETCH
 from iblf_jax.certificates.trajectory import Trajectory, Whole
 from iblf_jax.core.status import Status
+from iblf_jax.engine.plan import CERTIFY_STRETCH
 from iblf_jax.simulation.scenario import Scenario
 
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
@@ -246,7 +246,7 @@ def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | Non
 
 def bounds_along(trajectory: Trajectory, V: np.ndarray) -> dict[str, np.ndarray]:
     """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
-    places = np.minimum(np.arange(STRETCH), V.size - 1)  # one program for stretches of every size
+    places = np.minimum(np.arange(CERTIFY_STRETCH), V.size - 1)  # one program for stretches of every size
     by_barrier = _xi_bound(trajectory.whole.run.scenario, trajectory.t[places], jnp.asarray(V[places], trajectory.t.dtype))
     return {
         "xi, by V1": np.full(trajectory.sample.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier)[: V.size],

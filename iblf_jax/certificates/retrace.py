@@ -20,12 +20,11 @@ import numpy as np
 from iblf_jax.certificates.proof_terms import along_run
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
+from iblf_jax.engine.plan import CERTIFY_STRETCH
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import step
 from iblf_jax.simulation.scenario import Scenario
 
-STRETCH = 1024
-"""Steps that are looked at together: memory does not grow with the length of a run, and one program serves every length."""
 DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
 TORQUES = ("tau", "disturbance", "disturbance_estimate")
@@ -98,15 +97,15 @@ def tolerances(run: Any) -> dict[str, float]:
 
 def _as_recorded(run: Any, every: int) -> Iterator[tuple[np.ndarray, LoopState]]:
     """Step numbers and states of the recorded samples alone."""
-    for at in range(0, run.t.size, STRETCH):
-        rows = slice(at, min(at + STRETCH, run.t.size))
+    for at in range(0, run.t.size, CERTIFY_STRETCH):
+        rows = slice(at, min(at + CERTIFY_STRETCH, run.t.size))
         yield np.arange(rows.start, rows.stop) * every, jax.tree.map(lambda x, rows=rows: x[rows], states_of(run))
 
 
 def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopState]]:
     """Step numbers and states of all steps, made again; several of the pieces between samples at once where they are short."""
     recorded, count = states_of(run), run.t.size
-    together, length = max(1, STRETCH // every), min(every, STRETCH)
+    together, length = max(1, CERTIFY_STRETCH // every), min(every, CERTIFY_STRETCH)
     start = jax.tree.map(np.asarray, initial_state(run.scenario))
     _check_arrival(run, jax.tree.map(lambda x: x[:1], recorded), jax.tree.map(lambda x: x[None], start), np.zeros(1, int))
     for at in range(0, count, together):
@@ -146,7 +145,7 @@ def _onward(scenario: Scenario, first: jax.Array, states: LoopState, dt: jax.Arr
 
 def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> Stretch:
     """What there is at some steps, by a program of one size."""
-    size, places = index.size, np.minimum(np.arange(STRETCH), index.size - 1)
+    size, places = index.size, np.minimum(np.arange(CERTIFY_STRETCH), index.size - 1)
     t = index.astype(run.t.dtype) * run.dt
     padded = jax.tree.map(lambda x: x[places], (t, states))
     found = along_run(run.scenario, *padded, run.dt, method=run.method)

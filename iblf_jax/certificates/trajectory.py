@@ -26,12 +26,11 @@ from iblf_jax.certificates.eigenvalues import Extremes, eigenvalues_over
 from iblf_jax.certificates.proof_terms import rounding
 from iblf_jax.certificates.retrace import DISBELIEVED, Stretch, believed, check_status, grid, stretches
 from iblf_jax.core.status import describe
+from iblf_jax.engine.plan import CERTIFY_KEPT
 from iblf_jax.simulation.scenario import Scenario
 
 NOISE = 32.0
 """Units of the last place by which sqrt(2 V2) may be off, relative to the sizes of its terms."""
-KEPT = 100_000
-"""A run of at most so many steps is kept in memory between the two looks."""
 
 
 class Envelope(NamedTuple):
@@ -99,7 +98,7 @@ class Trajectory(NamedTuple):
 
 def look(run: Any) -> tuple[Whole, Iterator[Trajectory]]:
     """What is known of one run, its arrays on the host, and its stretches one after the other."""
-    seen: Iterable[Stretch] = list(stretches(run)) if grid(run)[1] <= KEPT else stretches(run)
+    seen: Iterable[Stretch] = list(stretches(run)) if grid(run)[1] <= CERTIFY_KEPT else stretches(run)
     whole = _whole(run, seen)
     return whole, _facts(whole, seen if isinstance(seen, list) else stretches(run))
 

@@ -49,6 +49,23 @@ JVP_LARGEST, JVP_LARGEST_IN_SEGMENTS = 60_000, 150_000
 """Nodes of a step, times one and its tangents, up to which "auto" lowers its derivatives: compilers take minutes over longer ones, the
 native one, which cuts a step into segments, half a minute.  Equal numbers are computed once, so about a third is left of them."""
 
+FORWARD_MOST = 32
+"""Numbers that are differentiated by up to which forward mode is taken, above it reverse mode."""
+
+# Studies: runs are made in blocks of one compiled shape.
+STUDY_BLOCK, STUDY_BLOCK_ELSEWHERE = {"cpu": 256}, 16_384
+"""Runs in a block of a study, by platform."""
+STUDY_MEMORY = 256 * 2**20
+"""Bytes that runs in flight may take, unless the caller says otherwise."""
+STUDY_IN_FLIGHT = 4
+"""Blocks that are queued on a device at once: enough to keep it busy."""
+TUNE_TOGETHER = 16
+"""Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a processor's vectors hold."""
+CERTIFY_STRETCH = 1024
+"""Steps that a certificate looks at together: memory does not grow with the length of a run, and one program serves every length."""
+CERTIFY_KEPT = 100_000
+"""Steps up to which a certificate keeps a run in memory between its two looks at it."""
+
 
 class Shape(NamedTuple):
     """How XLA is given a batch of runs."""
@@ -123,6 +140,27 @@ def native_segment(nodes: int) -> int | None:
 def gpu_threads(runs: int, processors: int) -> int:
     """Threads in a block: few enough that every multiprocessor gets a block, in whole warps."""
     return min(max(-(-runs // (processors * GPU_WARP)) * GPU_WARP, GPU_WARP), GPU_MOST_THREADS)
+
+
+def study_block(platform: str) -> int:
+    """Runs in a block of a study: results do not depend on it, but a kept study is laid out by it."""
+    return STUDY_BLOCK.get(platform, STUDY_BLOCK_ELSEWHERE)
+
+
+def blocks_in_flight(chunk: int | None, memory: float, block_bytes: int, block: int, devices: int) -> int:
+    """Blocks of a study that may be in flight: `chunk` runs if the caller says so, else what `memory` holds."""
+    allowed = memory // max(block_bytes, 1) if chunk is None else chunk // block
+    return int(min(max(allowed, 1), STUDY_IN_FLIGHT * devices))
+
+
+def differentiates_forward(numbers: int) -> bool:
+    """Whether derivatives by so many numbers are taken in forward mode."""
+    return numbers <= FORWARD_MOST
+
+
+def starts_together(starts: int, runs: int) -> int:
+    """Starts of a tuning, of so many runs each, that are evaluated at once."""
+    return min(starts, -(-TUNE_TOGETHER // runs))
 
 
 def checkpoint_edge(steps: int) -> tuple[int, int]:

@@ -47,7 +47,7 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies import distributions
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.distributions import Distribution, Perturbation
-from iblf_jax.studies.draws import plan
+from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
@@ -250,7 +250,7 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         checks.positive_integer(name, getattr(setup, name), most=MOST_RUNS)
     for name in ("seed", "report_seed"):
         check_seed(getattr(setup, name))
-    plan(start, setup.perturbations)
+    targets_of(start, setup.perturbations)
     words = {name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")}
     names = tuple(checks.word("names", name, "a string") for name in data["names"])
     history = {name: _array(data["history"][name], kinds) for name, kinds in HISTORY.items()}

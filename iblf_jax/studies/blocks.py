@@ -23,17 +23,10 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, flag
+from iblf_jax.engine import plan
 from iblf_jax.engine.execute import chosen_backend, run_batch
 from iblf_jax.engine.step import Run
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
-
-BLOCK = {"cpu": 256}
-"""Runs in a block, by platform."""
-BLOCK_ELSEWHERE = 16384
-MEMORY = 256 * 2**20
-"""Bytes that runs in flight may take, unless the caller says otherwise."""
-MOST_IN_FLIGHT = 4
-"""Blocks that are queued on a device at once: enough to keep it busy."""
 
 
 class StudyRun(NamedTuple):
@@ -64,7 +57,7 @@ class Results(NamedTuple):
 
 def block_size() -> int:
     """Runs in a block on the devices of this process."""
-    return BLOCK.get(jax.default_backend(), BLOCK_ELSEWHERE)
+    return plan.study_block(jax.default_backend())
 
 
 def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
@@ -134,7 +127,7 @@ def run_blocks(
     blocks: Sequence[int],
     *,
     chunk: int | None = None,
-    memory: float = MEMORY,
+    memory: float = plan.STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     record_every: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
@@ -160,7 +153,8 @@ def run_blocks(
         lanes = jax.device_put(lanes_of(np.arange(block * size, (block + 1) * size)), places[place])
         out = call(copies[place], lanes)
         waiting.append((block, out))
-        allowed = _in_flight(chunk, memory, size, (lanes, out), len(places))
+        each = sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
+        allowed = plan.blocks_in_flight(chunk, memory, each, size, len(places))
         while len(waiting) >= allowed:
             yield _harvest(*waiting.popleft())
     while waiting:
@@ -178,13 +172,6 @@ def _compile(program: StudyRun, record_every: int | None, copies: list[StudyInpu
 
     with ThreadPoolExecutor(len(copies)) as pool:
         list(pool.map(one, copies, lanes))
-
-
-def _in_flight(chunk: int | None, memory: float, size: int, arrays: Any, devices: int) -> int:
-    """How many blocks may be in flight."""
-    each = sum(x.nbytes for x in jax.tree.leaves(arrays))
-    allowed = memory // max(each, 1) if chunk is None else chunk // size
-    return int(np.clip(allowed, 1, MOST_IN_FLIGHT * devices))
 
 
 def _harvest(block: int, out: Any) -> tuple[int, Any]:

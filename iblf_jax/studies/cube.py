@@ -18,7 +18,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation.paths import get, why_inadmissible
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.draws import Cases, Target, draw, plan, sample_size
+from iblf_jax.studies.draws import Cases, Target, draw, sample_size, targets_of
 
 BATCHES = 64
 """How often as many points as are wanted are drawn, to find admissible ones."""
@@ -95,7 +95,7 @@ def bounded(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cu
     Raises:
       ValueError: nothing that varies, a distribution without ends, or as `draws.plan`.
     """
-    targets, by_path = plan(scenario, perturbations, signs=signs)
+    targets, by_path = targets_of(scenario, perturbations, signs=signs)
     if not targets:
         raise checks.fail("perturbations", perturbations, "at least one perturbation", "Say what may vary, and between which limits.")
     for target in targets:

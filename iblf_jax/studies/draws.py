@@ -78,7 +78,7 @@ def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
         seen.append(path)
 
 
-def plan(
+def targets_of(
     scenario: Scenario, perturbations: Any, what: str = "perturbations", *, signs: bool = True
 ) -> tuple[tuple[Target, ...], dict[str, Perturbation]]:
     """Checks a user's perturbations; returns the targets, and target path -> perturbation.

@@ -16,11 +16,12 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import distributed
-from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
+from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.progress import bar
@@ -43,7 +44,7 @@ def monte_carlo(
     replicates: int = 1,
     backend: str = "auto",
     chunk: int | None = None,
-    memory: float = MEMORY,
+    memory: float = plan.STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     progress: bool | None = None,
 ) -> Study:

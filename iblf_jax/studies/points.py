@@ -18,7 +18,7 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS, split, unit_points
 from iblf_jax.studies.distributions import Perturbation, is_distribution, value
-from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, plan, sample_size
+from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, sample_size, targets_of
 
 MOST_DIMS = 60
 """NumPy's arrays have 64; runs and joints come on top."""
@@ -94,7 +94,7 @@ def _design(scenario: Scenario, grid: Mapping[str, Any], design: str, count: int
     if not grid:
         raise checks.fail("grid", dict(grid), f'at least one distribution for design="{design}"')
     ways = {path: way if isinstance(way, Perturbation) else value(_distribution(path, way)) for path, way in grid.items()}
-    targets, by_path = plan(scenario, ways, "grid")
+    targets, by_path = targets_of(scenario, ways, "grid")
     dtype = scenario.initial.q.dtype
     by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
     designed: dict[str, np.ndarray] = {}

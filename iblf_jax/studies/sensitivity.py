@@ -23,11 +23,12 @@ from scipy import stats
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED
+from iblf_jax.engine import plan
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
-from iblf_jax.studies.blocks import MEMORY, block_size, checked_how, run_blocks
+from iblf_jax.studies.blocks import block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_SOBOL, check_seed, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
@@ -95,7 +96,7 @@ def sensitivity(
     method: str = "rk4",
     metrics: Sequence[Fold] | None = None,
     backend: str = "auto",
-    memory: float = MEMORY,
+    memory: float = plan.STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     progress: bool | None = None,
 ) -> Sensitivity:

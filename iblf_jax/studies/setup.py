@@ -18,7 +18,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import Results, StudyInputs, StudyRun, _execute, block_size, with_chosen_backend
 from iblf_jax.studies.designs import check_seed, split, unit_points
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.draws import Cases, Lanes, plan, sample_size
+from iblf_jax.studies.draws import Cases, Lanes, sample_size, targets_of
 
 
 @jax.tree_util.register_dataclass
@@ -81,7 +81,7 @@ def prepare(
     tableau(method)
     steps = checks.whole_steps(duration, dt)
     seed, scenario = check_seed(seed), canonical(scenario)
-    targets, by_path = plan(scenario, perturbations)
+    targets, by_path = targets_of(scenario, perturbations)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario.n)
     by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))

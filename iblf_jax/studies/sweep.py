@@ -17,12 +17,13 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies import config as configuration
 from iblf_jax.studies import distributed
-from iblf_jax.studies.blocks import MEMORY, Results, block_size, checked_how, run_blocks
+from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler, check_seed
 from iblf_jax.studies.distributions import Perturbation
@@ -69,7 +70,7 @@ def sweep(
     unit: int | None = None,
     backend: str = "auto",
     chunk: int | None = None,
-    memory: float = MEMORY,
+    memory: float = plan.STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     progress: bool | None = None,
 ) -> xarray.Dataset:

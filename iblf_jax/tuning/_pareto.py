@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine.plan import FORWARD_MOST
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import check_seed
@@ -30,7 +31,7 @@ from iblf_jax.tuning._tune import build, make_method, way_in
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.optimise import CountedProblem, Loop
 from iblf_jax.tuning.parameters import Block, Tunable, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN
+from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.robust import Risk
 
 MOST_WEIGHT = 0.95
@@ -130,7 +131,9 @@ def pareto(
     share = np.linspace(1 - MOST_WEIGHT, MOST_WEIGHT, points) if points > 1 else np.array([0.5])
     lanes = problem.lanes(z)._replace(weights=jnp.asarray(np.stack([share, 1 - share], axis=1), problem.shared.dt.dtype))
     loop = Loop(
-        CountedProblem(problem.plan, problem.shared, lanes, "forward"), make_method("newton", problem.box, iterations, tolerance, 0.1), z
+        CountedProblem(problem.formulation, problem.shared, lanes, "forward"),
+        make_method("newton", problem.box, iterations, tolerance, 0.1),
+        z,
     )
     loop.rescue = partial(way_in, problem, seed)
     with bar(progress, iterations, unit="steps") as shown:
@@ -156,7 +159,7 @@ def _front(problem, loop: Loop, seconds: float) -> Front:
         )
     tried, z = history["terms"][kept], history["z"][kept]
     front = non_dominated(tried)
-    blocks, start = problem.plan.blocks, problem.shared.cases.scenario
+    blocks, start = problem.formulation.blocks, problem.shared.cases.scenario
     log = np.concatenate([np.full(b.size, b.log) for b in blocks])
     x = np.where(log, np.exp(np.where(log, z[front], 0.0)), z[front])
     labels = tuple(t.name for t in problem.shared.objective.terms)

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.plan import BACKENDS
+from iblf_jax.engine.plan import BACKENDS, differentiates_forward
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.draws import Cases, plan
+from iblf_jax.studies.draws import Cases, targets_of
 from iblf_jax.studies.progress import bar
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.first_order import LBFGS, Adam
@@ -27,7 +27,7 @@ from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import FORWARD_MOST, NUMBERS_A_RUN, Formulation, Lane, ProblemInputs, Slope, gradient, slope, value
+from iblf_jax.tuning.problem import NUMBERS_A_RUN, Formulation, Lane, ProblemInputs, Slope, gradient, slope, value
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
@@ -135,13 +135,13 @@ def tune(
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = starting_points(problem.box, starts, seed)
     # The line search of L-BFGS is a loop of JAX's around the problem.
-    evaluator = CountedProblem(problem.plan._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
+    evaluator = CountedProblem(problem.formulation._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
     stages = sharpenings if method_.settles and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
     loop.rescue = partial(way_in, problem, seed)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
-    mark = fingerprint(problem.plan, problem.shared, options)
+    mark = fingerprint(problem.formulation, problem.shared, options)
     if checkpoint is not None and checkpoint.exists():
         load_checkpoint(checkpoint, loop, mark)
     with bar(progress, iterations, int(loop.state["iteration"]), unit="steps") as shown:
@@ -158,7 +158,7 @@ def tune(
     setup = TuneSetup(
         problem.shared.objective,
         dict(perturbations or {}),
-        problem.plan.risk,
+        problem.formulation.risk,
         problem.runs,
         seed,
         float(duration),
@@ -168,7 +168,7 @@ def tune(
         report_runs,
         report_seed,
         confidence,
-        tuple(zip(*(_in_units(problem.plan.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
+        tuple(zip(*(_in_units(problem.formulation.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
     )
     return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began)
 
@@ -176,14 +176,14 @@ def tune(
 class Problem:
     """A tuning problem, checked and ready to be evaluated."""
 
-    def __init__(self, plan: Formulation, shared: ProblemInputs, box: Box, runs: int):
-        self.plan, self.shared, self.box, self.runs = plan, shared, box, runs
+    def __init__(self, formulation: Formulation, shared: ProblemInputs, box: Box, runs: int):
+        self.formulation, self.shared, self.box, self.runs = formulation, shared, box, runs
 
     def lanes(self, z: np.ndarray) -> Lane:
         """Lanes at z, (S, p): the same runs for all, no multipliers yet."""
         starts, dtype = len(z), self.shared.dt.dtype
         index = np.broadcast_to(np.arange(self.runs, dtype=np.uint32), (starts, self.runs))
-        count, terms = len(self.plan.shares), len(self.shared.objective.terms)
+        count, terms = len(self.formulation.shares), len(self.shared.objective.terms)
         weights, lam, mu = np.ones((starts, terms), dtype), np.zeros((starts, count), dtype), np.full(starts, FIRST_MU, dtype)
         return Lane(np.asarray(z, dtype), index, weights, lam, mu)
 
@@ -197,7 +197,7 @@ def build(
     steps = checks.whole_steps(timing["duration"], timing["dt"])
     seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs, most=MOST_RUNS), canonical(scenario)
     dtype = scenario.initial.q.dtype
-    targets, by_path = plan(scenario, {} if perturbations is None else perturbations)
+    targets, by_path = targets_of(scenario, {} if perturbations is None else perturbations)
     if not targets and runs > 1:
         raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
     blocks, box = layout(scenario, parameters, float(timing["dt"]), timing["method"])
@@ -207,11 +207,11 @@ def build(
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
-    plan_ = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
-    problem = Problem(plan_, ProblemInputs(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
+    formulation = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
+    problem = Problem(formulation, ProblemInputs(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
     if not is_complete(goal):
         derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient
-        start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), plan=plan_).value.exact[0])
+        start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), formulation=formulation).value.exact[0])
         goal = complete(goal, start[: len(goal.terms)])
         problem.shared = problem.shared._replace(objective=jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
     return problem
@@ -222,7 +222,7 @@ def choose(mode: str, optimiser: str, size: int, resample: bool) -> tuple[str, s
     checks.one_of("mode", mode, ("auto", "forward", "reverse"))
     checks.one_of("optimiser", optimiser, OPTIMISERS)
     if mode == "auto":
-        mode = "forward" if optimiser == "newton" or size <= FORWARD_MOST else "reverse"
+        mode = "forward" if optimiser == "newton" or differentiates_forward(size) else "reverse"
     if optimiser == "auto":
         optimiser = "adam" if resample else "newton" if mode == "forward" else "lbfgs"
     if optimiser == "newton" and mode == "reverse":
@@ -258,7 +258,7 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
     low = np.where(np.isfinite(problem.box.low), problem.box.low, problem.box.z - 3 * SPREAD)
     high = np.where(np.isfinite(problem.box.high), problem.box.high, problem.box.z + 3 * SPREAD)
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
-    seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), plan=problem.plan))
+    seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), formulation=problem.formulation))
     broken = np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
     order = np.lexsort((seen.objective, broken, ~seen.valid))
     return points[order[: len(z)]]
@@ -288,7 +288,7 @@ def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
 
 
 def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
-    state, blocks = loop.state, problem.plan.blocks
+    state, blocks = loop.state, problem.formulation.blocks
     best = min(range(len(state["best_key"])), key=lambda s: tuple(state["best_key"][s]))
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
     history = {name: np.stack(x) for name, x in loop.history.items()}

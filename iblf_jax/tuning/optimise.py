@@ -28,6 +28,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine.plan import starts_together
 from iblf_jax.tuning import problem
 from iblf_jax.tuning.objectives import sharper
 from iblf_jax.tuning.problem import Formulation, Lane, ProblemInputs, Slope
@@ -42,19 +43,17 @@ SHARPER = 4.0
 ROUGH, HASTY = 1e-3, 6
 """Tolerance before the last sharpening, and steps at most of several starts without requirements: what is found there is a place to go on
 from, and good enough to choose by."""
-LANES = 16
-"""Runs that are evaluated at once at least, where starts run out one by one: what a processor's vectors hold."""
 
 
 class CountedProblem:
     """The compiled problem on the host: coordinates in, NumPy arrays out; counts what it did."""
 
-    def __init__(self, plan: Formulation, shared: ProblemInputs, lanes: Lane, mode: str):
-        self.plan, self.shared, self.lanes = plan, shared, lanes
-        self.derive = Derive(problem.slope if mode == "forward" else problem.gradient, plan)
+    def __init__(self, formulation: Formulation, shared: ProblemInputs, lanes: Lane, mode: str):
+        self.formulation, self.shared, self.lanes = formulation, shared, lanes
+        self.derive = Derive(problem.slope if mode == "forward" else problem.gradient, formulation)
         self.evaluations = 0
         starts, runs = lanes.index.shape
-        self.group = min(starts, -(-LANES // runs))
+        self.group = starts_together(starts, runs)
         self.needed = np.ones(starts, bool)
         """Which starts are evaluated; the others come back invalid."""
 
@@ -90,20 +89,20 @@ def _spread(found: Slope, rows: np.ndarray, starts: int) -> Slope:
 
 
 class Derive:
-    """A compiled problem with its plan; hashable by both, so that it can be static."""
+    """A compiled problem with its formulation; hashable by both, so that it can be static."""
 
-    def __init__(self, function: Callable, plan: Formulation):
-        self.function, self.plan = function, plan
+    def __init__(self, function: Callable, formulation: Formulation):
+        self.function, self.formulation = function, formulation
 
     def __call__(self, shared: ProblemInputs, lanes: Lane) -> Slope:
         """Value and derivatives of every lane."""
-        return self.function(shared, lanes, plan=self.plan)
+        return self.function(shared, lanes, formulation=self.formulation)
 
     def __hash__(self) -> int:
-        return hash((self.function, self.plan))
+        return hash((self.function, self.formulation))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Derive) and (self.function, self.plan) == (other.function, other.plan)
+        return isinstance(other, Derive) and (self.function, self.formulation) == (other.function, other.formulation)
 
 
 class Loop:
@@ -112,7 +111,7 @@ class Loop:
     def __init__(self, evaluator: CountedProblem, method: Any, z: np.ndarray, *, resample: bool = False, sharpenings: int = 0):
         self.evaluator, self.method, self.resample = evaluator, method, resample
         self.smoothest, self.sharpenings = evaluator.shared.objective, sharpenings
-        starts, count = len(z), len(evaluator.plan.shares)
+        starts, count = len(z), len(evaluator.formulation.shares)
         terms = len(evaluator.shared.objective.terms)
         self.runs = evaluator.lanes.index.shape[1]
         self.state: dict[str, Any] = {
@@ -257,11 +256,11 @@ class Loop:
 # ---------------------------------------------------------------------------------------------------------------- checkpoints
 
 
-def fingerprint(plan: Formulation, shared: ProblemInputs, options: Any) -> str:
+def fingerprint(formulation: Formulation, shared: ProblemInputs, options: Any) -> str:
     """A hash of everything that a checkpoint must agree with."""
     cases = shared.cases._replace(key=jax.random.key_data(shared.cases.key))
     leaves, structure = jax.tree.flatten(shared._replace(cases=cases))
-    digest = hashlib.sha256(repr((plan, structure, options)).encode())
+    digest = hashlib.sha256(repr((formulation, structure, options)).encode())
     for x in leaves:
         digest.update(np.asarray(x).tobytes() + str(np.shape(x)).encode())
     return digest.hexdigest()

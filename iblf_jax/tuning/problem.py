@@ -31,8 +31,6 @@ from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.robust import Risk, combine, worst_share
 from iblf_jax.tuning.tangents import by_coordinates
 
-FORWARD_MOST = 32
-"""Up to so many numbers forward mode is used, above it reverse mode."""
 INVALID = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 """Runs with these flags have no loss: a step that makes one is rejected."""
 
@@ -112,18 +110,18 @@ def fold_of(objective: Objective, dtype) -> tuple[Quantities, ...]:
     return (jax.tree.map(lambda x: jnp.asarray(x, dtype), Quantities(parts)),)
 
 
-def _varied(plan: Formulation, shared: ProblemInputs, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
+def _varied(formulation: Formulation, shared: ProblemInputs, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
     """Path -> value for one run."""
-    point = {path: x.astype(shared.dt.dtype) for path, x in values_at(plan.blocks, z).items()}
-    if not plan.targets:
+    point = {path: x.astype(shared.dt.dtype) for path, x in values_at(formulation.blocks, z).items()}
+    if not formulation.targets:
         return point
-    made, _, _ = draw(shared.cases, plan.targets, index, point, {})
+    made, _, _ = draw(shared.cases, formulation.targets, index, point, {})
     return merge(shared.cases.scenario, point, made)
 
 
-def _of_lanes(plan: Formulation, shared: ProblemInputs, lanes: Lane):
+def _of_lanes(formulation: Formulation, shared: ProblemInputs, lanes: Lane):
     """Path -> values (S, B, ...)."""
-    one = partial(_varied, plan, shared)
+    one = partial(_varied, formulation, shared)
     return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(lanes.z, lanes.index)
 
 
@@ -135,42 +133,42 @@ def _penalty(excess: jax.Array, lam: jax.Array, mu: jax.Array) -> jax.Array:
     return jnp.sum(jnp.maximum(0.0, lam + mu * excess) ** 2 - lam**2) / (2 * mu)
 
 
-def _excesses(plan: Formulation, objective: Objective, quantities: jax.Array) -> jax.Array:
+def _excesses(formulation: Formulation, objective: Objective, quantities: jax.Array) -> jax.Array:
     each = jax.vmap(objective.excesses)(quantities)
-    found = [worst_share(each[:, r], share) for r, share in enumerate(plan.shares)]
+    found = [worst_share(each[:, r], share) for r, share in enumerate(formulation.shares)]
     return jnp.stack(found) if found else jnp.zeros((0,), quantities.dtype)
 
 
-def _objective(plan: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
+def _objective(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
     terms = jax.vmap(shared.objective.values)(smooth)
-    terms = jnp.log(terms) if plan.scalarisation == "log" else terms
-    return combine(plan.risk, terms @ lane.weights)
+    terms = jnp.log(terms) if formulation.scalarisation == "log" else terms
+    return combine(formulation.risk, terms @ lane.weights)
 
 
-def _loss(plan: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
+def _loss(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
     """L of one start, from the quantities of its runs (B, K)."""
-    objective = _objective(plan, shared, lane, smooth)
-    return objective + _penalty(_excesses(plan, shared.objective, smooth), lane.lam, lane.mu)
+    objective = _objective(formulation, shared, lane, smooth)
+    return objective + _penalty(_excesses(formulation, shared.objective, smooth), lane.lam, lane.mu)
 
 
-def _value(plan: Formulation, shared: ProblemInputs, lane: Lane, smooth, exact, status) -> Value:
+def _value(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth, exact, status) -> Value:
     valid = jnp.all(status & int(INVALID) == 0) & jnp.all(jnp.isfinite(smooth))
     return Value(
-        jnp.where(valid, _loss(plan, shared, lane, smooth), jnp.inf),
-        _objective(plan, shared, lane, exact),
+        jnp.where(valid, _loss(formulation, shared, lane, smooth), jnp.inf),
+        _objective(formulation, shared, lane, exact),
         jnp.mean(jax.vmap(shared.objective.values)(exact), axis=0),
-        _excesses(plan, shared.objective, smooth),
-        _excesses(plan, shared.objective, exact),
+        _excesses(formulation, shared.objective, smooth),
+        _excesses(formulation, shared.objective, exact),
         -jnp.max(exact[:, -1]),
         valid,
         jnp.mean(exact, axis=0),
     )
 
 
-def _slope(plan: Formulation, shared: ProblemInputs, lane: Lane, outcome, tangents, products) -> Slope:
+def _slope(formulation: Formulation, shared: ProblemInputs, lane: Lane, outcome, tangents, products) -> Slope:
     """Loss, gradient and Gauss-Newton matrix of one start; arrays of its B runs."""
     smooth, exact, weight = (outcome.metrics[name] for name in Quantities.units)
-    pull = jax.grad(partial(_loss, plan, shared, lane))
+    pull = jax.grad(partial(_loss, formulation, shared, lane))
     d_loss = pull(smooth)
     J = tangents["tuning_smooth"]
     gradient = jnp.einsum("bk,buk->u", d_loss, J)
@@ -178,53 +176,59 @@ def _slope(plan: Formulation, shared: ProblemInputs, lane: Lane, outcome, tangen
     N = jax.vmap(fold.hessians)(products, J, weight)
     bent = jax.vmap(lambda tangent: jax.jvp(pull, (smooth,), (tangent,))[1], in_axes=1)(J)
     hessian = jnp.einsum("bk,bkuv->uv", d_loss, N) + jnp.einsum("ubk,bvk->uv", bent, J)
-    return Slope(_value(plan, shared, lane, smooth, exact, outcome.status), gradient, hessian)
+    return Slope(_value(formulation, shared, lane, smooth, exact, outcome.status), gradient, hessian)
 
 
-@partial(jax.jit, static_argnames="plan")
-def value(shared: ProblemInputs, lanes: Lane, *, plan: Formulation) -> Value:
+@partial(jax.jit, static_argnames="formulation")
+def value(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
     fold = fold_of(shared.objective, shared.dt.dtype)
-    varied = _flat(_of_lanes(plan, shared, lanes))
+    varied = _flat(_of_lanes(formulation, shared, lanes))
     outcome = run_batch(
-        shared.cases.scenario, varied, fold, shared.dt, Run(plan.steps, plan.method), backend=plan.backend, nested=plan.nested
+        shared.cases.scenario,
+        varied,
+        fold,
+        shared.dt,
+        Run(formulation.steps, formulation.method),
+        backend=formulation.backend,
+        nested=formulation.nested,
     )
     smooth, exact, _ = (outcome.metrics[name].reshape(*lanes.index.shape, -1) for name in Quantities.units)
     status = outcome.status.reshape(lanes.index.shape)
-    return jax.vmap(partial(_value, plan, shared))(lanes, smooth, exact, status)
+    return jax.vmap(partial(_value, formulation, shared))(lanes, smooth, exact, status)
 
 
-@partial(jax.jit, static_argnames="plan")
-def slope(shared: ProblemInputs, lanes: Lane, *, plan: Formulation) -> Slope:
+@partial(jax.jit, static_argnames="formulation")
+def slope(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Slope:
     """The problem with gradient (S, p) and Gauss-Newton matrix (S, p, p), by forward mode."""
     fold = fold_of(shared.objective, shared.dt.dtype)
-    one, overlap = partial(_varied, plan, shared), partial(same_place, shared.cases.scenario)
+    one, overlap = partial(_varied, formulation, shared), partial(same_place, shared.cases.scenario)
     jacobian = jax.vmap(jax.vmap(jax.jacfwd(one), in_axes=(None, 0)))(lanes.z, lanes.index)
-    moving = {path: x for path, x in _flat(jacobian).items() if any(overlap(path, block.path) for block in plan.blocks)}
-    tied = [b.path for b in plan.blocks if b.size == 1 and not any(overlap(b.path, t.path) for t in plan.targets)]
-    varied = _flat(_of_lanes(plan, shared, lanes))
-    run = Run(plan.steps, plan.method)
+    moving = {path: x for path, x in _flat(jacobian).items() if any(overlap(path, block.path) for block in formulation.blocks)}
+    tied = [b.path for b in formulation.blocks if b.size == 1 and not any(overlap(b.path, t.path) for t in formulation.targets)]
+    varied = _flat(_of_lanes(formulation, shared, lanes))
+    run = Run(formulation.steps, formulation.method)
     found = by_coordinates(
-        shared.cases.scenario, varied, moving, fold, shared.dt, run, backend=plan.backend, nested=plan.nested, together=tied
+        shared.cases.scenario, varied, moving, fold, shared.dt, run, backend=formulation.backend, nested=formulation.nested, together=tied
     )
     parts = jax.tree.map(lambda x: x.reshape(*lanes.index.shape, *x.shape[1:]), (found.outcome, found.tangents, found.products))
-    return jax.vmap(partial(_slope, plan, shared))(lanes, *parts)
+    return jax.vmap(partial(_slope, formulation, shared))(lanes, *parts)
 
 
-@partial(jax.jit, static_argnames="plan")
-def gradient(shared: ProblemInputs, lanes: Lane, *, plan: Formulation) -> Slope:
+@partial(jax.jit, static_argnames="formulation")
+def gradient(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Slope:
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
 
     def one_run(lane: Lane, index):
-        scenario = with_parameters(shared.cases.scenario, _varied(plan, shared, lane.z, index))
+        scenario = with_parameters(shared.cases.scenario, _varied(formulation, shared, lane.z, index))
         fold = fold_of(shared.objective, shared.dt.dtype)
-        outcome = run_for_reverse(scenario, fold, shared.dt, Run(plan.steps, plan.method))
+        outcome = run_for_reverse(scenario, fold, shared.dt, Run(formulation.steps, formulation.method))
         return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
 
     def loss(z, lane: Lane):
         lane = lane._replace(z=z)
         smooth, (exact, status) = jax.vmap(partial(one_run, lane))(lane.index)
-        return _loss(plan, shared, lane, smooth), _value(plan, shared, lane, smooth, exact, status)
+        return _loss(formulation, shared, lane, smooth), _value(formulation, shared, lane, smooth, exact, status)
 
     (_, found), slopes = jax.vmap(jax.value_and_grad(loss, has_aux=True))(lanes.z, lanes)
     return Slope(found, slopes, jnp.zeros((*slopes.shape, slopes.shape[-1]), slopes.dtype))
