@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, tables
 
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
 
@@ -121,20 +121,17 @@ class Certificate:
 
     def __repr__(self) -> str:
         rows = [("", "equation", "verdict", "margin", "value", "where the margin is smallest"), *self._rows()]
-        widths = [max(len(row[i]) for row in rows) for i in range(6)]
-        text = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
         notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
-        return "\n".join([f"Certificate: {self.verdict}  ({self._subject()})", *text, *(["notes", *notes] if notes else [])])
+        return "\n".join(
+            [f"Certificate: {self.verdict}  ({self._subject()})", *tables.as_text(rows), *(["notes", *notes] if notes else [])]
+        )
 
     def _repr_html_(self) -> str:
-        head = "".join(f"<th>{x}</th>" for x in ("", "equation", "verdict", "margin", "value", "where", "checked", "note"))
-        body = []
-        for line, row in zip(self.lines, self._rows(), strict=True):
-            cells = [*row, line.statement, line.note]
-            weight = ' style="font-weight:bold"' if line.verdict == FAILS else ""
-            body.append(f"<tr{weight}>" + "".join(f'<td style="text-align:left">{html.escape(c)}</td>' for c in cells) + "</tr>")
+        heading = ("", "equation", "verdict", "margin", "value", "where", "checked", "note")
+        rows = [(*row, line.statement, line.note) for line, row in zip(self.lines, self._rows(), strict=True)]
+        failing = [i for i, line in enumerate(self.lines) if line.verdict == FAILS]
         title = f"<b>Certificate: {html.escape(self.verdict)}</b> ({html.escape(self._subject())})"
-        return f"{title}<table><tr>{head}</tr>{''.join(body)}</table>"
+        return title + tables.as_html(heading, rows, failing)
 
     def _notes(self) -> dict[str, list[str]]:
         """Each note and the lines that it belongs to."""

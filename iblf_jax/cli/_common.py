@@ -160,6 +160,7 @@ def number(value: Any) -> str:
 
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
     """Metrics of runs side by side, one column a joint, with units."""
+    from iblf_jax.core import tables
     from iblf_jax.robots import joint_names
 
     first = next(iter(runs.values()))
@@ -172,14 +173,6 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
             cells = ["-" if name == "first_violation_joint" and x < 0 else number(x) for x in values]
             row += [*cells, *[""] * (run.n - len(cells))][: run.n]
         rows.append(row)
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        numbers = [cell.rjust(width) for cell, width in zip(row[2:], widths[2:], strict=True)]
-        lines.append("  ".join([row[0].ljust(widths[0]), row[1].ljust(widths[1]), *numbers]))
-    start, head = widths[0] + widths[1] + 4, ""
-    for i, name in enumerate(runs):
-        span = sum(w + 2 for w in widths[2 + i * first.n : 2 + (i + 1) * first.n]) - 2
-        head += name.center(span) + "  "
-    named = [" " * start + head] if head.strip() else []
-    return "\n".join(line.rstrip() for line in [*named, *lines])
+    if any(runs):  # a name, over the first of its joints
+        rows.insert(0, ["", "", *(cell for name in runs for cell in [name, *[""] * (first.n - 1)])])
+    return "\n".join(tables.as_text(rows, left=(0, 1)))

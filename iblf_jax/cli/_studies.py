@@ -88,10 +88,3 @@ def write_netcdf(data: xarray.Dataset, name: str | None) -> None:
     if name is not None and distributed.rank() == 0:
         data.to_netcdf(name, engine="scipy")
         print(f"\nwritten to {name}")
-
-
-def table(rows: list[list[str]]) -> str:
-    """Rows of text in columns, the first one left, the others right."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))] for row in rows]
-    return "\n".join("  ".join(line).rstrip() for line in lines)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, table, write_netcdf
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, write_netcdf
+from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
     from iblf_jax.studies.study import Study
@@ -58,7 +59,7 @@ def report(study: Study) -> str:
         levels = np.quantile(one_number(study.metrics, name)[study.made], (0.05, 0.5, 0.95), method="inverted_cdf")
         rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
     worst = study.worst(5)
-    lines = [repr(study), "", table(rows), "", f"worst runs (smallest margin first): {', '.join(map(str, worst))}"]
+    lines = [repr(study), "", *as_text(rows, left=(0,)), "", f"worst runs (smallest margin first): {', '.join(map(str, worst))}"]
     found = study.correlations(["margin"]).correlation.sel(metric="margin")
     rows = [["parameter", "rank correlation with the margin"], *([str(p), number(found.sel(parameter=p))] for p in found.parameter.values)]
-    return "\n".join([*lines, "", table(rows)])
+    return "\n".join([*lines, "", *as_text(rows, left=(0,))])

@@ -24,15 +24,15 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._common import assignments
+    from iblf_jax.core import tables
     from iblf_jax.files.scenario import preset_scenario, scenario_to_toml
     from iblf_jax.presets import PRESETS
 
     if args.name is None:
         if args.toml or args.arg:
             raise ValueError("--toml and --arg: expected the name of a preset before them; `presets` lists the names.")
-        width = max(len(name) for name in PRESETS)
-        for name, preset in PRESETS.items():
-            print(f"{name.ljust(width)}  {' '.join((inspect.getdoc(preset) or '').partition(chr(10))[0].split())}")
+        rows = [(name, " ".join((inspect.getdoc(preset) or "").partition("\n")[0].split())) for name, preset in PRESETS.items()]
+        print(*tables.as_text(rows), sep="\n")
         return 0
     scenario = preset_scenario(args.name, assignments("--arg", args.arg))
     if args.toml:

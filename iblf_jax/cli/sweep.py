@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, table, write_netcdf
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, write_netcdf
+from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
     import xarray
@@ -73,7 +74,7 @@ def report(data: xarray.Dataset) -> str:
         rows.append(cells)
     more = [f"... and {len(rows) - 1 - MOST_ROWS} more points"] if len(rows) > MOST_ROWS + 1 else []
     head = f"{data.attrs['cases']} runs of {data.attrs['duration']:g} s, dt = {data.attrs['dt']:g} s, seed {data.attrs['seed']}"
-    return "\n".join([head, "", table(rows[: MOST_ROWS + 1]), *more])
+    return "\n".join([head, "", *as_text(rows[: MOST_ROWS + 1], left=(0,)), *more])
 
 
 def _tick(value: Any) -> str:

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, tables
 from iblf_jax.simulation.scenario import Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
@@ -56,16 +56,10 @@ class ParameterTable(tuple[Parameter, ...]):
         return [(p.path, str(p.shape), p.unit, shown(p.value)) for p in self]
 
     def __repr__(self) -> str:
-        rows = [("path", "shape", "unit", "value"), *self._rows()]
-        widths = [max(len(row[i]) for row in rows) for i in range(4)]
-        return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
+        return "\n".join(tables.as_text([Parameter._fields, *self._rows()]))
 
     def _repr_html_(self) -> str:
-        import html
-
-        head = "<tr><th>path</th><th>shape</th><th>unit</th><th>value</th></tr>"
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in self._rows())
-        return f"<table>{head}{body}</table>"
+        return tables.as_html(Parameter._fields, self._rows())
 
 
 def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.barriers import Integral
+from iblf_jax.core import tables
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
 from iblf_jax.simulation.results import Rollout
@@ -138,16 +139,14 @@ class Comparison:
         run = next(iter(self.rollouts.values()))
         parts = [f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt = {float(run.dt):g} s, {run.method}; worst joint"]
         for held, rows in self.table.items():
-            parts += ["", HELD[held], *_aligned([HEADINGS, *map(_cells, rows)]), *self.notes[held]]
+            parts += ["", HELD[held], *tables.as_text([HEADINGS, *map(_cells, rows)], left=(0, len(HEADINGS) - 1)), *self.notes[held]]
         return "\n".join(parts)
 
     def _repr_html_(self) -> str:
         parts = []
         for held, rows in self.table.items():
-            head = "".join(f"<th>{html.escape(x)}</th>" for x in HEADINGS)
-            body = "".join("<tr>" + "".join(f"<td>{html.escape(x)}</td>" for x in _cells(row)) + "</tr>" for row in rows)
             notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[held])
-            parts.append(f"<h4>{HELD[held]}</h4><table><tr>{head}</tr>{body}</table>{notes}")
+            parts.append(f"<h4>{HELD[held]}</h4>{tables.as_html(HEADINGS, map(_cells, rows))}{notes}")
         return "".join(parts)
 
     def to_pandas(self):
@@ -166,13 +165,3 @@ class Comparison:
 
 def _cells(row: Row) -> tuple[str, ...]:
     return tuple(x if isinstance(x, str) else f"{x:.4g}" if math.isfinite(x) else "never" if x > 0 else "-" for x in row)
-
-
-def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    last = len(widths) - 1
-
-    def cell(text: str, i: int) -> str:
-        return text.ljust(widths[i]) if i in (0, last) else text.rjust(widths[i])
-
-    return ["  ".join(cell(text, i) for i, text in enumerate(row)).rstrip() for row in rows]

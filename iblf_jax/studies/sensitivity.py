@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from scipy import stats
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, tables
 from iblf_jax.core.status import FAILED
 from iblf_jax.engine import plan
 from iblf_jax.simulation.metrics import Fold, metric_units
@@ -75,13 +75,12 @@ class Sensitivity:
         return xarray.Dataset(variables, coordinates, {"output": self.output, "runs": self.runs, "failed": self.failed})
 
     def __repr__(self) -> str:
-        lines = [f"Sensitivity of {self.output} ({self.runs} runs, {self.failed} failed and part of it)"]
-        width = max(len(name) for name in self.parameters)
+        rows = []
         for i in np.argsort(-self.total_order):
             low, high = self.total_order_interval[i]
             total = f"total {self.total_order[i]:6.3f} ({low:.3f} to {high:.3f})"
-            lines.append(f"  {self.parameters[i].ljust(width)}  {total}  first {self.first_order[i]:6.3f}")
-        return "\n".join(lines)
+            rows.append(("", self.parameters[i], total, f"first {self.first_order[i]:6.3f}"))
+        return "\n".join([f"Sensitivity of {self.output} ({self.runs} runs, {self.failed} failed and part of it)", *tables.as_text(rows)])
 
 
 def sensitivity(
