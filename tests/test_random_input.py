@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import datetime
+import itertools
+import json
 import math
+import os
+import re
+import shutil
 import warnings
 from pathlib import Path
 
@@ -12,20 +18,27 @@ import jax
 import members
 import numpy as np
 import pytest
-from conftest import SHORT
+from conftest import ROOT, SHORT
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from made_up_runs import made_up
 from members import FAMILIES
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, robots
+from iblf_jax import barriers, bounds, cli, robots
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
 from iblf_jax.engine import simulate
+from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
+from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import check_values
+from iblf_jax.studies.setup import prepare
+from iblf_jax.tuning.parameters import layout
+from iblf_jax.tuning.result import TuneSetup
+from iblf_jax.tuning.robust import as_risk
 
 SCALARS = st.one_of(
     st.floats(),
@@ -108,7 +121,8 @@ def test_parse_and_get(paper, path):
     tokens = accepts_or_value_error(lambda: paths.parse(path))
     if tokens is not None:
         assert all(isinstance(t, str | int) for t in tokens)
-        assert paths.parse("".join(f"[{t}]" if isinstance(t, int) else f".{t}" for t in tokens).removeprefix(".")) == tokens
+        spelled = [f"[{t}]" if isinstance(t, int) else f"[{json.dumps(t)}]" if isinstance(t, paths.Row) else f".{t}" for t in tokens]
+        assert paths.parse("".join(spelled).removeprefix(".")) == tokens
     value = accepts_or_value_error(lambda: paths.get(paper, path))
     assert value is None or np.all(np.isfinite(value))
 
@@ -440,3 +454,192 @@ def test_toml_of_any_depth(text, tmp_path, capsys):
         assert "x.toml" in said
         assert len(said) < 1500
     assert depth_left(500)
+
+
+# ------------------------------------------------------------------------------------------------------ what results and commands take
+
+
+@pytest.fixture
+def results(paper, no_runs, monkeypatch):
+    """One result of every kind, which no simulator made; whatever would run or draw raises Entered."""
+    monkeypatch.setattr("iblf_jax.plotting._style.new_figure", entered)
+    monkeypatch.setattr("iblf_jax.tuning.result._slice", entered)
+    run = made_up(paper.plant, duration=0.1)
+    setup = prepare(paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="xla")
+    found = Metrics({"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)}, (("margin", "rad"), ("rmse", "rad")))
+    study = ij.Study(paper, found, np.zeros(4, np.int32), np.ones(4), {"controller.K2": np.full((4, 2), 20.0)}, setup)
+    history = {"sound": np.ones((1, 1), bool), "x": np.full((1, 1, 2), 20.0), "objective": np.ones((1, 1)), "evaluations": np.ones(1, int)}
+    asked = TuneSetup(GOAL, {}, as_risk("mean"), 1, 0, 0.01, 1e-3, "rk4", "auto", 4, 1, 0.95, ((1.0, 100.0), (1.0, 100.0)))
+    names = ("controller.K2[0]", "controller.K2[1]")
+    tuned = ij.TuneResult(paper, paper, {"controller.K2": np.full(2, 20.0)}, names, history, 0, "done", "newton", "forward", 1.0, asked)
+    vars(tuned)["nominal"] = (run, run)
+    twos, (blocks, _) = np.ones((2, 2)), layout(paper, ["controller.K2"], 1e-3, "rk4")
+    front = ij.Front(("a", "b"), twos, twos, names, twos, twos[0], paper, blocks, twos, 1.0)
+    attack = ij.Attack(paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, {"duration": 0.01, "dt": 1e-3, "method": "rk4"})
+    compared = ij.Comparison({"log": run}, {}, {}, {}, {"log": "K2 = 20"})
+    matters = ij.Sensitivity(names, np.ones(2), np.ones(2), twos, twos, "margin", 8, 0)
+    return {"run": run, "study": study, "tuning": tuned, "front": front, "attack": attack, "comparison": compared, "sensitivity": matters}
+
+
+METHODS = {
+    "run.plot": {"title": "x"},
+    "study.__getitem__": {"index": 0},
+    "study.replay": {"index": 0, "record_every": 1},
+    "study.worst": {"count": 1, "metric": "margin"},
+    "study.probability": {"event": Status.BOUND_VIOLATED, "confidence": 0.9},
+    "study.quantiles": {"quantiles": [0.5], "exclude_failed": False},
+    "study.correlations": {"metrics": None, "exclude_failed": False},
+    "study.bands": {"quantiles": [0.5], "runs": 2, "samples": 5, "exclude_failed": False},
+    "study.parameter_unit": {"path": "controller.K2"},
+    "study.plot": {"runs": 2},
+    "tuning.check": {"runs": 2, "seed": 3},
+    "tuning.landscape": {"first": "controller.K2[0]", "second": "controller.K2[1]", "points": 2, "span": 1.0},
+    "tuning.plot": {"landscape": None},
+    "tuning.save": {"path": "/"},
+    "front.scenario": {"index": 0},
+    "attack.replay": {"record_every": 1},
+    "comparison.plot": {"joint": 0, "zoom": None},
+}
+"""Methods of results, and arguments that are fine."""
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.filterwarnings("ignore")
+def test_anything_in_the_place_of_the_arguments_of_a_method(method, results, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kind, _, name = method.partition(".")
+    call, odd = (
+        getattr(results[kind], name),
+        {**NASTY, "-1": -1, "half": 0.5, "true": True, "slice": slice(0, 1), "far": -(2**70), "pair": (1, 2)},
+    )
+    refused = set()
+    for argument in METHODS[method]:
+        for label, value in odd.items():
+            try:
+                call(**(METHODS[method] | {argument: value}))
+                continue
+            except (Entered, FileNotFoundError):
+                continue
+            except ValueError as error:
+                refused.add(argument)
+                said = str(error)
+            assert re.match(r".+: got .*, expected .+$", said), (argument, label, said)
+            assert len(said) < 1500, (argument, label)
+    assert refused == set(METHODS[method])
+
+
+@dataclasses.dataclass(frozen=True)
+class Own:
+    """A fold of a user's."""
+
+    width: object = 1.0
+    units: object = dataclasses.field(default_factory=lambda: {"own": "rad"})
+
+    def init(self, sample):
+        return 0.0 * sample.t
+
+    def update(self, acc, sample):
+        return acc
+
+    def finish(self, acc):
+        return {"own": acc}
+
+
+jax.tree_util.register_dataclass(Own, ["width"], ["units"])
+
+
+@pytest.mark.parametrize("odd", NASTY)
+def test_anything_in_a_fold_and_in_a_table(odd):
+    value = NASTY[odd]
+    for field in ("width", "units"):
+        accepts_or_value_error(lambda field=field: metrics.as_folds([Own(**{field: value})], np.float64, 2))
+    for table in (value, {"k1": value}, {"k1": 1.0, "K2": 1.0, "o": 1.0, "barrier": value}):
+        accepts_or_value_error(lambda table=table: decode_fields(ij.controllers.Backstepping, table, "controller"))
+    assert depth_left(500)
+
+
+WORDS = [
+    "",
+    " ",
+    "nan",
+    "-1",
+    "0",
+    "1e400",
+    str(2**63),
+    "9" * 5000,
+    "x" * 5000,
+    "a\0b",
+    "\ud800",
+    "a\nb",
+    "/",
+    "/dev/null",
+    "--",
+    "-",
+    "[1,2]",
+]
+WORDS += [
+    "folder.toml",
+    "folder.nc",
+    "missing.toml",
+    "missing/x.nc",
+    "empty.toml",
+    "loop.toml",
+    "pipe.toml",
+    "a=b",
+    "=",
+    "a=",
+    "[" * 3000 + "=1",
+]
+WORDS += ["controller.K2=nan", "controller.K2=" + "[" * 5000, "law=7", "plant.mass[999999999999]=1", "localhost:99999", "::1", ",", "rk5"]
+COMMANDS = {
+    "reproduce": ["--out", "out"],
+    "simulate": ["zhang_yan_2024", "--duration", "0.01"],
+    "compare": ["zhang_yan_2024", "--duration", "0.01"],
+    "montecarlo": ["study.toml", "--quiet"],
+    "sweep": ["sweep.toml", "--quiet"],
+    "tune": ["tune.toml", "--quiet"],
+    "presets": ["printed_gap"],
+    "parameters": ["zhang_yan_2024"],
+}
+"""Command, and words for it that are fine."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_any_word_in_the_place_of_any_other_on_the_command_line(command, no_runs, tmp_path, monkeypatch, capsys):
+    """Exit code 2 and one line that can be read, or the command goes on to its runs; `presets` and `parameters` print."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jax.distributed.initialize", entered)
+    monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
+    for name in ("study", "sweep", "tune"):
+        shutil.copy(ROOT / "examples" / f"{name}.toml", tmp_path)
+    for name in ("folder.toml", "folder.nc"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "empty.toml").touch()
+    (tmp_path / "loop.toml").symlink_to("loop.toml")
+    os.mkfifo(tmp_path / "pipe.toml")
+    (commands,) = (x.choices for x in cli.build_parser()._actions if isinstance(x, argparse._SubParsersAction))
+    words, fine, calls = itertools.cycle(WORDS), COMMANDS[command], [COMMANDS[command]]
+    for action in commands[command]._actions[1:]:
+        for word in itertools.islice(words, len(WORDS) // 8):
+            if not action.option_strings:
+                calls.append([word, *fine[1:]])
+            elif action.nargs == 0:
+                calls.append([*fine, action.option_strings[0], word])
+            else:
+                calls += [[*fine, action.option_strings[0], word], [*fine, f"{action.option_strings[0]}={word}"]]
+        calls.append([*fine, f"{action.option_strings[0]}=--"] if action.option_strings else ["--"])
+    codes = set()
+    for call in calls:
+        try:
+            code = cli.main([command, *call])
+        except Entered:
+            code = None
+        codes.add(code)
+        said = capsys.readouterr().err
+        assert code in (0, 2, None), call
+        if code == 2:
+            assert said.startswith("iblf-jax: error: "), call
+            assert said.count("\n") == 1, call
+            assert len(said) < 1500, call
+    assert 2 in codes
+    assert codes - {2}

@@ -252,6 +252,8 @@ def test_a_distribution_of_ones_own_is_named_in_files(tmp_path, monkeypatch):
         ("montecarlo", "study.toml", "--out", "runs.csv"),
         ("montecarlo", "study.toml", "--runs", "0"),
         ("montecarlo", "study.toml", "--chunk", "0"),
+        ("montecarlo", "study.toml", "--devices", "100000"),
+        ("montecarlo", "study.toml", "--devices", "200"),
         ("sweep", "sweep.toml", "--coordinator", "localhost:1"),
         ("sweep", "study.toml"),
     ],

@@ -15,18 +15,29 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jax
 
+from iblf_jax import checks
 from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.lowering.toolchain import ToolchainError, cache_directory, not_ours
 
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
 
+LONGEST_WORD = 400
+"""Characters of a word that an error or a warning repeats: a user's may be of any length."""
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that says what is wrong in one line."""
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """The value of an option; of `--out=--` Python 3.11 and 3.12 make an empty list."""
+        if action.option_strings and action.nargs is None and arg_strings == ["--"]:
+            self.error(f"argument {'/'.join(action.option_strings)}: expected one argument")
+        return super()._get_values(action, arg_strings)
 
     def error(self, message: str) -> NoReturn:
         """Prints one line and exits with 2."""
@@ -92,8 +103,9 @@ def _warn_once(message: str, said: set[str]) -> None:
 
 
 def complain(message: str, kind: str = "error") -> None:
-    """One line on stderr."""
-    print(f"iblf-jax: {kind}: {' '.join(message.split())}", file=sys.stderr)
+    """One line on stderr that can be read."""
+    words = [x if len(x) <= LONGEST_WORD else f"{x[: LONGEST_WORD - 23]}...{x[-20:]}" for x in message.split()]
+    print(f"iblf-jax: {kind}: {checks.line(' '.join(words), 'message')}", file=sys.stderr)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import xarray
 
+MOST_DEVICES = 256
+"""CPU devices of one process; each has threads of its own, and XLA aborts where the system gives it no more."""
 UNFINISHED = 3
 """Exit code: a disk is full or another process was lost; start the same command again."""
 
@@ -50,7 +52,12 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
     _check_out(args.out)
     distributed.check_seconds("--heartbeat", args.heartbeat)
     if args.devices is not None:
-        jax.config.update("jax_num_cpu_devices", checks.positive_integer("--devices", args.devices))
+        devices = checks.positive_integer("--devices", args.devices, most=MOST_DEVICES)
+        try:
+            jax.config.update("jax_num_cpu_devices", devices)
+        except RuntimeError:  # who calls `main` where JAX has run
+            expected = f"{jax.local_device_count()} devices, as JAX has in this process"
+            raise checks.fail("--devices", devices, expected, "Start the command in a process of its own.") from None
     job = (args.coordinator, args.num_processes, args.process_id)
     try:
         if args.distributed or any(word is not None for word in job):

@@ -28,8 +28,8 @@ MOST_STEPS = 2**31 - 1
 LIMITS = ("limit", "positive limit")
 """Signs of leaves that may be infinite."""
 
-LONGEST = {"field": 200, "value": 160, "words": 800}
-"""Characters of an error message's parts: what a user typed may be of any length."""
+LONGEST = {"field": 200, "value": 160, "words": 800, "message": 1400}
+"""Characters of an error message's parts, and of all that the command line prints of one: what a user typed may be of any length."""
 
 MOST_JOINTS = 10_000
 """More than any robot has."""
@@ -210,7 +210,13 @@ def conforms(name: str, value: Any, protocol: type, remedy: str = "", optional: 
     missing = sorted(x for x in members - set(optional) if bare or not hasattr(value, x))
     if bare or missing:
         raise fail(name, value, expected, " ".join(x for x in (remedy, "" if bare else f"It lacks {', '.join(missing)}.") if x))
-    if any(leaf is value for leaf in jax.tree.leaves(value)):
+    for field, part in getattr(value, "__dict__", {}).items():
+        flat_enough(f"{name}.{field}", part)
+    try:
+        leaves = jax.tree.leaves(value)
+    except Exception as error:
+        raise fail(name, value, expected, f"JAX cannot take it apart: {error}") from error
+    if any(leaf is value for leaf in leaves):
         raise fail(name, value, expected, "JAX does not know its class: decorate it with iblf_jax.component.")
 
 
@@ -267,6 +273,17 @@ def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None 
     if number < least or (most is not None and number > most):
         raise fail(name, value, expected)
     return number
+
+
+class NoSuchEntryError(IndexError, ValueError):
+    """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's own protocols look for."""
+
+
+def entry(name: str, value: Any, count: int, what: str) -> int:
+    """A Python int from 0 to `count` - 1 from a user's index, which may count from the end; NoSuchEntryError where it leads nowhere."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -count <= value < count:
+        raise NoSuchEntryError(str(fail(name, value, f"one of the {what} 0 to {count - 1}")))
+    return int(value) % count
 
 
 def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:

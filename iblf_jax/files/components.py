@@ -131,7 +131,7 @@ def decode(value: Any, hint: Any, path: str) -> Any:
     """
     hint, _ = without_none(hint)
     if hint not in FAMILIES and dataclasses.is_dataclass(hint):
-        return decode_fields(hint, as_table(value, path), path)
+        return decode_fields(hint, value, path)
     if isinstance(value, list) and hint not in FAMILIES:
         if typing.get_origin(hint) is tuple or any(isinstance(x, dict) for x in value):
             return tuple(decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
@@ -158,8 +158,9 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
 
 
-def decode_fields(cls: Any, table: dict[str, Any], path: str) -> Any:
+def decode_fields(cls: Any, table: Any, path: str) -> Any:
     """A component of class `cls` from its table, every key checked."""
+    checks.flat_enough(path, as_table(table, path))
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     known_keys(table, path, fields)
     hints, values = field_hints(cls), {}

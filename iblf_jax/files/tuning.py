@@ -182,7 +182,7 @@ def _objective(terms: Any, requirements: Any) -> Objective:
 
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
-    setup = result.setup
+    target, setup = checks.file_to_write("path", path), result.setup
     history = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
     plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits")
     data = {
@@ -197,7 +197,6 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         **{name: getattr(result, name) for name in ("names", "best_start", "stopped", "optimiser", "mode", "seconds")},
         "report": result.report.to_dict(),
     }
-    target = checks.file_to_write("path", path)
     temporary = target.with_name(f".{target.name}.partial")
     temporary.write_text(json.dumps(data, indent=1), encoding="utf-8")
     os.replace(temporary, target)

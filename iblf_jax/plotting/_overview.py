@@ -36,10 +36,11 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
       The figure.
 
     Raises:
-      ValueError: a batch, or something that is no Rollout.
+      ValueError: a batch, something that is no Rollout, or a title that is no text.
     """
     if not isinstance(run, Rollout):
         raise checks.fail("run", type(run).__name__, "a Rollout", "To compare several, use plotting.joint and the other figures.")
+    checks.word("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
     figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows + 4.4)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from iblf_jax import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, plain
 from iblf_jax.plotting._panels import QUANTITIES, Window, draw, say_what_is_cut, set_limits, show
@@ -36,6 +37,8 @@ def tuning(result: TuneResult, *, landscape: tuple[str, str] | None = None, poin
 
     Source: design of this package.
     """
+    if landscape is not None and (not isinstance(landscape, tuple | list) or len(landscape) != 2):
+        raise checks.fail("landscape", landscape, "the names of two tuned numbers", f"They are {', '.join(result.names)}.")
     n = result.scenario.n
     columns = 1 if n <= 3 else 2
     rows = len(_style.row_sizes(n, columns))

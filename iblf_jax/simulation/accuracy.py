@@ -63,23 +63,21 @@ class Accuracy(NamedTuple):
     """The largest, relative to the width of its tube, () [1]."""
 
 
-def numbers(state: LoopState) -> jax.Array:
-    """Positions, velocities and the observer's state as one vector, (m,); what a law has learnt is left out."""
-    leaves = [x for x in jax.tree.leaves((state.q, state.dq, state.observer)) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.concatenate([jnp.ravel(x) for x in leaves])
+def _watched(state: LoopState) -> list:
+    """Positions, velocities and the observer's state, leaf by leaf; what a law has learnt is left out."""
+    return [x for x in jax.tree.leaves((state.q, state.dq, state.observer)) if jnp.issubdtype(x.dtype, jnp.floating)]
 
 
 def places(state: LoopState) -> np.ndarray:
-    """Where these numbers stand in the whole state, flat."""
+    """Where the numbers that are watched, m of them, stand in the whole state, flat."""
     leaves, structure = jax.tree.flatten(state)
     ends = np.cumsum([0, *(x.size for x in leaves)])
-    spans = [range(a, b) if jnp.issubdtype(x.dtype, jnp.floating) else () for x, a, b in zip(leaves, ends, ends[1:], strict=False)]
-    by_part = jax.tree.unflatten(structure, spans)
-    return np.concatenate([np.asarray(x, int) for x in jax.tree.leaves((by_part.q, by_part.dq, by_part.observer))])
+    numbered = [np.arange(a, b).astype(x.dtype) for x, a, b in zip(leaves, ends, ends[1:], strict=False)]
+    return np.concatenate(_watched(jax.tree.unflatten(structure, numbered))).astype(int)
 
 
 def response(jacobian: jax.Array, n: int) -> jax.Array:
-    """R from the Jacobian by these numbers, (m, m) [1/s]; 0 where there is none."""
+    """R from the Jacobian by the numbers that are watched, (m, m) [1/s]; 0 where there is none."""
     inner = jacobian[n:, n:]
     size = len(inner)
     found = solve(SLOWEST * jnp.eye(size, dtype=inner.dtype) - inner.T, jnp.eye(size, n, dtype=inner.dtype)).T
@@ -91,7 +89,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
 
     Args:
       method: the integrator.
-      jacobian: of the closed loop at the start, by these numbers, (m, m) [1/s].
+      jacobian: of the closed loop at the start, by the numbers that are watched, (m, m) [1/s].
       state: the state at the start.
     """
     n = state.q.size
@@ -103,7 +101,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
 
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     """The rate of the positions, and of where they end up, (2 n,)."""
-    flat, n = jax.lax.stop_gradient(numbers(slope)), slope.q.size
+    flat, n = jax.lax.stop_gradient(jnp.concatenate([jnp.ravel(x) for x in _watched(slope)])), slope.q.size
     return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
 
 

@@ -280,7 +280,7 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int
     """The folds that a user asked for (None: the standard ones), checked (for n joints), their numbers in one floating-point type.
 
     Raises:
-      ValueError: something that is not a fold, or two folds that return the same name.
+      ValueError: something that is not a fold, units that are no words, fields that are no numbers, or two folds that return the same name.
     """
     if metrics is None:
         metrics = standard()
@@ -291,11 +291,20 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int
         checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
         if n is not None:
             fit_joints(fold, n, f"metrics[{i}]")
-        for name in fold.units:
+        for name, unit in checks.mapping(f"metrics[{i}].units", fold.units, '{"rmse": "rad"}').items():
+            checks.word(f"metrics[{i}].units[{name!r}]", unit, "a unit in words")
             if name in owner:
                 raise checks.fail(f"metrics[{i}]", fold, "names that no other fold returns", f"{owner[name]} returns {name!r} too.")
             owner[name] = f"metrics[{i}]"
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tuple(metrics))
+    return tuple(_in_type(f"metrics[{i}]", fold, dtype) for i, fold in enumerate(metrics))
+
+
+def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
+    """The fold with its numbers in one floating-point type."""
+    try:
+        return jax.tree.map(lambda x: jnp.asarray(x, dtype), fold)
+    except Exception as error:
+        raise checks.fail(name, fold, "a fold whose fields are numbers", "Other things belong in a static field.") from error
 
 
 def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:

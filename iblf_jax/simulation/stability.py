@@ -59,23 +59,12 @@ def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
     return (rates[0] - rates[1]) / size
 
 
-def _flat_rate(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[Callable, jax.Array]:
-    x, whole = ravel_pytree(state)
-    return lambda y: ravel_pytree(rate(scenario, t, whole(y)))[0], x
-
-
 @jax.jit
 def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     """The closed loop's Jacobian at (t, state), (m, m) [1/s]."""
-    rate_at, x = _flat_rate(scenario, t, state)
+    x, whole = ravel_pytree(state)
+
+    def rate_at(y):
+        return ravel_pytree(rate(scenario, t, whole(y)))[0]
+
     return jax.lax.map(lambda unit: along(rate_at, x, unit), jnp.eye(x.size, dtype=x.dtype)).T
-
-
-def fastest_mode(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
-    """Spectral radius of the closed loop's Jacobian at (t, state), () [1/s], by power iteration."""
-    rate_at, x = _flat_rate(scenario, t, state)
-
-    def iterate(growth, iteration):
-        return grown(growth, along(rate_at, x, growth.direction), iteration), None
-
-    return growth_rate(jax.lax.scan(iterate, growth_start(x), jnp.arange(POWER_ITERATIONS))[0])

@@ -112,14 +112,9 @@ class Study:
     def __len__(self) -> int:
         return self.runs
 
-    def _index(self, index: Any) -> int:
-        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not -self.runs <= index < self.runs:
-            raise IndexError(f"run {checks.shown(index)}: the study has runs 0 to {self.runs - 1}")
-        return int(index) % self.runs
-
     def __getitem__(self, index: int) -> OneRun:
         """One run: its metrics, status and drawn values."""
-        i = self._index(index)
+        i = checks.entry("index", index, self.runs, "runs")
         return OneRun(i, jax.tree.map(lambda x: x[i], self.metrics), int(self.status[i]), {path: x[i] for path, x in self.samples.items()})
 
     @property
@@ -296,12 +291,11 @@ class Study:
           A `Rollout`, with the drawn parameters in its scenario.
 
         Raises:
-          IndexError: no such run.
-          ValueError: the run was not made because a draw was inadmissible.
+          ValueError: no such run (an IndexError too), or one that was not made because a draw was inadmissible.
 
         Source: design of this package.
         """
-        i = self._index(index)
+        i = checks.entry("index", index, self.runs, "runs")
         record_every = checks.recorded_every(record_every, self.setup.program.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}

@@ -60,8 +60,16 @@ class Front:
         return len(self.x)
 
     def scenario(self, index: int) -> Scenario:
-        """The scenario with the gains of one point."""
-        return with_parameters(self.start, values_at(self.blocks, jnp.asarray(self.z[index])))
+        """The scenario with the gains of one point.
+
+        Args:
+          index: its number, in the order of `objectives`.
+
+        Raises:
+          ValueError: no such point (an IndexError too).
+        """
+        z = self.z[checks.entry("index", index, len(self), "points")]
+        return with_parameters(self.start, values_at(self.blocks, jnp.asarray(z)))
 
     def plot(self, **options):
         """Figure of the front.  Options as `plotting.pareto`."""
