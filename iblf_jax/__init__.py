@@ -15,6 +15,9 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
+from iblf_jax.core import linalg as linalg
+from iblf_jax.core import pytree as pytree
+from iblf_jax.core import status as status
 from iblf_jax.core.pytree import astype as astype
 from iblf_jax.core.pytree import component as component
 from iblf_jax.core.pytree import leaf as leaf
@@ -29,6 +32,7 @@ from iblf_jax.files.rollouts import save_rollouts as save_rollouts
 from iblf_jax.files.scenario import load_scenario as load_scenario
 from iblf_jax.files.scenario import save_scenario as save_scenario
 from iblf_jax.simulation import metrics as metrics
+from iblf_jax.simulation import paths as paths
 from iblf_jax.simulation.paths import parameters as parameters
 from iblf_jax.simulation.paths import with_parameters as with_parameters
 from iblf_jax.simulation.results import Metrics as Metrics
