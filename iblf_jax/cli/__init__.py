@@ -19,8 +19,8 @@ from typing import Any, NoReturn
 
 import jax
 
-from iblf_jax import checks
 from iblf_jax._start import INTERRUPTED, end_process
+from iblf_jax.core import checks
 from iblf_jax.lowering.toolchain import ToolchainError, cache_directory, not_ours
 
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax import checks
+from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, plain
 from iblf_jax.plotting._panels import QUANTITIES, Window, draw, say_what_is_cut, set_limits, show
