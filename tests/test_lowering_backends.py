@@ -147,6 +147,24 @@ def test_a_run_that_fails_does_not_touch_the_others():
     np.testing.assert_array_equal(found.status, batch(backend="vmap", values=broken).status)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["xla", pytest.param("native", marks=needs_compiler)])
+def test_a_sine_of_any_size_is_finite_in_a_batch(backend):
+    scenario = canonical(ij.presets.zhang_yan_2024())
+    varied = {
+        "disturbance.phase": jnp.asarray([0.3, 1e7, 1e18]),
+        "disturbance.velocity_phase": jnp.asarray([[0.1, 0.2]] * 2 + [[3e17, 1.0]]),
+    }
+
+    def run(backend):
+        f = jax.jit(lambda v: execute.run_batch(scenario, v, standard(), jnp.asarray(1e-3), Run(3, "euler"), backend=backend))
+        return jax.tree.map(np.asarray, f(varied))
+
+    found = run(backend)
+    assert not np.any(found.status & ij.Status.NOT_FINITE)
+    assert_same(found, run("vmap"), TOLERANCE["float64"])
+
+
 @needs_compiler
 def test_a_step_that_is_too_large_is_seen_by_every_backend():
     values = {"plant.mass[1]": np.asarray([0.85, 0.05, 0.02, 0.85, 0.9]), "initial.q": np.full((5, 2), 0.8)}

@@ -6,7 +6,7 @@ On CPU it says to XLA where to stop fusing: what is used several times is comput
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,28 +16,8 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax.engine import plan, vector_math
+from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.program import Node, Program
-
-STORED = 8
-"""Cost from which a number with several uses is stored on CPU.  XLA would compute it again for each use."""
-
-FUNCTIONS: dict[str, Callable] = {
-    "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "rem": lax.rem, "neg": lax.neg, "abs": lax.abs, "max": lax.max,
-    "min": lax.min, "sqrt": lax.sqrt, "rsqrt": lax.rsqrt, "cbrt": lax.cbrt, "sign": lax.sign, "floor": lax.floor, "ceil": lax.ceil,
-    "round_even": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), "sin": lax.sin, "cos": lax.cos, "tan": lax.tan,
-    "asin": lax.asin, "acos": lax.acos, "atan": lax.atan, "sinh": lax.sinh, "cosh": lax.cosh, "tanh": lax.tanh, "asinh": lax.asinh,
-    "acosh": lax.acosh, "atanh": lax.atanh, "exp": lax.exp, "exp2": lax.exp2, "expm1": lax.expm1, "log": lax.log, "log1p": lax.log1p,
-    "pow": lax.pow, "atan2": lax.atan2, "erf": lax.erf, "erfc": lax.erfc, "logistic": lax.logistic, "is_finite": lax.is_finite,
-    "eq": lax.eq, "ne": lax.ne, "lt": lax.lt, "le": lax.le, "gt": lax.gt, "ge": lax.ge, "and": lax.bitwise_and, "or": lax.bitwise_or,
-    "xor": lax.bitwise_xor, "not": lax.bitwise_not, "select": lax.select,
-}  # fmt: skip
-"""No function of jnp: those are jitted, and within a function that XLA may not inline each would be a call."""
-POLYNOMIALS = {"sin": vector_math.sin, "cos": vector_math.cos}
-"""In place of functions that XLA's CPU backend does not vectorise."""
-CHEAP = frozenset(
-    ("add", "sub", "mul", "neg", "abs", "max", "min", "select", "convert", "and", "or", "xor", "not", "lt", "le", "gt", "ge", "eq", "ne")
-)
-"""Operations of one instruction; others count as eight."""
 
 
 class Entry(NamedTuple):
@@ -65,7 +45,7 @@ class Evaluator:
         self.program = program
         self.shape = shape
         self.bordered = on_cpu() and bool(shape)
-        self.functions = FUNCTIONS | (POLYNOMIALS if self.bordered else {})
+        self.polynomials = vector_math.LIBRARY if self.bordered else {}
         self.types = {"f": program.dtype, "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
 
     def compute(self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None) -> None:
@@ -88,9 +68,9 @@ class Evaluator:
         nodes, cost, stored = self.program.nodes, dict.fromkeys(order, 0), set(wanted)
         uses = Counter([a for i in order for a in nodes[i].args] + list(stored))
         for i in order:
-            here = (1 if nodes[i].op in CHEAP else 8) + sum(cost.get(a, 0) for a in nodes[i].args if a not in stored)
+            here = (1 if OPERATIONS[nodes[i].op].cheap else plan.XLA_DEAR) + sum(cost.get(a, 0) for a in nodes[i].args if a not in stored)
             cost[i] = here
-            if uses[i] > 1 and here >= STORED:
+            if uses[i] > 1 and here >= plan.XLA_STORED:
                 stored.add(i)
         return stored
 
@@ -108,27 +88,47 @@ class Evaluator:
         for i in order:
             if nodes[i].op == "lookup":
                 tables.setdefault((nodes[i].args, len(nodes[i].value)), []).append(i)
+        rounds = self._rounds(order)
         entries = {i: known[i] for i in inputs if isinstance(known[i], Entry)}
         arrays = {i: known[i] for i in inputs if i not in entries}
 
         def body(row, arrays):
             local = arrays | {i: x.read(row) for i, x in entries.items()}
-            for i in order:
-                if nodes[i].op != "lookup":
-                    local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
-                elif i not in local:
-                    together = tables[nodes[i].args, len(nodes[i].value)]
-                    local |= zip(together, self._looked_up(together, local[nodes[i].args[0]]), strict=True)
+            for plain, sines in rounds:
+                for i in plain:
+                    if nodes[i].op != "lookup":
+                        local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
+                    elif i not in local:
+                        together = tables[nodes[i].args, len(nodes[i].value)]
+                        local |= zip(together, self._looked_up(together, local[nodes[i].args[0]]), strict=True)
+                if sines:
+                    angles = [jnp.broadcast_to(local[nodes[i].args[0]], self.shape) for i in sines]
+                    local |= zip(sines, vector_math.sines([nodes[i].op for i in sines], angles), strict=True)
             return [local[i] for i in outputs]
 
         results = lax.optimization_barrier(as_function(body)(row, arrays)) if self.bordered else body(row, arrays)
         known |= zip(outputs, results, strict=True)
 
+    def _rounds(self, order: list[int]) -> list[tuple[list[int], list[int]]]:
+        """`order` as rounds: nodes, then the sines and cosines that these and earlier rounds allow, which are computed together."""
+        nodes, done = self.program.nodes, dict[int, int]()
+        rounds: list[tuple[list[int], list[int]]] = [([], [])]
+        for i in order:
+            first = max((done.get(a, 0) for a in nodes[i].args), default=0)
+            is_sine = nodes[i].op in self.polynomials
+            rounds[first][is_sine].append(i)
+            done[i] = first + is_sine
+            if done[i] == len(rounds):
+                rounds.append(([], []))
+        return rounds
+
     def _value(self, node: Node, args: list[Any]) -> Any:
         args = [jnp.broadcast_to(x, self.shape) for x in args]
         if node.op == "convert":
             return lax.convert_element_type(args[0], self.types[node.kind])
-        return self.functions[node.op](*args)
+        function = OPERATIONS[node.op].lax
+        assert function is not None, node.op
+        return function(*args)
 
     def _looked_up(self, lookups: list[int], index: Any) -> jax.Array:
         """The values of lookups by one index, in one gather: XLA makes a loop of each.

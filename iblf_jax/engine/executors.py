@@ -100,7 +100,8 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
     function = _on_leaves(step, leaves.treedef, leaves.is_lane, treedef)
     # A derivative's literal zero says "does not depend".
     sparse = getattr(step, "is_derivative", False)
-    return lowered(function, np.dtype(batch.dtype), Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), Shapes.of(flat, 1), sparse)
+    shapes = Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), Shapes.of(flat, 1)
+    return lowered(function, np.dtype(batch.dtype), *shapes, plan.LOWERED, sparse)
 
 
 def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]]) -> Executor:

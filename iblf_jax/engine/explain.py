@@ -15,6 +15,7 @@ from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import automatic
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.step import Inputs, TimeStep
+from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
 from iblf_jax.lowering.toolchain import threads
 from iblf_jax.simulation.integrators import tableau
@@ -22,13 +23,8 @@ from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import Scenario, canonical
 
-SLOTS = {
-    "div": 8, "sqrt": 8, "rsqrt": 16, "sin": 18, "cos": 18, "tan": 40, "exp": 20, "expm1": 22, "log": 24, "log1p": 32, "tanh": 32,
-    "logistic": 30, "atan": 26, "atan2": 40, "convert": 1, "max": 3, "min": 3, "sign": 4, "is_finite": 2, "lookup": 24,
-}  # fmt: skip
-"""Vector instructions of an operation, roughly, where it is not one; a function of the C library takes LIBRARY a run."""
 LIBRARY = 40
-LIBRARY_CALLS = ("asin", "acos", "sinh", "cosh", "asinh", "acosh", "atanh", "exp2", "erf", "erfc", "cbrt", "pow", "rem")
+"""Vector instructions that a function of the C library takes for a run, roughly."""
 NAMES = {SHARED: "once", SHARED | TIME: "a step, shared", LANE: "a run", LANE | TIME: "a step and run"}
 
 
@@ -100,8 +96,11 @@ def instructions(program: Program, width: int) -> float:
         if node.op in ("add", "sub")
     }
     counted = program.counts()[LANE | TIME]
-    total = sum(n * (LIBRARY * width if op in LIBRARY_CALLS else SLOTS.get(op, 1)) for op, n in counted.items())
-    return total - len(fused - {None})
+    total = -len(fused - {None})
+    for op, n in counted.items():
+        cost = OPERATIONS[op].cost
+        total += n * (LIBRARY * width if cost is None else cost)
+    return total
 
 
 def _clock() -> float:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iblf_jax.lowering.program import Limits
+
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a user may ask for a batch to be executed; "vmap" is the scan executor."""
 SINGLE_RUN_BACKENDS = ("auto", "xla", "native", "gpu")
@@ -29,6 +31,12 @@ LONGEST_FUNCTION = 60_000
 # Scalar programs: numbers of operations are nodes of a step.
 LONGEST_ALONE = 2500
 """Nodes up to which one run is lowered unasked: a longer one gains less by it than it takes to compile."""
+LOWERED = Limits(choices=64, table=4096, tables=50_000, scan=64)
+"""What is lowered at all.  An entry of a choice is a comparison and a selection in every step, one of a table a constant in the code; a
+scan is unrolled."""
+XLA_DEAR, XLA_STORED = 8, 8
+"""What an operation costs on CPU where a cheap one costs 1, and the cost from which a number with several uses is stored: XLA would
+compute it again for each use."""
 XLA_BLOCK = 64
 """Runs that go through a stretch of steps together on CPU: their numbers stay in the first-level cache."""
 XLA_BLOCK_ALWAYS = 10_000

@@ -14,18 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, UnsupportedError, frontier
 
-INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
-    "and": "&", "or": "|", "xor": "^",
-}  # fmt: skip
-CALLS = (
-    "max", "min", "abs", "sign", "floor", "ceil", "round_even", "sqrt", "rsqrt", "cbrt", "sin", "cos", "tan", "asin", "acos", "atan",
-    "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "pow", "atan2", "erf", "erfc", "logistic",
-    "rem", "is_finite",
-)  # fmt: skip
-COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
@@ -47,21 +38,11 @@ def literal(node: Node, dtype: np.dtype) -> str:
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
     """One operation in C; `args` are expressions of vectors."""
     op = node.op
-    if op in ("eq", "ne") and kinds[0] == "b":
-        return f"{'~' if op == 'eq' else ''}({args[0]} ^ {args[1]})"
-    if (op in INFIX and kinds[0] != "b") or op in ("and", "or", "xor"):
-        text = f"{args[0]} {INFIX[op]} {args[1]}"
-        return f"MASK({text})" if op in COMPARISONS else text
-    if op in ("neg", "not"):
-        return f"{'-' if op == 'neg' else '~'}{args[0]}"
-    if op == "select":
-        return f"{args[0]} ? {args[1]} : {args[2]}"
     if op == "convert":
         return _conversion(kinds[0], node.kind, args[0])
-    if kinds[0] == "i" and op in ("max", "min"):
-        return f"i_{op}({args[0]}, {args[1]})"
-    if op in CALLS and kinds[0] == "f":
-        return f"f_{op}({', '.join(args)})"
+    text = OPERATIONS[op].in_c(op, kinds[0], args)
+    if text is not None:
+        return text
     raise UnsupportedError(f"generated code has no {op} of kind {kinds}")
 
 

@@ -15,8 +15,6 @@ from jax.extend import core
 from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, constants
 from iblf_jax.lowering.rules import RULES
 
-LONGEST_SCAN = 64
-"""Steps up to which an inner scan is unrolled."""
 INLINED = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr",
@@ -67,8 +65,8 @@ def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
 def _scan(b: Builder, eqn, operands):
     params = eqn.params
     length, n_const, n_carry = params["length"], params["num_consts"], params["num_carry"]
-    if length > LONGEST_SCAN:
-        raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {LONGEST_SCAN})")
+    if length > b.limits.scan:
+        raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})")
     const, carry, xs = operands[:n_const], operands[n_const : n_const + n_carry], operands[n_const + n_carry :]
     stacked: list[list[Ids]] = []
     for i in reversed(range(length)) if params["reverse"] else range(length):

@@ -7,55 +7,28 @@ be seen to be so.  (Programs of derivatives, `Builder.sparse`, are the exception
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+from iblf_jax.lowering.operations import OPERATIONS
 
 if TYPE_CHECKING:
     from iblf_jax.lowering.program import Builder
 
 
-def _reciprocal_root(x):
-    return 1 / np.sqrt(x)
-
-
-_erf = np.vectorize(math.erf, otypes=[float])
-_erfc = np.vectorize(math.erfc, otypes=[float])
-
-
-def _logistic(x):
-    return 1 / (1 + np.exp(-x))
-
-
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "abs": np.abs, "max": np.maximum,
-    "min": np.minimum, "sqrt": np.sqrt, "rsqrt": _reciprocal_root, "cbrt": np.cbrt, "sign": np.sign, "floor": np.floor, "ceil": np.ceil,
-    "round_even": np.rint, "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
-    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh,
-    "exp": np.exp, "exp2": np.exp2, "expm1": np.expm1, "log": np.log, "log1p": np.log1p, "pow": np.power, "atan2": np.arctan2,
-    "erf": _erf, "erfc": _erfc, "logistic": _logistic, "is_finite": np.isfinite,
-    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
-    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "rem": np.fmod,
-}  # fmt: skip
-"""NumPy's function for every operation; these and a few more are what a program may hold."""
-
-
 def fold(op: str, values: list, kinds: list[str], kind: str, dtype: np.dtype):
     """The value of an operation on constants, or None if it is not known here."""
-    if op == "select":
-        return values[1] if values[0] else values[2]
     if op == "convert":
         return {"f": float, "i": int, "b": bool}[kind](values[0])
-    if op == "not":
-        return not values[0] if kind == "b" else ~values[0]
-    if op not in FUNCTIONS:
+    function = OPERATIONS[op].numpy
+    if function is None:
         return None
     if op == "div" and kind == "i":
         return None if values[1] == 0 else int(values[0] / values[1])
     types = {"f": dtype.type, "i": np.int64, "b": np.bool_}
     with np.errstate(all="ignore"):
-        return FUNCTIONS[op](*(types[k](v) for k, v in zip(kinds, values, strict=True))).item()
+        return function(*(types[k](v) for k, v in zip(kinds, values, strict=True))).item()
 
 
 def simplify(b: Builder, op: str, args: tuple[int, ...], kind: str) -> int | None:

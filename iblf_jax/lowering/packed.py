@@ -12,7 +12,7 @@ import numpy as np
 
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.passes import with_reciprocals
-from iblf_jax.lowering.program import Builder, Program, UnsupportedError, finished, kind_of
+from iblf_jax.lowering.program import Builder, Limits, Program, UnsupportedError, finished, kind_of
 
 
 class Shapes(NamedTuple):
@@ -48,17 +48,17 @@ class Lowered(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes, sparse: bool = False) -> Lowered:
+def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes, limits: Limits, sparse: bool = False) -> Lowered:
     """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, records)`.
 
-    `sparse`: for steps that hold derivatives, see `Builder`.
+    `limits`: what is too long; `sparse`: for steps that hold derivatives, see `Builder`.
 
     Raises:
       UnsupportedError: the step holds something that a scalar program cannot express.
     """
     index = jax.ShapeDtypeStruct((), jnp.int32)
     jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(shared.structs(), lane.structs(), carry.structs(), index)
-    b = Builder(dtype, sparse=sparse)
+    b = Builder(dtype, sparse=sparse, limits=limits)
     operands, read = [], []
     for op, group in (("shared", shared), ("lane", lane), ("carry", carry)):
         count = 0

@@ -14,6 +14,7 @@ Every node has one of four classes, by what it depends on; each is computed as s
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.lowering.identities import fold, simplify
+from iblf_jax.lowering.operations import OPERATIONS
 
 SHARED, LANE, TIME = 0, 1, 2
 INPUTS = ("shared", "lane", "carry", "index")
@@ -57,13 +59,32 @@ class Node(NamedTuple):
     value: Any = None
 
 
+class Limits(NamedTuple):
+    """What is too long to be lowered; the caller says so."""
+
+    choices: float = math.inf
+    """Entries among which indices of the run may choose."""
+    table: float = math.inf
+    """Floating-point constants among which one may."""
+    tables: float = math.inf
+    """Numbers that the tables of one indexing may have in all."""
+    scan: float = math.inf
+    """Steps up to which an inner scan is unrolled."""
+
+
+NO_LIMITS = Limits()
+
+
 class Builder:
     """Makes nodes; equal ones are made once."""
 
-    def __init__(self, dtype, *, sparse: bool = False) -> None:
-        """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such a zero says "does not depend"."""
+    def __init__(self, dtype, *, sparse: bool = False, limits: Limits = NO_LIMITS) -> None:
+        """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such a zero says "does not depend".
+        `limits`: for what is read from a jaxpr.
+        """
         self.dtype = np.dtype(dtype)
         self.sparse = sparse
+        self.limits = limits
         self.nodes: list[Node] = []
         self._known: dict[tuple, int] = {}
 
@@ -86,9 +107,7 @@ class Builder:
         simpler = simplify(self, op, args, kind)
         if simpler is not None:
             return simpler
-        if op in ("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"):
-            args = tuple(sorted(args)) if op not in ("max", "min") else args
-        return self._add(Node(op, args, kind), None)
+        return self._add(Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None)
 
     def lookup(self, table: tuple[float, ...], index: int) -> int:
         """The node of table[index], for an index that only the run knows."""

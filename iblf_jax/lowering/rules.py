@@ -6,15 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, kind_of
 from iblf_jax.lowering.structure import STRUCTURE
-
-COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
-UNARY = (
-    "neg", "abs", "sign", "floor", "ceil", "sqrt", "rsqrt", "cbrt", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh",
-    "asinh", "acosh", "atanh", "exp", "exp2", "expm1", "log", "log1p", "erf", "erfc", "logistic", "not",
-)  # fmt: skip
-BINARY = ("sub", "mul", "max", "min", "pow", "atan2", "rem", "and", "or", "xor")
 
 
 def each(b: Builder, op: str, eqn, *operands: Ids, kind: str | None = None) -> Ids:
@@ -171,20 +165,11 @@ def _square(b: Builder, eqn, x: Ids) -> Ids:
     return each(b, "mul", eqn, x, x)
 
 
-def _add(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
-    return each(b, "add", eqn, x, y)
-
-
-def _div(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
-    return each(b, "div", eqn, x, y)
-
-
 RULES: dict[str, Callable] = {
-    **{op: _elementwise(op) for op in (*UNARY, *BINARY)},
-    **{op: _elementwise(op) for op in COMPARISONS},
+    **{name: _elementwise(op) for op, row in OPERATIONS.items() for name in ((op,) if row.primitives is None else row.primitives)},
     **STRUCTURE,
-    "add": _add, "add_any": _add, "div": _div, "square": _square, "pow": _pow, "integer_pow": _integer_pow, "round": _round,
-    "is_finite": _elementwise("is_finite"), "select_n": _select_n, "clamp": _clamp, "convert_element_type": _convert,
+    "square": _square, "pow": _pow, "integer_pow": _integer_pow, "round": _round, "select_n": _select_n, "clamp": _clamp,
+    "convert_element_type": _convert,
     "stop_gradient": _stop, "optimization_barrier": _stop, "copy": _stop, "copy_p": _stop, "reduce_precision": _stop,
     "reduce_sum": _reduce("add"), "reduce_prod": _reduce("mul"), "reduce_max": _reduce("max"), "reduce_min": _reduce("min"),
     "reduce_and": _reduce("and"), "reduce_or": _reduce("or"), "argmin": _arg_extreme("lt"), "argmax": _arg_extreme("gt"),

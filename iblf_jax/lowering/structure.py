@@ -13,11 +13,6 @@ import numpy as np
 
 from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, constants
 
-MOST_CHOICES = 64
-"""Entries among which indices of the run may choose."""
-LONGEST_TABLE, LARGEST_TABLES = 4096, 50_000
-"""Floating-point constants among which one may, and how many numbers the tables of one indexing may have in all."""
-
 
 def _reshape(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
     return x.reshape(eqn.outvars[0].aval.shape)
@@ -91,12 +86,12 @@ def _chosen(b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] 
     if not unknown:
         return at(np.asarray(flat, np.int32).reshape(index.shape))
     choices = size ** len({*unknown, *known})
-    if choices > (LONGEST_TABLE if choices == size and _is_table(b, x.ravel().tolist()) else MOST_CHOICES):
+    if choices > (b.limits.table if choices == size and _is_table(b, x.ravel().tolist()) else b.limits.choices):
         raise UnsupportedError(f"indices that only the run knows choose among {choices} entries, which is too many")
     node = unknown[0]
     cases = [_chosen(b, x, index, at, known | {node: v}) for v in range(size)]
     columns = np.stack([case.ravel() for case in cases], axis=1)
-    if columns.size > LARGEST_TABLES:
+    if columns.size > b.limits.tables:
         raise UnsupportedError(f"an index that only the run knows chooses among {columns.size} numbers, which is too many")
     return np.asarray([_one_of(b, column, node) for column in columns.tolist()], np.int64).reshape(cases[0].shape)
 
@@ -111,7 +106,7 @@ def _one_of(b: Builder, entries: list[int], index: int) -> int:
         return entries[0]
     if _is_table(b, entries):
         return b.lookup(tuple(b.value(i) for i in entries), index)
-    if len(entries) > MOST_CHOICES:
+    if len(entries) > b.limits.choices:
         raise UnsupportedError(f"an index that only the run knows chooses among {len(entries)} entries, which is too many")
     result = entries[-1]
     for v, entry in reversed(list(enumerate(entries[:-1]))):

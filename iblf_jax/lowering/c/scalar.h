@@ -40,9 +40,11 @@ typedef union { real f; integer i; } word;
 #define from(first) (first)
 #define to_float(x) ((F)(x))
 #define to_int(x) ((I)(x))
+INLINE int any_run(I x) { return x != 0; }
 INLINE F f_lookup(const integer *table, integer size, I i) { return from_bits(table[i < 0 ? 0 : i < size ? i : size - 1]); }
 struct all_runs {};
 struct one_run {};
 template <typename count> INLINE void store_some(real *p, F x, count) { *p = x; }
 #define LANEWISE(name, call) INLINE F name(F x) { return FN(call)(x); }
 #define LANEWISE2(name, call) INLINE F name(F x, F y) { return FN(call)(x, y); }
+#define LANEWISE_WHERE(name, call) static __device__ __attribute__((noinline)) F name(I which, F x, F y) { return which ? FN(call)(x) : y; }

@@ -53,6 +53,22 @@ INLINE I bits(F x) { return (I)x; }
 INLINE F from_bits(I x) { return (F)x; }
 INLINE F to_float(I x) { return __builtin_convertvector(x, F); }
 INLINE I to_int(F x) { return __builtin_convertvector(x, I); }
+
+/* Whether a comparison holds for any run: an instruction or two where the processor has them, of a name that GCC and Clang share. */
+#if VECTOR_BYTES == 64 && defined(__AVX512DQ__)
+typedef long long longs __attribute__((vector_size(VECTOR_BYTES)));
+typedef int ints __attribute__((vector_size(VECTOR_BYTES)));
+INLINE int any_run(I x) { return DOUBLE ? __builtin_ia32_cvtq2mask512((longs)x) != 0 : __builtin_ia32_cvtd2mask512((ints)x) != 0; }
+#elif VECTOR_BYTES == 32 && defined(__AVX__)
+typedef float floats __attribute__((vector_size(VECTOR_BYTES)));
+INLINE int any_run(I x) { return __builtin_ia32_movmskps256((floats)x) != 0; }
+#elif VECTOR_BYTES == 16 && defined(__SSE__)
+typedef float floats __attribute__((vector_size(VECTOR_BYTES)));
+INLINE int any_run(I x) { return __builtin_ia32_movmskps((floats)x) != 0; }
+#else
+INLINE int any_run(I x) { integer y = 0; for (int l = 0; l < W; l++) y |= x[l]; return y != 0; }
+#endif
+
 INLINE F f_lookup(const integer *table, integer size, I index) {
   I x; for (int l = 0; l < W; l++) x[l] = table[index[l] < 0 ? 0 : index[l] < size ? index[l] : size - 1]; return from_bits(x); }
 
@@ -62,3 +78,7 @@ INLINE F f_lookup(const integer *table, integer size, I index) {
 #define LANEWISE2(name, call) INLINE F name(F x, F y) { \
   real a[W], b[W]; memcpy(a, &x, sizeof a); memcpy(b, &y, sizeof b); \
   for (int l = 0; l < W; l++) a[l] = FN(call)(a[l], b[l]); memcpy(&x, a, sizeof a); return x; }
+
+/* The same, for those runs alone for which `which` holds, else y: what few runs need, in a function of its own. */
+#define LANEWISE_WHERE(name, call) static __attribute__((noinline, cold, const)) F name(I which, F x, F y) { \
+  for (int l = 0; l < W; l++) if (which[l]) y[l] = FN(call)(x[l]); return y; }
