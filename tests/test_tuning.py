@@ -14,7 +14,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.execute import run_plain
+from iblf_jax.engine.execute import run_transformable
 from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -247,7 +247,7 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
 
 
 def plain_status(scenario):
-    return jax.jit(lambda s: run_plain(s, standard(), jnp.asarray(1e-3), Run(300, "euler")).status)(scenario)
+    return jax.jit(lambda s: run_transformable(s, standard(), jnp.asarray(1e-3), Run(300, "euler")).status)(scenario)
 
 
 class Cliff:

@@ -153,16 +153,16 @@ def assumptions(trajectory: Trajectory) -> list[Line]:
     room = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     row, joint = np.unravel_index(np.argmin(room), room.shape)
     feasible: Description = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
-    line = _plain(feasible, float(room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
+    line = _line(feasible, float(room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
     lines.append(_as_status(whole, line, Status.INFEASIBLE_REFERENCE))
     if trajectory.t[0] == 0:
         start = np.minimum(sample.q[0] - sample.lower[0], sample.upper[0] - sample.q[0])
         inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
-        lines.append(_plain(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
+        lines.append(_line(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
     return lines
 
 
-def _plain(description: Description, margin: float, **more: Any) -> Line:
+def _line(description: Description, margin: float, **more: Any) -> Line:
     """A line whose margin must be positive."""
     return Line(verdict=HOLDS if margin > 0 else FAILS, margin=margin, **description, **more)
 
@@ -191,7 +191,7 @@ def gains(whole: Whole) -> list[Line]:
         margins = np.asarray(getattr(whole.claim, field)) - lowest
         spare = name == "kf, case 2" and whole.case == 1
         note = "f' = 0 on this run, so case 1 is what counts" if spare else ""
-        lines.append(_plain(description, float(margins.min()), joint=int(margins.argmin()), counts=not spare, note=note))
+        lines.append(_line(description, float(margins.min()), joint=int(margins.argmin()), counts=not spare, note=note))
     return lines
 
 
@@ -213,7 +213,7 @@ def rates(whole: Whole, case: int) -> list[Line]:
             f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.eigenvalues.searched})" if where == "box" else "") + f"; set by {least}"
         )
         counts = not (case == 2 and whole.case == 1)
-        lines.append(_plain(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
+        lines.append(_line(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
     return lines
 
 
@@ -336,7 +336,7 @@ def conclusion(trajectory: Trajectory) -> Line:
     room = 1.0 - np.abs(trajectory.sample.xi)
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
     case = applicable_case(trajectory.whole)
-    line = _plain(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
+    line = _line(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
     line = _as_status(trajectory.whole, line, Status.BOUND_VIOLATED)
     unclaimed = case is not None and _xi_bound(trajectory.whole.run.scenario, trajectory.t[:1], trajectory.proof.V[:1]) is None
     if case is None or unclaimed:

@@ -152,7 +152,7 @@ class Certificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Heading, verdict, constants and lines as plain numbers, strings and lists, for strict JSON (no NaN, no infinity)."""
-        return _plain({
+        return _for_json({
             "heading": self.heading,
             "verdict": self.verdict,
             "runs": list(self.runs),
@@ -174,14 +174,14 @@ def _number(value: float | None, unit: str) -> str:
     return f"{value:.4g}" + ("" if unit == "1" else f" {unit}")
 
 
-def _plain(value: Any) -> Any:
+def _for_json(value: Any) -> Any:
     """`value` with arrays as lists, NumPy numbers as Python's, and what is not finite as None."""
     if isinstance(value, dict):
-        return {str(key): _plain(x) for key, x in value.items()}
+        return {str(key): _for_json(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(x) for x in value]
+        return [_for_json(x) for x in value]
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return _for_json(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value

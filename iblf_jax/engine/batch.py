@@ -51,7 +51,7 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
     return Leaves(treedef, tuple(touched), [x for x, yes in zip(before, touched, strict=True) if not yes], list(lane))
 
 
-PLAIN = Shape("together", "none", False)
+TOGETHER = Shape("together", "none", False)
 
 
 class Batch(NamedTuple):
@@ -61,11 +61,11 @@ class Batch(NamedTuple):
     """Of their `Inputs`."""
     runs: int | None
     """None: one run, and no array has a run axis."""
-    shape: Shape = PLAIN
+    shape: Shape = TOGETHER
     """How its parts are compiled."""
 
     @staticmethod
-    def of(inputs: Inputs, varied: Mapping[str, jax.Array] | None, shape: Shape = PLAIN) -> Batch:
+    def of(inputs: Inputs, varied: Mapping[str, jax.Array] | None, shape: Shape = TOGETHER) -> Batch:
         """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
         runs = jax.tree.leaves(dict(varied))[0].shape[0] if varied else None
         return Batch(split(inputs, varied or {}), runs, shape)

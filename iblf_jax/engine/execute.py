@@ -57,13 +57,13 @@ def automatic() -> tuple[str, str | None]:
     return ("xla", reason) if reason else (best, None)
 
 
-def with_fallback(backend: str, run_on: Callable, plain: Callable):
-    """`run_on(name)` on the executor that was asked for, or the next one that can; `plain()` is scan.
+def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
+    """`run_on(name)` on the executor that was asked for, or the next one that can; `on_scan()` is scan.
 
     Args:
       backend: one of `plan.BACKENDS`.
       run_on: function of a name in LOWERED.
-      plain: function without arguments.
+      on_scan: function without arguments.
 
     Raises:
       ValueError: an unknown backend.
@@ -81,7 +81,7 @@ def with_fallback(backend: str, run_on: Callable, plain: Callable):
                 _tell(f"The {name} backend is not available ({error}): running on xla.")
     except UnsupportedError as reason:
         _tell(f"This scenario runs on the vmap backend, several times slower: {reason}.")
-    return plain()
+    return on_scan()
 
 
 def _inputs(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
@@ -145,10 +145,10 @@ def run_batch(
     def run_on(name):
         return run_all(_executor(name), _lowered_batch(inputs, varied, nested), run)
 
-    def plain():
+    def on_scan():
         return _scanned(inputs, varied, nested, lambda batch: run_all(scan, batch, run))
 
-    return with_fallback(backend, run_on, plain)
+    return with_fallback(backend, run_on, on_scan)
 
 
 def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto") -> Outcome:
@@ -165,30 +165,30 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
     def run_on(name):
         return jax.tree.map(lambda x: x[0], run_all(_executor(name), batch, run))
 
-    def plain():
+    def on_scan():
         return _scanned(inputs, None, False, lambda batch: run_all(scan, batch, run))
 
     if backend in plan.COMPILED.values():
-        return with_fallback(backend, run_on, plain)
+        return with_fallback(backend, run_on, on_scan)
     if backend == "vmap" or jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
-        return plain()
+        return on_scan()
     name = "native" if backend == "auto" and not native.unavailable() else "xla"
     try:
         step = TimeStep(run.method, run.record_every is not None)
         program, _ = program_of(step, batch, carry_shapes(batch, run.method))
-        return run_on(name) if plan.lowers_alone(len(program.nodes)) else plain()
+        return run_on(name) if plan.lowers_one_run(len(program.nodes)) else on_scan()
     except (UnsupportedError, ToolchainError):
-        return plain()
+        return on_scan()
 
 
-def run_plain(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
+def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
     """One run that may be batched and differentiated from outside; arguments as `run_one`."""
     inputs = _inputs(scenario, folds, dt, run)
     return run_all(scan, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 
 def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
-    """As `run_plain`, for reverse mode: few states are in memory at a time; `run` records nothing."""
+    """As `run_transformable`, for reverse mode: few states are in memory at a time; `run` records nothing."""
     inputs = _inputs(scenario, folds, dt, run)
     return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
@@ -226,13 +226,13 @@ def run_batch_jvp(
         if backend == "auto":
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
             if not plan.lowers_derivatives(name, len(program.nodes), along.tangents):
-                return plain()
+                return on_scan()
         return run_with_tangents(_executor(name), batch, along, run)
 
-    def plain():
+    def on_scan():
         return _scanned(inputs, varied, nested, lambda batch: run_with_tangents(scan, batch, along, run))
 
-    return with_fallback(backend, run_on, plain)
+    return with_fallback(backend, run_on, on_scan)
 
 
 def chosen_backend(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds: Any, dt: jax.Array, *, method: str) -> str:

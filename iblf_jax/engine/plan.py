@@ -29,7 +29,7 @@ LONGEST_FUNCTION = 60_000
 """Operations over which LLVM takes minutes as one machine function."""
 
 # Scalar programs: numbers of operations are nodes of a step.
-LONGEST_ALONE = 2500
+LONGEST_ONE_RUN = 2500
 """Nodes up to which one run is lowered unasked: a longer one gains less by it than it takes to compile."""
 LOWERED = Limits(choices=64, table=4096, tables=50_000, scan=64)
 """What is lowered at all.  An entry of a choice is a comparison and a selection in every step, one of a table a constant in the code; a
@@ -115,9 +115,9 @@ def order(backend: str, platform: str) -> tuple[str, ...]:
     return () if backend == "vmap" else (*wanted, "xla")
 
 
-def lowers_alone(nodes: int) -> bool:
+def lowers_one_run(nodes: int) -> bool:
     """Whether one run is lowered unasked."""
-    return nodes <= LONGEST_ALONE
+    return nodes <= LONGEST_ONE_RUN
 
 
 def lowers_derivatives(executor: str, nodes: int, tangents: int) -> bool:

@@ -37,7 +37,7 @@ class SimulationWarning(UserWarning):
 
 
 _run_one = jax.jit(execute.run_one, static_argnames=("run", "backend"))
-_run_plain = jax.jit(execute.run_plain, static_argnames="run")
+_run_transformable = jax.jit(execute.run_transformable, static_argnames="run")
 
 
 def simulate(
@@ -102,7 +102,7 @@ def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record
     if checks.is_concrete((scenario, folds)):
         outcome = _run_one(scenario, folds, dt, run, backend=backend)
     else:
-        outcome = _run_plain(scenario, folds, dt, run)
+        outcome = _run_transformable(scenario, folds, dt, run)
     arrays, controller_state, observer_state = outcome.records
     return Rollout(
         scenario=scenario,

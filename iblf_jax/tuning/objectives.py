@@ -207,7 +207,7 @@ def is_smoothed(objective: Objective) -> bool:
     return any(getattr(quantity, "smoothing", None) is not None for quantity in _composed(objective).quantities)
 
 
-def _plain(name: str, quantity: Quantity, scale: Any) -> Objective:
+def _one_term(name: str, quantity: Quantity, scale: Any) -> Objective:
     return Objective((Term(quantity, scale=scale, name=name),))
 
 
@@ -229,17 +229,17 @@ def tracking(*, joints: Any = 1.0, after: Any = 0.0, scale: Any = None) -> Objec
 
     Source: the ISE criterion, textbook.
     """
-    return _plain("tracking", TimeIntegral("error", joints, after), scale)
+    return _one_term("tracking", TimeIntegral("error", joints, after), scale)
 
 
 def effort(*, joints: Any = 1.0, scale: Any = None) -> Objective:
     """Integral of the squared torque, int |tau|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2 s."""
-    return _plain("effort", TimeIntegral("torque", joints), scale)
+    return _one_term("effort", TimeIntegral("torque", joints), scale)
 
 
 def torque_rate(*, joints: Any = 1.0, scale: Any = None) -> Objective:
     """Integral of the squared rate of the torque, int |tau'|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2/s."""
-    return _plain("torque_rate", TimeIntegral("torque_rate", joints), scale)
+    return _one_term("torque_rate", TimeIntegral("torque_rate", joints), scale)
 
 
 def settle(tolerance: Any = 0.01, *, joints: Any = 1.0, scale: Any = 1.0) -> Objective:
@@ -252,7 +252,7 @@ def settle(tolerance: Any = 0.01, *, joints: Any = 1.0, scale: Any = 1.0) -> Obj
       joints: weight of each joint, one number or (n,).
       scale: in s.
     """
-    return _plain("settle", TimeIntegral("outside", joints, tolerance=tolerance), scale)
+    return _one_term("settle", TimeIntegral("outside", joints, tolerance=tolerance), scale)
 
 
 def peak_torque(limit: Any = None, *, sharpness: Any = 20.0, smoothing: Any = 0.01, joints: Any = 1.0) -> Objective:
@@ -304,7 +304,7 @@ def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Ob
 
     Source: design of this package.
     """
-    return _plain(checks.word("name", name, "the name of one of the fold's results"), MetricResult(fold, name, joints), scale)
+    return _one_term(checks.word("name", name, "the name of one of the fold's results"), MetricResult(fold, name, joints), scale)
 
 
 def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:
