@@ -19,14 +19,17 @@ are added up in `ProofTerms.terms`.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax.certificates.claims import law_of
 from iblf_jax.controllers import Backstepping
+from iblf_jax.engine.execute import run_from
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
@@ -109,38 +112,37 @@ def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
       t: time, () [s].
       state: state of the loop at t.
     """
-    return observed(scenario, t, state)[0]
+    terms, M0, _ = _seen(scenario, t, state)
+    eigenvalues = jnp.linalg.eigvalsh(M0)
+    return ProofTerms(**terms, lambda_min=eigenvalues[0], lambda_max=eigenvalues[-1])
 
 
-def observed(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[ProofTerms, Sample]:
-    """The proof at one state, as `terms_at`, and the sample that a run records there."""
+def _seen(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str, jax.Array], jax.Array, Sample]:
+    """The proof at one state but for the eigenvalues of M0, M0 itself, and the sample that a run records there."""
     along = rate(scenario, t, state)
     now, ahead, sample = jax.jvp(partial(_probe, scenario), (t, state), (jnp.ones_like(t), along), has_aux=True)
     M0 = scenario.model.mass_matrix(state.q)
     dM0 = mass_matrix_rate(scenario.model, state.q, state.dq)
     f_tilde = now["disturbance"] - now["disturbance_estimate"]
-    eigenvalues = jnp.linalg.eigvalsh(M0)
     dropped_e2, dropped_f = _dropped(scenario, dM0, state.dq, now["e2"], f_tilde)
     terms, df_terms, V_terms = _sizes(scenario, t, state, M0, now, ahead, f_tilde)
-    proof = ProofTerms(
-        V=now["V"],
-        dV=ahead["V"],
-        f=now["disturbance"],
-        df=ahead["disturbance"],
-        f_tilde=f_tilde,
-        e2=now["e2"],
-        xi=now["xi"],
-        lambda_min=eigenvalues[0],
-        lambda_max=eigenvalues[-1],
-        dropped_e2=dropped_e2,
-        dropped_f=dropped_f,
-        steady=_alike(at_time(scenario.plant, t), scenario.model) & jnp.all(ahead["pushed"] == 0.0),
-        held=jnp.any(sample.guard_active | sample.saturated) | _limited(scenario, t, state, now),
-        terms=terms,
-        df_terms=df_terms,
-        V_terms=V_terms,
-    )
-    return proof, sample
+    proof = {
+        "V": now["V"],
+        "dV": ahead["V"],
+        "f": now["disturbance"],
+        "df": ahead["disturbance"],
+        "f_tilde": f_tilde,
+        "e2": now["e2"],
+        "xi": now["xi"],
+        "dropped_e2": dropped_e2,
+        "dropped_f": dropped_f,
+        "steady": _alike(at_time(scenario.plant, t), scenario.model) & jnp.all(ahead["pushed"] == 0.0),
+        "held": jnp.any(sample.guard_active | sample.saturated) | _limited(scenario, t, state, now),
+        "terms": terms,
+        "df_terms": df_terms,
+        "V_terms": V_terms,
+    }
+    return proof, M0, sample
 
 
 def _limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
@@ -186,27 +188,58 @@ def _sizes(scenario: Scenario, t: jax.Array, state: LoopState, M0, now, ahead, f
     return terms, torque_rate, jnp.sqrt(reach)
 
 
-def defect(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array, method: str) -> jax.Array:
-    """The integrator's error in V2 over one step, (): one step against two half steps, times two for safety.
+class Place(NamedTuple):
+    """A state of a run, and where it is in time: after so many steps of a size."""
 
-    With it the envelopes can be held against a run in which V2 has fallen below what the integrator resolves.
+    steps: jax.Array
+    """(), a float."""
+    size: jax.Array
+    """() [s]."""
+    state: LoopState
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """A step of the engine that stays where it is and records what is seen there."""
+
+    is_derivative: ClassVar[bool] = True
+
+    def __call__(self, inputs, place: Place, index: jax.Array, form):
+        """The place, and what `_seen` gives."""
+        return place, _seen(inputs.scenario, place.steps * place.size, place.state)
+
+
+@dataclasses.dataclass(frozen=True)
+class Onward:
+    """A step of the engine that makes the run's own step, of any size, and records the state and V2 before it."""
+
+    method: str
+
+    def __call__(self, inputs, place: Place, index: jax.Array, form):
+        """The place after the step; the state and V2 before it."""
+        t = (place.steps + index.astype(place.steps.dtype)) * place.size
+        made = step(self.method, partial(evaluate, inputs.scenario), t, place.state, place.size, rolled=form.rolled)
+        return place._replace(state=made.state), (place.state, made.first.V)
+
+
+def along_run(scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.Array, *, method: str):
+    """What a run is at some of its states.
+
+    Args:
+      scenario: canonical.
+      index: numbers of the steps, (T,).
+      states: the states before them, (T, ...).
+      dt, method: of the run.
+
+    Returns:
+      The proof, the sample, and the integrator's error in V2 over one step, on the host; (T, ...) each.
     """
-
-    def stepped(t, state, size):
-        return step(method, partial(evaluate, scenario), t, state, size, rolled=True).state
-
-    first = jax.vmap(partial(stepped, t, state))(jnp.stack([dt, 0.5 * dt]))
-    whole, half = (jax.tree.map(lambda x, i=i: x[i], first) for i in (0, 1))
-    ends = jax.tree.map(lambda *x: jnp.stack(x), whole, stepped(t + 0.5 * dt, half, 0.5 * dt))
-    V = jax.vmap(lambda state: evaluate(scenario, t + dt, state)[1].V)(ends)
-    return 2.0 * jnp.abs(V[0] - V[1])
-
-
-@partial(jax.jit, static_argnames="method")
-def along_run(scenario: Scenario, times: jax.Array, states: LoopState, dt: jax.Array, *, method: str):
-    """The proof, the sample and the integrator's error in V2 over one step, at every state; time axis first."""
-
-    def one(t, state):
-        return *observed(scenario, t, state), defect(scenario, t, state, dt, method)
-
-    return jax.vmap(one)(times, states)
+    count = jnp.asarray(index, dt.dtype)
+    places = [Place(part * count, jnp.full_like(count, 1.0 / part) * dt, states) for part in (1, 2)]
+    found = run_from(scenario, dt, places[0], step=Look())[1]
+    # One step against two half steps: the envelopes are held against a run in which V2 has fallen below what the integrator resolves.
+    whole, halves = (run_from(scenario, dt, place, step=Onward(method), steps=k + 2)[1][1] for k, place in enumerate(places))
+    proof, M0, sample = jax.tree.map(lambda x: np.asarray(x[:, 0]), found)
+    eigenvalues = np.linalg.eigvalsh(M0)
+    defect = 2.0 * np.abs(np.asarray(whole)[:, 1] - np.asarray(halves)[:, 2])  # times two for safety
+    return ProofTerms(**proof | {"lambda_min": eigenvalues[:, 0], "lambda_max": eigenvalues[:, -1]}), sample, defect

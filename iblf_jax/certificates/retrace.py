@@ -10,20 +10,18 @@ A run that is not to be believed is not made again: its recorded samples are loo
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.proof_terms import along_run
+from iblf_jax.certificates.proof_terms import Onward, Place, along_run
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
+from iblf_jax.engine.execute import run_from
 from iblf_jax.engine.plan import CERTIFY_STRETCH
-from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
-from iblf_jax.simulation.integrators import step
-from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.closed_loop import LoopState, initial_state
 
 DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
@@ -113,7 +111,8 @@ def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopSt
         states = jax.tree.map(lambda x, rows=rows: x[rows], recorded)
         for offset in range(0, every, length):
             first = rows * every + offset
-            path, states = _onward(run.scenario, jnp.asarray(first, jnp.int32), states, run.dt, length=length, method=run.method)
+            place = Place(jnp.asarray(first, run.dt.dtype), jnp.full(first.shape, run.dt), states)
+            (_, _, states), (path, _) = run_from(run.scenario, run.dt, place, step=Onward(run.method), steps=length)
             index = first[:, None] + np.arange(length)
             keep = (np.arange(at, at + together) < count)[:, None] & (np.arange(offset, offset + length) < every) & (index <= last)
             if not keep.any():
@@ -128,28 +127,13 @@ def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopSt
         _check_arrival(run, jax.tree.map(lambda x, rows=rows, come=come: x[rows[come] + 1], recorded), arrived, rows[come] + 1)
 
 
-@partial(jax.jit, static_argnames=("length", "method"))
-def _onward(scenario: Scenario, first: jax.Array, states: LoopState, dt: jax.Array, *, length: int, method: str):
-    """The states before each of `length` steps, (R, length, ...), and after the last, from R states at the steps `first`, (R,)."""
-
-    def one(state, index):
-        t = index.astype(dt.dtype) * dt
-        return step(method, partial(evaluate, scenario), t, state, dt, rolled=True).state, state
-
-    def row(first, state):
-        last, before = jax.lax.scan(one, state, first + jnp.arange(length, dtype=first.dtype))
-        return before, last
-
-    return jax.vmap(row)(first, states)
-
-
 def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> Stretch:
     """What there is at some steps, by a program of one size."""
     size, places = index.size, np.minimum(np.arange(CERTIFY_STRETCH), index.size - 1)
     t = index.astype(run.t.dtype) * run.dt
-    padded = jax.tree.map(lambda x: x[places], (t, states))
-    found = along_run(run.scenario, *padded, run.dt, method=run.method)
-    proof, sample, defect = jax.tree.map(lambda x: np.asarray(x)[:size], found)
+    padded = jax.tree.map(lambda x: jnp.asarray(x)[places], states)
+    found = along_run(run.scenario, index[places], padded, run.dt, method=run.method)
+    proof, sample, defect = jax.tree.map(lambda x: x[:size], found)
     return Stretch(t, sample, proof, defect, index % every == 0)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
-from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
+from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all, split
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
@@ -96,11 +96,15 @@ def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], nested: bool
     return Batch.of(inputs, varied, plan.lowered_shape(jax.default_backend(), len(next(iter(varied.values()))), nested))
 
 
+def _operations(inputs: Inputs) -> int:
+    """Of one evaluation of the closed loop."""
+    zero = jnp.zeros_like(inputs.dt)
+    return length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
+
+
 def _shape(inputs: Inputs, runs: int | None, nested: bool) -> plan.Shape:
     """How the scan executor runs them."""
-    platform, zero = jax.default_backend(), jnp.zeros_like(inputs.dt)
-    operations = length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
-    return plan.scan_shape(platform, operations, runs, nested)
+    return plan.scan_shape(jax.default_backend(), _operations(inputs), runs, nested)
 
 
 def _scanned(inputs: Inputs, varied: Mapping[str, jax.Array] | None, nested: bool, run: Callable) -> Any:
@@ -191,6 +195,31 @@ def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> 
     """As `run_transformable`, for reverse mode: few states are in memory at a time; `run` records nothing."""
     inputs = _inputs(scenario, folds, dt, run)
     return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
+
+
+@partial(jax.jit, static_argnames=("step", "steps"))
+def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps: int = 1) -> tuple[Any, Any]:
+    """A step of a kind of its own, made `steps` times from each of many states.
+
+    Args:
+      scenario: what all share, canonical.
+      dt: time step, () [s].
+      carry: the states, as the step takes them, (R, ...).
+      step: a function (inputs, carry, index, form) -> (carry, records) of one run, hashable.
+      steps: how many.
+
+    Returns:
+      The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
+    """
+    inputs = _inputs(scenario, (), dt, Run(steps))
+    batch = Batch(split(inputs, {}), jax.tree.leaves(carry)[0].shape[0], plan.STATES)
+    name = automatic()[0]
+    if name != "xla" and _operations(inputs) <= plan.LONG_EVALUATION:
+        try:
+            return _executor(name)(step, batch, carry, steps, 1)
+        except (UnsupportedError, ToolchainError):
+            pass
+    return scan(step, batch, carry, steps, 1)
 
 
 def run_batch_jvp(

@@ -87,6 +87,10 @@ class Shape(NamedTuple):
     take 2.3 times as long, and XLA's own loop over one run three times."""
 
 
+STATES = Shape("together", "none", True)
+"""How one step is made from each of many states: it is made few times, so what counts is how long it compiles."""
+
+
 def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -> Shape:
     """How the scan executor runs a batch.
 
