@@ -2,6 +2,7 @@
 
     from_jaxpr, rules, structure    a jaxpr taken apart into numbers
     program, identities, passes     what comes of it, simplified
+    operations                      what a program may hold, one row each
     packed                          the arrays that go in and out
     emit_c, c/                      its text in C, for CPUs and GPUs
     toolchain, nvrtc                compilers, and what they have built before
