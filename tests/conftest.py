@@ -26,6 +26,8 @@ sys.path.insert(0, str(ROOT / "tests"))
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
+# An array of another type is a slip, not a promotion.  (Ranks are promoted: the package broadcasts leading axes throughout.)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 hypothesis.settings.register_profile("default", deadline=None, max_examples=100, derandomize=bool(os.environ.get("CI")))
 hypothesis.settings.load_profile("default")

@@ -113,7 +113,8 @@ class LBFGS:
             return value, gradient @ tangents[0]
 
         value, gradient = optax.value_and_grad_from_state(loss)(w, state=inner)
-        move, inner = self.optimiser.update(gradient, inner, w, value=value, grad=gradient, value_fn=loss)
+        with jax.numpy_dtype_promotion("standard"):  # optax counts in integers of several types
+            move, inner = self.optimiser.update(gradient, inner, w, value=value, grad=gradient, value_fn=loss)
         return optax.apply_updates(w, move), inner
 
     def step(self, evaluate: Any, state):
