@@ -16,6 +16,7 @@ from members import TWO_LINK
 import iblf_jax as ij
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
+from iblf_jax.simulation import paths
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical
 
@@ -258,7 +259,7 @@ def test_batches_of_arms_agree_with_single_runs():
 def test_rows_have_names():
     arm = ij.robots.load(ARMS / "ur5.urdf")
     scenario = scenario_with(two_link_in_space(links=("upper arm", "fore/arm"), joints=("shoulder", "elbow")))
-    assert float(ij.paths.get(scenario, "plant.link[fore/arm].mass")) == float(scenario.plant.mass[1])
+    assert float(paths.get(scenario, "plant.link[fore/arm].mass")) == float(scenario.plant.mass[1])
     changed = ij.with_parameters(scenario, {"plant.link[fore/arm].centre[2]": 0.3, "plant.joint[elbow].damping": 0.7})
     assert float(changed.plant.centre[1, 2]) == 0.3
     assert float(changed.plant.damping[1]) == 0.7
@@ -268,9 +269,9 @@ def test_rows_have_names():
     assert listed["plant.link[fore/arm].mass"].unit == "kg"
     assert listed["plant.joint[shoulder].axis"].shape == (3,)
     assert not any("[elbow]" in p.path for p in ij.parameters(scenario, named=False))
-    assert ij.paths.sign_at(scenario, "plant.link[1].mass") == "nonnegative"
-    assert ij.paths.unit_at(scenario, "plant.joint[elbow].damping") == "N m s/rad"
-    assert ij.paths.sign_at(scenario, "plant.joint[elbow].effort") == "positive"
+    assert paths.sign_at(scenario, "plant.link[1].mass") == "nonnegative"
+    assert paths.unit_at(scenario, "plant.joint[elbow].damping") == "N m s/rad"
+    assert paths.sign_at(scenario, "plant.joint[elbow].effort") == "positive"
     assert ij.parameters(dataclasses.replace(scenario, plant=two_link_in_space())), arm
 
 
@@ -287,12 +288,12 @@ def test_rows_have_names():
 )
 def test_unknown_rows_are_refused(path):
     with pytest.raises(ValueError, match="expected the path of a leaf"):
-        ij.paths.get(scenario_with(two_link_in_space()), path)
+        paths.get(scenario_with(two_link_in_space()), path)
 
 
 def test_a_name_that_is_nearly_right_is_suggested():
     with pytest.raises(ValueError, match=r"plant\.link\[link1\]\.mass"):
-        ij.paths.get(scenario_with(two_link_in_space()), "plant.link[link7].mass")
+        paths.get(scenario_with(two_link_in_space()), "plant.link[link7].mass")
 
 
 def test_two_names_for_one_number_overlap():

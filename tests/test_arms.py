@@ -12,6 +12,7 @@ from conftest import ROOT
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, references
+from iblf_jax.core.status import describe
 from iblf_jax.files.scenario import from_dict, scenario_to_dict
 from iblf_jax.presets import arms
 
@@ -68,7 +69,7 @@ def test_unknown_arm():
 
 @pytest.mark.slow
 def test_the_run_does_its_job(scenario, run):
-    assert run.ok, ij.status.describe(int(run.status))
+    assert run.ok, describe(int(run.status))
     assert np.all(np.asarray(run.metrics.margin) > 0.1)
     assert np.all(np.abs(run.e1[-1]) < 0.08)
     assert float(run.metrics.rmse.max()) < 0.12

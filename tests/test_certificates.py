@@ -356,9 +356,9 @@ def test_run_that_its_scenario_does_not_reproduce_is_refused(shaken):
 class Growing:
     """A pendulum with friction, whose mass grows from a time on."""
 
-    mass: ij.Leaf = ij.leaf("kg")
-    damping: ij.Leaf = ij.leaf("N m s/rad", shape="scalar", default=0.0)
-    growth: ij.Leaf = ij.leaf("kg/s", shape="scalar", default=0.0)
+    mass: jax.Array = ij.leaf("kg")
+    damping: jax.Array = ij.leaf("N m s/rad", shape="scalar", default=0.0)
+    growth: jax.Array = ij.leaf("kg/s", shape="scalar", default=0.0)
     n = 1
 
     def at(self, t):

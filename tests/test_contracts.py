@@ -1,21 +1,46 @@
-"""Every member of every family fits its contract; and the checkers notice members that do not (test_testing.py)."""
+"""Every member of every family fits its contract; and the checkers notice members that do not (test_testing.py).
+
+The default run checks one instance of every class, the first that `members.py` lists; CI checks all of them.
+"""
 
 from __future__ import annotations
 
+import jax
+import numpy as np
 import pytest
-from members import FAMILIES
+from members import FAMILIES, ROBOTS
 
-CASES = [
-    pytest.param(check, member, id=f"{family}-{name}")
-    for family, (members, _, check) in FAMILIES.items()
-    for name, member in members.items()
-]
+from iblf_jax.testing import robots
+from iblf_jax.testing._contract import Findings
+
+LONG = {"arm"}
+"""Takes a minute to compile: the default run holds it to a part of its contract, in a test of its own."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("check", "member"), CASES)
+def cases():
+    for family, (members, _, check) in FAMILIES.items():
+        seen = set()
+        for name, member in members.items():
+            again = type(member) in seen
+            seen.add(type(member))
+            marks = [pytest.mark.slow] if again or name in LONG else []
+            yield pytest.param(check, member, id=f"{family}-{name}", marks=marks)
+
+
+@pytest.mark.parametrize(("check", "member"), list(cases()))
 def test_member_fits_its_contract(check, member):
     check(member)
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_a_long_robot_has_the_shapes_and_the_physics_of_its_contract(name, rng):
+    robot, findings = ROBOTS[name], Findings(ROBOTS[name], "Robot")
+    q, v, u = rng.uniform(-2, 2, (3, robot.n))
+    robots._shapes(findings, robot, q)
+    findings.stop_if_any()
+    numbers = jax.jit(robots._identities)(robot, q, v, u)
+    robots._physics(findings, {name: np.asarray(x)[None] for name, x in numbers.items()})
+    findings.stop_if_any()
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -69,7 +69,7 @@ def test_the_momentum_observer_finds_a_constant_torque():
             return step("rk4", lambda t, x: (slope(t, x), None), t, x, 1e-3).state, f - observer.estimate(t, x[0], x[1], model, x[2])
 
         q, dq = jnp.asarray([0.3, 0.2]), jnp.asarray([1.0, -0.5])
-        return jax.lax.scan(one, (q, dq, observer.init(q, dq, model)), jnp.arange(400))[1]
+        return jax.lax.scan(one, (q, dq, observer.init(q, dq, model)), jnp.arange(400.0))[1]
 
     f_tilde = np.asarray(run())
     times = 1e-3 * np.arange(400)

@@ -104,7 +104,7 @@ def test_energy_of_a_falling_arm_is_kept_and_friction_takes_it(rng):
             return integrators.step("rk4", lambda t, x: (slope(t, x), None), i * 1e-3, x, 1e-3).state, None
 
         x0 = (jnp.asarray([0.3, -0.4]), jnp.asarray([0.5, 1.0]), jnp.zeros(()))
-        x1, _ = jax.lax.scan(one, x0, jnp.arange(1000))
+        x1, _ = jax.lax.scan(one, x0, jnp.arange(1000.0))
         energy = [0.5 * v @ robot.mass_matrix(q) @ v + robot.potential(q) for q, v, _ in (x0, x1)]
         return energy[1] - energy[0], x1[2]
 

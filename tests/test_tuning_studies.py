@@ -49,7 +49,7 @@ def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
 def run_again(attack):
     """The replay of an attack, which must not raise."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ij.rollout.SimulationWarning)
+        warnings.simplefilter("ignore", ij.SimulationWarning)
         return attack.replay()
 
 

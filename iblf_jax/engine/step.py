@@ -241,7 +241,7 @@ class Probe:
         start = initial_state(inputs.scenario)
         watched, whole, x = accuracy.places(start), ravel_pytree(start)[1], carry.state
         iteration = index - watched.size
-        rank = np.full(x.size, -1, np.int32)
+        rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
         unit = (jnp.asarray(rank) == index).astype(x.dtype)
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
@@ -251,7 +251,7 @@ class Probe:
 
         w = stability.along(rate_at, x, direction)
         growth = keep_if(iteration < 0, carry.growth, stability.grown(carry.growth, w, iteration))
-        column = jnp.arange(watched.size) == index
+        column = jnp.arange(watched.size, dtype=index.dtype) == index
         jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
         return Probed(carry.time, x, growth, jacobian), ()
 

@@ -64,7 +64,7 @@ OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "mar
 REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "violation_probability_below")
 TABLES = ("tune", "objective", "requirement", "perturbations")
 HISTORY = dict.fromkeys(("loss", "objective", "terms", "excess", "margin", "gradient_norm", "z", "x"), "f") | {
-    "sound": "b",
+    "valid": "b",
     "evaluations": "iu",
 }
 """What a result's history holds, and the kinds of its numbers."""

@@ -106,7 +106,7 @@ def _spans_decades(x: np.ndarray) -> bool:
 
 def _accepted(result: TuneResult) -> np.ndarray:
     """The steps of the winning start at which its loss fell below all before."""
-    loss = np.where(result.history["sound"], result.history["loss"], np.inf)[:, result.best_start]
+    loss = np.where(result.history["valid"], result.history["loss"], np.inf)[:, result.best_start]
     before = np.minimum.accumulate(np.concatenate([[np.inf], loss[:-1]]))
     found = np.flatnonzero(loss < before)
     return found if len(found) else np.arange(1)
@@ -114,7 +114,7 @@ def _accepted(result: TuneResult) -> np.ndarray:
 
 def _progress(axes: Axes, result: TuneResult) -> None:
     history = result.history
-    trials = np.where(history["sound"], history["objective"], np.nan)
+    trials = np.where(history["valid"], history["objective"], np.nan)
     steps = np.arange(1, len(trials) + 1)
     axes.plot(steps, trials, linestyle="none", marker=".", markersize=3, color=_style.bound())
     best = history["objective"][_accepted(result), result.best_start]

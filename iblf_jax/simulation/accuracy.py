@@ -164,7 +164,7 @@ def between_stages(scenario: Scenario, accuracy: Accuracy, method: str, dt: jax.
 
     # Steps in the places of the golden section, so that they share no period with a signal.
     spread = jnp.asarray(np.arange(INSTANTS) * 0.6180339887498949 % 1.0, dt.dtype)
-    indices = jnp.floor(spread * steps).astype(jnp.int32)
+    indices = jnp.floor(spread * jnp.asarray(steps, spread.dtype)).astype(jnp.int32)
     missed, push, width = jax.vmap(at)(indices)
     M = at_time(scenario.plant, jnp.zeros_like(dt)).mass_matrix(scenario.initial.q)
     pushed = jnp.abs(matvec(accuracy.response[:, :n], solve_spd(M, jnp.max(push, axis=0))))

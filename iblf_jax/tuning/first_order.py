@@ -57,7 +57,8 @@ class Adam:
         found = evaluate(z)
         gradient = pull(found.gradient)
         valid = np.isfinite(found.value.loss) & np.all(np.isfinite(gradient), axis=1)
-        move, inner = self.update(jnp.asarray(np.where(valid[:, None], gradient, 0.0)), state["inner"])
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
+            move, inner = self.update(jnp.asarray(np.where(valid[:, None], gradient, 0.0)), state["inner"])
         keep = jax.tree.map(lambda new, old: np.where(valid.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old), inner, state["inner"])
         state["inner"] = jax.tree.map(np.asarray, keep)
         state["slower"] = np.where(valid, state["slower"], 0.5 * state["slower"])
@@ -113,7 +114,8 @@ class LBFGS:
             return value, gradient @ tangents[0]
 
         value, gradient = optax.value_and_grad_from_state(loss)(w, state=inner)
-        move, inner = self.optimiser.update(gradient, inner, w, value=value, grad=gradient, value_fn=loss)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
+            move, inner = self.optimiser.update(gradient, inner, w, value=value, grad=gradient, value_fn=loss)
         return optax.apply_updates(w, move), inner
 
     def step(self, evaluate: Any, state):

@@ -1,0 +1,130 @@
+"""What a step of a run costs, and what a first call compiles, in counts: they are exact, where seconds would flicker.
+
+`tests/data/costs.json` holds them.  After a change that is meant to move them,
+
+    python tests/test_costs.py
+
+writes the file anew; the difference is what the change costs or gains.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+
+import jax
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, observers, references
+from iblf_jax.engine import native
+
+FILE = Path(__file__).parent / "data" / "costs.json"
+
+# --- a step ----------------------------------------------------------------------------------------------------------------------------
+
+
+def planar_chain(n: int) -> ij.Scenario:
+    """n equal links, each joint with the paper's kind of path and gains."""
+    return ij.Scenario(
+        plant=ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=0.02),
+        reference=references.Sinusoid(offset=[0.5] * n, amplitude=0.14, frequency=1.0),
+        bounds=bounds.Bounds(lower=bounds.Constant(0.1), upper=bounds.Constant(0.9)),
+        controller=controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, barrier=barriers.Integral()),
+        observer=observers.Momentum(kf=20.0),
+        initial=ij.Initial(q=[0.6] * n, dq=0.0),
+    )
+
+
+SCENARIOS = {f"zhang_yan_2024, {law}": lambda law=law: ij.presets.zhang_yan_2024(law=law) for law in ij.presets.LAWS}
+SCENARIOS |= {name: preset for name, preset in ij.presets.PRESETS.items() if name != "zhang_yan_2024"}
+SCENARIOS["planar chain of 3"] = lambda: planar_chain(3)
+LONG = ("ur5", "iiwa14")
+"""Six and seven joints: a count takes seconds."""
+
+
+def step_counts(name: str) -> dict[str, dict[str, int]]:
+    """How often -> operation -> how many in a step of Runge-Kutta with the standard metrics, where runs differ in start and a mass."""
+    counts = ij.explain(SCENARIOS[name](), varied=["plant.mass[1]"]).counts
+    return {often: dict(sorted(counter.items())) for often, counter in counts.items()}
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in SCENARIOS])
+def test_operations_of_a_step(name):
+    found, expected = step_counts(name), json.loads(FILE.read_text())["a step"][name]
+    changes = {often: Counter(found[often]) for often in found}
+    for often, counter in expected.items():
+        changes.setdefault(often, Counter()).subtract(counter)
+    moved = {often: {op: n for op, n in sorted(counter.items()) if n} for often, counter in changes.items()}
+    assert found == expected, f"{name}: {moved} more than in {FILE.name}; if that is meant, `python tests/test_costs.py` writes it anew"
+
+
+# --- a first call ----------------------------------------------------------------------------------------------------------------------
+
+CALLS = {
+    "simulate": lambda paper: ij.simulate(paper, duration=0.1, dt=1e-3),
+    "certify": lambda paper: ij.certify(paper, duration=0.1, dt=1e-3),
+    "monte_carlo": lambda paper: ij.monte_carlo(paper, UNKNOWN, runs=32, duration=0.1, dt=1e-3, progress=False),
+    "tune": lambda paper: ij.tune(paper, ["controller.K2"], ij.objectives.tracking(), duration=0.1, dt=1e-3, iterations=2, progress=False),
+}
+UNKNOWN = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
+OPERATION = re.compile(r"^\s*(?:%\S+ = )?\"?(?:stablehlo|chlo|func\.call|call)\b", re.MULTILINE)
+SLACK = 1.02
+"""A bound is what was counted and a little more: a release of JAX may write a function of its own otherwise."""
+
+
+def count_of(call: str) -> dict[str, int]:
+    """What a first call makes, in this process, which must be a fresh one."""
+    traced, sources = [], []
+    mass_matrix, built = ij.robots.TwoLink.mass_matrix, native.built
+
+    def counted_matrix(self, q):
+        traced.append(q.shape)
+        return mass_matrix(self, q)
+
+    def counted_source(source, *args, **kwargs):
+        sources.append(source)
+        return built(source, *args, **kwargs)
+
+    paper = ij.presets.zhang_yan_2024()
+    with tempfile.TemporaryDirectory() as folder:
+        jax.config.update("jax_dump_ir_to", folder)
+        ij.robots.TwoLink.mass_matrix, native.built = counted_matrix, counted_source
+        CALLS[call](paper)
+        programs = [path.read_text() for path in Path(folder).glob("*.mlir")]
+    return {
+        "mass matrices traced": len(traced),
+        "programs for XLA": len(programs),
+        "operations in them": sum(len(OPERATION.findall(text)) for text in programs),
+        "characters of C": sum(map(len, sources)),
+    }
+
+
+def in_a_fresh_process(call: str) -> dict[str, int]:
+    """`count_of`, in a process that has nothing compiled and nothing traced."""
+    done = subprocess.run([sys.executable, __file__, call], check=True, capture_output=True, text=True, timeout=280)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("call", [x if x == "simulate" else pytest.param(x, marks=pytest.mark.slow) for x in CALLS])
+def test_what_a_first_call_compiles(call):
+    found, most = in_a_fresh_process(call), json.loads(FILE.read_text())["a first call"][call]
+    over = {what: (n, most[what]) for what, n in found.items() if n > SLACK * most[what]}
+    assert not over, f"{call}: {over} (counted, counted in {FILE.name})"
+    assert min(found["mass matrices traced"], found["operations in them"]) > 0, "nothing was counted"
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        print(json.dumps(count_of(sys.argv[1])))
+    else:
+        table = {"a step": {x: step_counts(x) for x in SCENARIOS}, "a first call": {x: in_a_fresh_process(x) for x in CALLS}}
+        FILE.write_text(json.dumps(table, indent=1) + "\n")
