@@ -136,7 +136,7 @@ class Judge:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """J at points (S, p) or (p,)."""
         found = problem.value(self.built.shared, self.built.lanes(np.atleast_2d(points)), formulation=self.built.formulation)
-        losses = np.where(np.asarray(found.sound), np.asarray(found.objective) - self.offset, 1e6)
+        losses = np.where(np.asarray(found.valid), np.asarray(found.objective) - self.offset, 1e6)
         losses = np.where(np.isfinite(losses), losses, 1e6)
         self.seen += losses.tolist()
         self.times += [time.perf_counter() - self.began] * len(losses)
@@ -195,7 +195,7 @@ def run_ours(problem_: tuple, starts: int, backend: str, loss: Loss, cost: float
         times: list[float] = []
         began = time.perf_counter()
         history = once(seed, iterations, lambda loop: times.append(time.perf_counter() - began)).history
-        seen = np.where(history["sound"], history["objective"] - loss.offset, 1e6).min(axis=1)
+        seen = np.where(history["valid"], history["objective"] - loss.offset, 1e6).min(axis=1)
         return Search("iblf_jax tune", seed, seen, cost * history["evaluations"], np.asarray(times))
 
     once(seeds[0], 1)

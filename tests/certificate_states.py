@@ -65,5 +65,5 @@ def _position(scenario: ij.Scenario, t, xi, dq):
 
 @jax.jit
 def terms_of(batch: ij.Scenario, t, state: LoopState) -> ProofTerms:
-    """The proof at each of the states."""
+    """The terms of the proof at each of the states."""
     return jax.vmap(terms_at)(batch, t, state)

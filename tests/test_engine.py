@@ -126,10 +126,10 @@ def test_what_the_plan_says():
     assert plan.scan_shape("cpu", 10_000, 1000, False) == ("in turn", "parts", True)
     assert plan.scan_shape("cpu", 700, None, True) == ("together", "none", False)
     assert plan.scan_shape("gpu", 10_000, None, False) == ("together", "none", True)
-    assert plan.order("auto", "cpu") == plan.order("native", "cpu") == ("native", "xla")
-    assert plan.order("auto", "gpu") == ("gpu", "xla")
-    assert plan.order("auto", "tpu") == plan.order("xla", "cpu") == ("xla",)
-    assert plan.order("vmap", "cpu") == ()
+    assert plan.executors_for("auto", "cpu") == plan.executors_for("native", "cpu") == ("native", "xla")
+    assert plan.executors_for("auto", "gpu") == ("gpu", "xla")
+    assert plan.executors_for("auto", "tpu") == plan.executors_for("xla", "cpu") == ("xla",)
+    assert plan.executors_for("vmap", "cpu") == ()
 
 
 def test_the_length_of_a_function_is_that_of_its_inner_ones():

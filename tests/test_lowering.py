@@ -112,7 +112,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name):
 
 def lowered_function(f, *arrays):
     """The outputs of `f` by its scalar program, with constants for inputs."""
-    b = program.Builder(np.float64, limits=plan.LOWERED)
+    b = program.Builder(np.float64, limits=plan.LIMITS)
     jaxpr = jax.make_jaxpr(f)(*arrays)
     operands, values = [], []
     for x in arrays:

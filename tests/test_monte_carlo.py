@@ -172,6 +172,15 @@ def test_designs_fill_the_range_evenly(sampler):
 # ---------------------------------------------------------------------------------------------------------- one run again
 
 
+def test_all_of_a_study_are_leaves(study):
+    """Its setup too: it can be moved to the host, and goes through jit."""
+    host = jax.tree.map(np.asarray, study)
+    moved = jax.jit(lambda x: x)(host)
+    for other in (host, moved):
+        np.testing.assert_array_equal(other.replay(3).q, study.replay(3).q)
+    assert isinstance(hash(jax.tree.structure(study)), int)
+
+
 def test_replay_is_bit_identical_and_has_the_trajectory(study):
     for i in (0, 300, int(study.worst(1)[0])):
         run = study.replay(i)

@@ -468,7 +468,7 @@ def results(paper, no_runs, monkeypatch):
     setup = prepare(paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="xla")
     found = Metrics({"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)}, (("margin", "rad"), ("rmse", "rad")))
     study = ij.Study(paper, found, np.zeros(4, np.int32), np.ones(4), {"controller.K2": np.full((4, 2), 20.0)}, setup)
-    history = {"sound": np.ones((1, 1), bool), "x": np.full((1, 1, 2), 20.0), "objective": np.ones((1, 1)), "evaluations": np.ones(1, int)}
+    history = {"valid": np.ones((1, 1), bool), "x": np.full((1, 1, 2), 20.0), "objective": np.ones((1, 1)), "evaluations": np.ones(1, int)}
     asked = TuneSetup(GOAL, {}, as_risk("mean"), 1, 0, 0.01, 1e-3, "rk4", "auto", 4, 1, 0.95, ((1.0, 100.0), (1.0, 100.0)))
     names = ("controller.K2[0]", "controller.K2[1]")
     tuned = ij.TuneResult(paper, paper, {"controller.K2": np.full(2, 20.0)}, names, history, 0, "done", "newton", "forward", 1.0, asked)

@@ -524,7 +524,7 @@ def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, mo
 
 
 def handlers() -> list:
-    return [signal.getsignal(number) for number in interrupt.SIGNALS]
+    return [signal.getsignal(number) for number in interrupt.STOP_SIGNALS]
 
 
 @pytest.mark.parametrize("event", range(40))
@@ -552,5 +552,5 @@ def test_handlers_are_given_back_wherever_a_second_signal_comes(event, monkeypat
         assert handlers() == before
     finally:
         sys.settrace(old)
-        for number, handler in zip(interrupt.SIGNALS, before, strict=True):
+        for number, handler in zip(interrupt.STOP_SIGNALS, before, strict=True):
             signal.signal(number, handler)

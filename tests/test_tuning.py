@@ -306,7 +306,7 @@ def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
         z, found = method.step(bowl, state)
         assert found.value.valid[0]
     np.testing.assert_allclose(z[0], Bowl.bottom, atol=1e-6)
-    assert state["converged"][0] and 10 < bowl.evaluations < 400
+    assert state["done"][0] and 10 < bowl.evaluations < 400
 
 
 class Corner:

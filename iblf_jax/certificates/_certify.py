@@ -15,14 +15,13 @@ from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certifica
 from iblf_jax.certificates.retrace import believed
 from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
 from iblf_jax.core import checks
+from iblf_jax.engine.plan import CERTIFY_RECORDED
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 
 WORST = 16
-RECORDED = 20_000
-"""Samples that are recorded, at most about, of a run that is made here; all steps are looked at whatever is recorded."""
 
 
 def certify(
@@ -61,7 +60,7 @@ def certify(
     if not checks.is_concrete(scenario):
         raise checks.fail("scenario", "traced values", "numbers", "certify works on the host: call it outside jit, vmap and grad.")
     if run is None:
-        every = 1 + checks.whole_steps(duration, dt) // RECORDED
+        every = 1 + checks.whole_steps(duration, dt) // CERTIFY_RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
     worst = None if worst is None else checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
@@ -108,7 +107,7 @@ def _worst_of(study: Any, worst: int | None) -> list[int]:
 def _replayed(study: Any, index: int) -> Rollout:
     """One run of a study, with no more samples than memory should hold."""
     steps = round(study.duration / study.dt) if hasattr(study, "duration") and hasattr(study, "dt") else 0
-    return study.replay(index, record_every=1 + steps // RECORDED) if steps > RECORDED else study.replay(index)
+    return study.replay(index, record_every=1 + steps // CERTIFY_RECORDED) if steps > CERTIFY_RECORDED else study.replay(index)
 
 
 def _heading(scenario: Scenario) -> str:
@@ -133,25 +132,25 @@ def _one(run: Rollout) -> Certificate:
     return Certificate(_heading(run.scenario), lines, _numbers(whole), joined, joints=joint_names(run.scenario.plant, run.n))
 
 
-def _numbers(trajectory: Whole) -> dict[str, Any]:
+def _numbers(whole: Whole) -> dict[str, Any]:
     """The constants of the claim."""
-    rho = {f"rho_{where}_case_{case}": value for (case, where), value in trajectory.rho.items()}
+    rho = {f"rho_{where}_case_{case}": value for (case, where), value in whole.rho.items()}
     return rho | {
-        "case": trajectory.case,
-        "F_m": trajectory.F_m,
-        "F_d": trajectory.F_d,
-        "rho2": trajectory.F_d**2 / 2,
-        "V2_start": trajectory.V_ends[0],
-        "V2_end": trajectory.V_ends[1],
-        "lambda_min_run": trajectory.lambda_min,
-        "lambda_max_run": trajectory.lambda_max,
-        "lambda_min_box": trajectory.eigenvalues.lambda_min,
-        "lambda_max_box": trajectory.eigenvalues.lambda_max,
-        "lambda_searched": trajectory.eigenvalues.searched,
-        "q_of_lambda_max_box": trajectory.eigenvalues.q_max,
-        "jump_times": trajectory.jumps,
-        "samples": trajectory.samples,
-        "samples_left_out": trajectory.left_out,
+        "case": whole.case,
+        "F_m": whole.F_m,
+        "F_d": whole.F_d,
+        "rho2": whole.F_d**2 / 2,
+        "V2_start": whole.V_ends[0],
+        "V2_end": whole.V_ends[1],
+        "lambda_min_run": whole.lambda_min,
+        "lambda_max_run": whole.lambda_max,
+        "lambda_min_box": whole.over_box.lambda_min,
+        "lambda_max_box": whole.over_box.lambda_max,
+        "lambda_searched": whole.over_box.searched,
+        "q_of_lambda_max_box": whole.over_box.q_max,
+        "jump_times": whole.jumps,
+        "samples": whole.samples,
+        "samples_left_out": whole.left_out,
     }
 
 

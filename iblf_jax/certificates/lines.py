@@ -206,12 +206,10 @@ def rates(whole: Whole, case: int) -> list[Line]:
         if reason or whole.claim is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        largest = whole.lambda_max if where == "run" else whole.eigenvalues.lambda_max
+        largest = whole.lambda_max if where == "run" else whole.over_box.lambda_max
         terms = np.asarray(claims.rho_terms(whole.claim, jnp.asarray(largest), case))
         least = ("the decay rate of V1", "K2 over lambda_max(M0)", "kf")[int(np.argmin(terms))]
-        note = (
-            f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.eigenvalues.searched})" if where == "box" else "") + f"; set by {least}"
-        )
+        note = f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.over_box.searched})" if where == "box" else "") + f"; set by {least}"
         counts = not (case == 2 and whole.case == 1)
         lines.append(_line(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
     return lines

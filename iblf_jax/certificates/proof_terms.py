@@ -105,7 +105,7 @@ def _alike(one: Any, other: Any) -> jax.Array:
 
 
 def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
-    """The proof at one state; pure, for `vmap` over states, times and gains.
+    """The terms of the proof at one state; pure, for `vmap` over states, times and gains.
 
     Args:
       scenario: canonical scenario of n joints.
@@ -118,7 +118,7 @@ def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
 
 
 def _seen(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str, jax.Array], jax.Array, Sample]:
-    """The proof at one state but for the eigenvalues of M0, M0 itself, and the sample that a run records there."""
+    """The terms of the proof at one state but for the eigenvalues of M0, M0 itself, and the sample that a run records there."""
     along = rate(scenario, t, state)
     now, ahead, sample = jax.jvp(partial(_probe, scenario), (t, state), (jnp.ones_like(t), along), has_aux=True)
     M0 = scenario.model.mass_matrix(state.q)

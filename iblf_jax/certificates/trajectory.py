@@ -1,4 +1,4 @@
-"""One run as the certificate sees it: proof at every step, the constants of the claim, and the envelope of V2.
+"""One run as the certificate sees it: the terms of the proof at every step, the constants of the claim, and the envelope of V2.
 
     case 1:  V2(t) <= V2(s) exp(-rho (t - s)) for t >= s                                                                 (3.20)
     case 2:  V2(t) <= V2(s) exp(-rho (t - s)) + rho2/rho,   rho2 = F_d^2/2, F_d = sup |f'| over the run                  (3.28)
@@ -6,7 +6,7 @@
 The claim holds from any instant s on.  So where f jumps (Assumption 1 is broken there), and where the guard or a torque limit was at
 work, the envelope starts anew at the next step.
 
-A run is not the exact solution: the envelope is widened by the integrator's own error in V2 (`proof.defect`), carried along at the
+A run is not the exact solution: the envelope is widened by the integrator's own error in V2 (`proof_terms.along_run`), carried along at the
 rate of the claim, and by rounding, so that V2 may be followed down to where it is only noise.
 
 All steps are looked at, whatever the run recorded (`retrace`), twice: rho and F_d are known after the first time only.  A run of few
@@ -75,7 +75,7 @@ class Whole(NamedTuple):
     lambda_min: float
     """Smallest eigenvalue of M0 along the run [kg m^2]."""
     lambda_max: float
-    eigenvalues: Extremes
+    over_box: Extremes
     claim: claims.Claim | None
     samples: int
     """Steps that were looked at, and the last instant."""
@@ -100,7 +100,7 @@ def look(run: Any) -> tuple[Whole, Iterator[Trajectory]]:
     """What is known of one run, its arrays on the host, and its stretches one after the other."""
     seen: Iterable[Stretch] = list(stretches(run)) if grid(run)[1] <= CERTIFY_KEPT else stretches(run)
     whole = _whole(run, seen)
-    return whole, _facts(whole, seen if isinstance(seen, list) else stretches(run))
+    return whole, _with_envelopes(whole, seen if isinstance(seen, list) else stretches(run))
 
 
 class _Tally:
@@ -140,12 +140,12 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
         no_run = f"the run is not to be believed: {describe(int(run.status) & int(DISBELIEVED))}"
     no_claim = claims.why_no_claim(run.scenario)
     constants = None if no_claim else claims.claim(run.scenario)
-    eigenvalues = eigenvalues_over(run.scenario.model, tally.low, tally.high)
+    over_box = eigenvalues_over(run.scenario.model, tally.low, tally.high)
     case = 1 if tally.steady else 2
     rates = {}
     if constants is not None:
         for each in claims.CASES:
-            for where, largest in (("run", tally.lambda_max), ("box", eigenvalues.lambda_max)):
+            for where, largest in (("run", tally.lambda_max), ("box", over_box.lambda_max)):
                 rates[each, where] = float(claims.rho(constants, largest, each))
     return Whole(
         run=run,
@@ -159,7 +159,7 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
         F_d=0.0 if case == 1 else float(tally.F_d),
         lambda_min=float(tally.lambda_min),
         lambda_max=float(tally.lambda_max),
-        eigenvalues=eigenvalues,
+        over_box=over_box,
         claim=constants,
         samples=tally.samples,
         left_out=tally.left_out,
@@ -167,7 +167,7 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
     )
 
 
-def _facts(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Trajectory]:
+def _with_envelopes(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Trajectory]:
     """The second look: the stretches, with the envelopes that run through them."""
     anchors: dict[int, Anchor] = {}
     t, held = np.zeros(0), np.zeros(0, bool)

@@ -1,1 +1,1 @@
-"""What everything stands on: components as pytrees, checks of input, small linear algebra, status flags, files made in one piece."""
+"""What everything stands on: components as pytrees, checks, small linear algebra, status flags, tables of words, whole files."""

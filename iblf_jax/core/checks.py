@@ -202,7 +202,7 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
 def conforms(name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()) -> None:
     """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks for, except `optional`."""
     members = {x for x in (*vars(protocol), *getattr(protocol, "__annotations__", {})) if not x.startswith("_")}
-    public = protocol.__module__.removesuffix("._base").replace("iblf_jax.simulation.", "iblf_jax.")
+    public = protocol.__module__.removesuffix("._base").replace("iblf_jax.simulation.metrics", "iblf_jax.metrics")
     expected = f"a component that fits {public}.{protocol.__name__}"
     if isinstance(value, type):
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")

@@ -1,1 +1,1 @@
-"""How steps are run: what a step is (`step`), who decides (`plan`), who steps (`executors`), and what callers ask for (`execute`)."""
+"""How steps are run: what a step is (`step`), who decides (`plan`), who steps (`executors`), who calls (`execute`, `simulate`)."""

@@ -45,7 +45,7 @@ class Evaluator:
         self.program = program
         self.shape = shape
         self.bordered = on_cpu() and bool(shape)
-        self.polynomials = vector_math.LIBRARY if self.bordered else {}
+        self.sines = frozenset(vector_math.XLA_OWN) if self.bordered else frozenset()
         self.types = {"f": program.dtype, "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
 
     def compute(self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None) -> None:
@@ -115,7 +115,7 @@ class Evaluator:
         rounds: list[tuple[list[int], list[int]]] = [([], [])]
         for i in order:
             first = max((done.get(a, 0) for a in nodes[i].args), default=0)
-            is_sine = nodes[i].op in self.polynomials
+            is_sine = nodes[i].op in self.sines
             rounds[first][is_sine].append(i)
             done[i] = first + is_sine
             if done[i] == len(rounds):

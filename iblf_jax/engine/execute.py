@@ -31,7 +31,7 @@ from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 
-LOWERED = {"native": native, "gpu": gpu, "xla": xla}
+EXECUTORS = {"native": native, "gpu": gpu, "xla": xla}
 """What runs scalar programs."""
 
 
@@ -50,10 +50,10 @@ def _tell(text: str) -> None:
 
 def automatic() -> tuple[str, str | None]:
     """The backend that "auto" takes for what lowers, and why it is not a compiled one, in one line (None if it is)."""
-    best = plan.order("auto", jax.default_backend())[0]
+    best = plan.executors_for("auto", jax.default_backend())[0]
     if best == "xla":
         return best, f"no kernels are compiled for {jax.default_backend()}"
-    reason = LOWERED[best].unavailable()
+    reason = EXECUTORS[best].unavailable()
     return ("xla", reason) if reason else (best, None)
 
 
@@ -62,7 +62,7 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
 
     Args:
       backend: one of `plan.BACKENDS`.
-      run_on: function of a name in LOWERED.
+      run_on: function of a name in EXECUTORS.
       on_scan: function without arguments.
 
     Raises:
@@ -74,7 +74,7 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
         _tell(f"The {backend} backend is not for the default device, {platform}: running on xla.")
         backend = "xla"
     try:
-        for name in plan.order(backend, platform):
+        for name in plan.executors_for(backend, platform):
             try:
                 return run_on(name)
             except ToolchainError as error:
@@ -89,7 +89,7 @@ def _inputs(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
 
 
 def _executor(name: str) -> Executor:
-    return lowered_on(LOWERED[name].run)
+    return lowered_on(EXECUTORS[name].run)
 
 
 def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], nested: bool = False) -> Batch:
@@ -160,7 +160,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
-      backend: "native" or "gpu", which fall back with a warning; "xla"; "vmap", which is scan; or "auto", which is native for short
+      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native for short
         steps where there is a compiler.  What is long or does not lower is, on "auto" and "xla", on scan, without a warning.
     """
     inputs = _inputs(scenario, folds, dt, run)
@@ -174,7 +174,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     if backend in plan.COMPILED.values():
         return with_fallback(backend, run_on, on_scan)
-    if backend == "vmap" or jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
+    if jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
         return on_scan()
     name = "native" if backend == "auto" and not native.unavailable() else "xla"
     try:

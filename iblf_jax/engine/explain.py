@@ -23,7 +23,7 @@ from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import Scenario, canonical
 
-LIBRARY = 40
+LIBRARY_CALL = 40
 """Vector instructions that a function of the C library takes for a run, roughly."""
 NAMES = {SHARED: "once", SHARED | TIME: "a step, shared", LANE: "a run", LANE | TIME: "a step and run"}
 
@@ -99,7 +99,7 @@ def instructions(program: Program, width: int) -> float:
     total = -len(fused - {None})
     for op, n in counted.items():
         cost = OPERATIONS[op].cost
-        total += n * (LIBRARY * width if cost is None else cost)
+        total += n * (LIBRARY_CALL * width if cost is None else cost)
     return total
 
 

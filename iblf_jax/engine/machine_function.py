@@ -29,8 +29,6 @@ REFUSED = frozenset(
         "fft",
         "scatter",
         "scatter-add",
-        "while",
-        "cond",
         "custom_call",
         "ffi_call",
         "pure_callback",
@@ -47,7 +45,8 @@ REFUSED = frozenset(
         "schur",
     }
 )
-"""Operations that are not trusted inside: matrix products and decompositions become library calls, the others were not needed."""
+"""Operations that are not trusted inside: matrix products and decompositions become library calls, the others were not needed.  Loops and
+branches are judged by what is in them."""
 
 COPIES = frozenset(
     {"concatenate", "iota", "convert_element_type", "broadcast_in_dim", "reshape", "slice", "squeeze", "dynamic_update_slice"}

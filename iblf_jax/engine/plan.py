@@ -1,7 +1,8 @@
 """How a run, a batch or its derivatives are executed: the one place that decides, from sizes, the number of runs and the platform.
 
-Three things are decided: the executor (scan, xla, native, gpu), what the plain executor makes of the closed loop (`Shape`), and how
-long a piece of code a compiler gets at a time.  Every threshold stands in the table below, with the measurement behind it.
+Decided are the executor (scan, xla, native, gpu), how XLA is given a batch (`Shape`), what is lowered, how long a piece of code a compiler
+gets at a time, forward or reverse mode, and how many runs or steps go together.  Every threshold stands in the table below, with the
+measurement behind it where there is one.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ LONGEST_FUNCTION = 60_000
 # Scalar programs: numbers of operations are nodes of a step.
 LONGEST_ONE_RUN = 2500
 """Nodes up to which one run is lowered unasked: a longer one gains less by it than it takes to compile."""
-LOWERED = Limits(choices=64, table=4096, tables=50_000, scan=64)
+LIMITS = Limits(choices=64, table=4096, tables=50_000, scan=64)
 """What is lowered at all, on native, where a step of the paper's scenario takes 90 ns: a choice among 64 entries takes 9 ns, one among 256
 entries 70; twelve tables of 4096 numbers take 18 ns and 2 s to lower and build, 48 of them 100 ns and 7 s; a scan of 64 rounds with a sine
 in each takes 140 ns, and one of 256 takes 6 s to build."""
@@ -39,7 +40,8 @@ XLA_DEAR, XLA_STORED = 8, 8
 """What an operation costs on CPU where a cheap one costs 1, and the cost from which a number with several uses is stored: XLA would
 compute it again for each use."""
 XLA_BLOCK = 64
-"""Runs that go through a stretch of steps together on CPU: their numbers stay in the first-level cache."""
+"""Runs that go through a stretch of steps together on CPU: their numbers stay in the first-level cache (32 are half as fast, 128 the
+same)."""
 XLA_BLOCK_ALWAYS = 10_000
 """Nodes from which a block is always that wide: loops over fewer runs would be unrolled, and LLVM takes up to 20 GB over that."""
 XLA_LONGEST = 20_000
@@ -49,7 +51,8 @@ XLA_STRETCH = 4096
 XLA_SEGMENT = 2000
 """Nodes in one XLA computation on CPU: its passes take more than linear time."""
 NATIVE_LONG, NATIVE_SEGMENT = 20_000, 5000
-"""Nodes above which the C of a step is cut into functions, and of how many each: a third slower, but built three times as fast."""
+"""Nodes above which the C of a step is cut into functions, and of how many each: a chain of seven builds in 28 s instead of 96 s, and runs
+at two thirds of the speed."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
 GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100
@@ -66,12 +69,16 @@ STUDY_BLOCK, STUDY_BLOCK_ELSEWHERE = {"cpu": 256}, 16_384
 """Runs in a block of a study, by platform."""
 STUDY_MEMORY = 256 * 2**20
 """Bytes that runs in flight may take, unless the caller says otherwise."""
+STEP_SIZE_CHUNK = 1000
+"""Steps between two looks at the pair of runs that tells a step size."""
 STUDY_IN_FLIGHT = 4
 """Blocks that are queued on a device at once: enough to keep it busy."""
 TUNE_TOGETHER = 16
 """Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a processor's vectors hold."""
 CERTIFY_STRETCH = 1024
 """Steps that a certificate looks at together: memory does not grow with the length of a run, and one program serves every length."""
+CERTIFY_RECORDED = 20_000
+"""Steps that a certificate has recorded at most of the run that it makes; the others are made again."""
 CERTIFY_KEPT = 100_000
 """Steps up to which a certificate keeps a run in memory between its two looks at it."""
 
@@ -113,7 +120,7 @@ def lowered_shape(platform: str, runs: int, nested: bool) -> Shape:
     return Shape("together", "parts" if platform == "cpu" and runs == 1 and not nested else "none", False)
 
 
-def order(backend: str, platform: str) -> tuple[str, ...]:
+def executors_for(backend: str, platform: str) -> tuple[str, ...]:
     """The executors that lower a step, best first, for what the user asked for; after them comes scan."""
     compiled = COMPILED.get(platform)
     wanted = {"native": ("native",), "gpu": ("gpu",), "auto": (compiled,) if compiled else ()}.get(backend, ())

@@ -141,7 +141,7 @@ def _begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple)
 
 
 class Advanced(NamedTuple):
-    """A step that was made."""
+    """One step of a run, its sample folded in."""
 
     carry: Carry
     """After it."""

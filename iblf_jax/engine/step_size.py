@@ -21,6 +21,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.core import checks
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.engine.plan import STEP_SIZE_CHUNK
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import step as one_step
@@ -34,10 +35,8 @@ GOAL = accuracy.TOLERANCE / 5
 """Difference of the two runs, relative to the tube, that a recommended step may leave."""
 LOOKS = 33
 """Places along the reference at which modes are measured."""
-MOST_STEPS = 5_000_000
+MOST_TRIED = 5_000_000
 """Steps of the longest run that is tried."""
-CHUNK = 1000
-"""Steps between two looks at the pair."""
 CUTS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.236), (0.618, 0.382))
 """Start and size, in steps, of what is integrated for each step: it, and its three parts."""
 
@@ -85,7 +84,7 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
 
 @partial(jax.jit, static_argnames="method")
 def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str) -> Pair:
-    """The pair up to CHUNK steps later: one machine function, as XLA's own loops take longer to go round than a small arm to compute."""
+    """The pair up to so many steps later: one machine function, as XLA's own loops take longer to go round than a small arm to compute."""
     whole = ravel_pytree(initial_state(scenario))[1]
     n = scenario.n
 
@@ -116,7 +115,7 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
             after = Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
             return jax.tree.map(partial(jnp.where, pair.going & (pair.step < steps)), after, pair), None
 
-        return jax.lax.scan(one, pair, None, CHUNK)[0]
+        return jax.lax.scan(one, pair, None, STEP_SIZE_CHUNK)[0]
 
     return machine_function(chunk)(scenario, dt, steps, pair)
 
@@ -173,7 +172,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
     dt = for_modes = min(comfortable_dt(mode), round_down(duration))
     whole = ravel_pytree(initial_state(scenario))[1]
-    while duration / dt <= MOST_STEPS:
+    while duration / dt <= MOST_TRIED:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
         excess = max(float(pair.difference) / GOAL, float(pair.estimate.relative) / accuracy.TOLERANCE)
         if not excess > 1.0:
@@ -184,7 +183,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         else:
             dt = smaller(dt, excess if np.isfinite(excess) else np.inf, order)
     warnings.warn(
-        f"No step down to {duration / MOST_STEPS:.1g} s makes this run accurate: the loop may magnify every error, or a signal may be "
+        f"No step down to {duration / MOST_TRIED:.1g} s makes this run accurate: the loop may magnify every error, or a signal may be "
         f"faster than that. {for_modes:g} s is what the loop's modes allow.",
         stacklevel=3,
     )

@@ -69,7 +69,7 @@ def _near(op: str, x: jax.Array) -> jax.Array:
     return _quadrant(s, c, k if op == "sin" else k + 1)
 
 
-LIBRARY = {"sin": lax.sin, "cos": lax.cos}
+XLA_OWN = {"sin": lax.sin, "cos": lax.cos}
 """XLA's own, right for every argument."""
 
 
@@ -83,6 +83,6 @@ def sines(ops: Sequence[str], xs: Sequence[jax.Array]) -> Sequence[jax.Array]:
     far = reduce(lax.bitwise_or, is_far)
 
     def beyond(xs, is_far, near):
-        return [lax.select(far, LIBRARY[op](x), y) for op, x, far, y in zip(ops, xs, is_far, near, strict=True)]
+        return [lax.select(far, XLA_OWN[op](x), y) for op, x, far, y in zip(ops, xs, is_far, near, strict=True)]
 
     return lax.cond(lax.reduce_or(far, tuple(range(far.ndim))), beyond, lambda xs, is_far, near: near, list(xs), is_far, near)

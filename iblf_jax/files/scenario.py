@@ -8,7 +8,7 @@ Written out in full, a file has one table a component, and `kind` names the memb
     ...
     [reference]  [bounds.lower]  [bounds.upper]  [disturbance]  [controller]  [controller.barrier]  [observer]  [initial]
 
-or its robot is read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `robot_file`), or it starts from a preset and changes what it must:
+or its robot is read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `files.robot`), or it starts from a preset and changes some of it:
 
     preset = "zhang_yan_2024"
     [arguments]                     # what the preset takes

@@ -1,6 +1,6 @@
 """Study files: a Monte-Carlo study or a sweep as typed, validated TOML.
 
-A study file is a scenario file (`scenario_file`) with more tables:
+A study file is a scenario file (`files.scenario`) with more tables:
 
     preset = "zhang_yan_2024"                                      # or the scenario written out
     [run]                                                          # required: duration, dt, method

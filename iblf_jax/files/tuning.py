@@ -1,6 +1,7 @@
 """Tuning files: what to tune, as typed, validated TOML; and saved results, from which the report can be made again.
 
-A tuning file is a scenario file (`scenario_file`) with four more tables, of which [perturbations] is that of a study file (`study_file`):
+A tuning file is a scenario file (`files.scenario`) with four more tables, of which [perturbations] is that of a study file
+(`files.study`):
 
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method

@@ -1,7 +1,7 @@
 """Constant folding, and identities that hold for every floating-point number, NaN and infinities included.
 
 x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN, and a run that is not finite must
-be seen to be so.  (Programs of derivatives, `Builder.sparse`, are the exception: their values are those of the plain program.)
+be seen to be so.  (Programs of derivatives, `Builder.sparse`, are the exception: their values are those of a program without derivatives.)
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class Links(NamedTuple):
     carrier: dict[int, int]
     """Body -> that link, -1 for the base."""
 
-    def physical(self, joints: dict[str, Any], repairs: Repairs) -> Links:
+    def repaired(self, joints: dict[str, Any], repairs: Repairs) -> Links:
         """The links, those mended that would leave the mass matrix singular.
 
         Args:

@@ -164,7 +164,7 @@ class _Chain(NamedTuple):
         joints = tree.of_joints(self.joints)
         links = tree.welded(self.base, self.joints, self.held, repairs)
         tree.check_closed(links, self.joints, tendons, repairs)
-        links = links.physical(joints, repairs)
+        links = links.repaired(joints, repairs)
         p, R = links.frames[self.tip]
         tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
         return Arm(

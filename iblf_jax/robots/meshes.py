@@ -17,7 +17,7 @@ LARGEST_MESHES = 512 << 20
 OF_MESH = ("name", "file", "content_type", "scale", "refpos", "refquat", "inertia", "maxhullvert", "uservert", "userface")
 OF_GEOM = ("type", "meshname", "typeinertia", "fitscale")
 """What decides whether the library can weigh a geom that has its shape from a mesh."""
-MEND = "Or give the body an <inertial>."
+REMEDY = "Or give the body an <inertial>."
 
 
 class Meshes:
@@ -72,7 +72,8 @@ class Meshes:
         except ValueError as error:
             path = self.opened.pop(geom.meshname)
             got = Shown(path or "vertices in the model")
-            raise checks.fail(f"mesh {mesh.name!r}", got, "a surface around a volume", f"{' '.join(str(error).split())}. {MEND}") from None
+            reason = " ".join(str(error).split())
+            raise checks.fail(f"mesh {mesh.name!r}", got, "a surface around a volume", f"{reason}. {REMEDY}") from None
 
     def _open(self, mesh: Any) -> Path | None:
         """Reads the file of a mesh, if it has one."""
@@ -80,9 +81,9 @@ class Meshes:
             return None
         field, path = f"mesh {mesh.name!r}", self.folder / (Path(mesh.file).name if self.bare else mesh.file)
         left = LARGEST_MESHES - sum(map(len, self.files.values()))
-        data = contents(field, path, left, "the path of a mesh, STL, OBJ or MSH", MEND)
+        data = contents(field, path, left, "the path of a mesh, STL, OBJ or MSH", REMEDY)
         if len(data) > left:
-            raise checks.fail(field, str(path), f"meshes of at most {LARGEST_MESHES >> 20} MiB together", MEND)
+            raise checks.fail(field, str(path), f"meshes of at most {LARGEST_MESHES >> 20} MiB together", REMEDY)
         mesh.file = f"{len(self.files)}{path.suffix}"
         self.files[mesh.file] = data
         return path

@@ -68,7 +68,7 @@ class Weight(NamedTuple):
     nearest: np.ndarray | None = None
     """The inertia to take in its place, where there is a fault that can be mended."""
 
-    def physical(self, repairs: Repairs) -> Weight:
+    def repaired(self, repairs: Repairs) -> Weight:
         """The weight to count, its fault met."""
         if self.fault is None:
             return self

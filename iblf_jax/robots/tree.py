@@ -209,7 +209,7 @@ class Tree:
         m = self.model
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
         own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
-        mass, inertia, *_ = own.physical(repairs)
+        mass, inertia, *_ = own.repaired(repairs)
         compensated = float(m.body_gravcomp[body])
         if compensated and mass:
             where, expected = f"body {self.bodies[body]!r}: gravcomp", "0: compensation of gravity is not modelled, it is the law's to do"

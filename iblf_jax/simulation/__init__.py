@@ -1,1 +1,1 @@
-"""What one run is: the scenario and its paths, the closed loop, integrators, modes and accuracy, metrics, results."""
+"""What one run is: scenario and paths, the closed loop, its signals and vector field, integrators, accuracy, metrics, results."""

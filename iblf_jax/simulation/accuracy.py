@@ -21,6 +21,7 @@ What the stages of a step cannot see, a reference or a disturbance that goes thr
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -63,17 +64,21 @@ class Accuracy(NamedTuple):
     """The largest, relative to the width of its tube, () [1]."""
 
 
-def _watched(state: LoopState) -> list:
-    """Positions, velocities and the observer's state, leaf by leaf; what a law has learnt is left out."""
-    return [x for x in jax.tree.leaves((state.q, state.dq, state.observer)) if jnp.issubdtype(x.dtype, jnp.floating)]
+def _watched(state: LoopState, of: LoopState | None = None) -> list:
+    """The leaves of `of`, `state` if not given, that stand where `state` has positions, velocities and the observer's floating-point state.
+
+    What a law has learnt is left out.
+    """
+    parts = [jax.tree.leaves((x.q, x.dq, x.observer)) for x in (state, of or state)]
+    return [x for kind, x in zip(*parts, strict=True) if jnp.issubdtype(kind.dtype, jnp.floating)]
 
 
 def places(state: LoopState) -> np.ndarray:
     """Where the numbers that are watched, m of them, stand in the whole state, flat."""
     leaves, structure = jax.tree.flatten(state)
     ends = np.cumsum([0, *(x.size for x in leaves)])
-    numbered = [np.arange(a, b).astype(x.dtype) for x, a, b in zip(leaves, ends, ends[1:], strict=False)]
-    return np.concatenate(_watched(jax.tree.unflatten(structure, numbered))).astype(int)
+    numbered = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
+    return np.concatenate(_watched(state, jax.tree.unflatten(structure, numbered)))
 
 
 def response(jacobian: jax.Array, n: int) -> jax.Array:

@@ -52,7 +52,7 @@ def tableau(method: str) -> Tableau:
 
 
 class Stepped(NamedTuple):
-    """A step that was made."""
+    """One step of the integrator."""
 
     state: Any
     """The state one step later."""

@@ -1,7 +1,7 @@
 """The closed loop as x' = field(t, x) over one flat vector x, for solvers of other libraries: diffrax, SciPy, optimistix.
 
 The loop's own state is a pytree, and holds an empty tuple for a law without memory, which some solvers cannot carry (diffrax: "Only arrays
-can be treated as buffers").  Here its numbers stand one after the other, in the order of `closed_loop.LoopState`:
+can be treated as buffers").  Here its numbers stand one after the other, in the order of `iblf_jax.simulation.closed_loop.LoopState`:
 
     x = (q, q', state of the law, state of the observer),   (m,)
 
@@ -94,7 +94,8 @@ class VectorField:
           x: (..., m); SciPy's `solution.y` has time last, so give `solution.y.T`.
 
         Returns:
-          `closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s], controller and observer as these make them, leading axes first.
+          `iblf_jax.simulation.closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s], controller and observer as these make
+          them, leading axes first.
 
         Raises:
           ValueError: another last axis.
@@ -109,7 +110,7 @@ class VectorField:
           x: state, (m,).
 
         Returns:
-          `signals.Sample`; its vectors are (n,).
+          `iblf_jax.simulation.signals.Sample`; its vectors are (n,).
 
         Raises:
           ValueError: as the field itself.

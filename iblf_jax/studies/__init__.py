@@ -8,6 +8,5 @@
     keeping          config -> store: a sweep on disk that survives a kill
     numbers          statistics, summaries
 
-The public names are those of `iblf_jax`; distributions of parameters are in `iblf_jax.distributions`, several processes in
-`iblf_jax.distributed`.
+The public names are those of `iblf_jax`; `distributions` has those of parameters, `distributed` is for several processes.
 """

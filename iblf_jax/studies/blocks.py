@@ -30,7 +30,7 @@ from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
 
 class StudyRun(NamedTuple):
-    """What is compiled; static."""
+    """What every block of a study runs: which leaves are drawn, how many steps, by what; static."""
 
     targets: tuple[Target, ...]
     steps: int
@@ -84,7 +84,7 @@ def _draws(program: StudyRun, shared: StudyInputs, lanes: Lanes):
 
 
 def with_chosen_backend(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> StudyRun:
-    """The program with the backend that its blocks will run on in place of "auto" or one that is not available.
+    """The study's run with the backend that its blocks will run on in place of "auto" or one that is not available.
 
     Raises:
       ValueError: an unknown backend.

@@ -93,7 +93,7 @@ def bounded(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cu
       signs: whether ranges that reach beyond what a leaf may be are refused; their points are, in either case.
 
     Raises:
-      ValueError: nothing that varies, a distribution without ends, or as `draws.plan`.
+      ValueError: nothing that varies, a distribution without ends, or as `draws.targets_of`.
     """
     targets, by_path = targets_of(scenario, perturbations, signs=signs)
     if not targets:
@@ -103,4 +103,4 @@ def bounded(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cu
         if not all(np.all(np.isfinite(end)) for end in distribution.support()):
             raise checks.fail(f"perturbations[{target.source!r}]", distribution, "a bounded distribution", "Use ij.uniform(low, high).")
     by_path = jax.tree.map(lambda x: jnp.asarray(x, scenario.initial.q.dtype), by_path)
-    return Cube(Cases(scenario, by_path, jax.random.key(0)), targets, tuple(sample_size(targets, by_path).items()))
+    return Cube(Cases(scenario, by_path, jax.random.PRNGKey(0)), targets, tuple(sample_size(targets, by_path).items()))

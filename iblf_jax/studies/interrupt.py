@@ -11,7 +11,7 @@ from typing import Any
 
 from iblf_jax._start import end_process
 
-SIGNALS = {signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)), signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,))}
+STOP_SIGNALS = {signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)), signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,))}
 """Signals that ask, what they are called, and who handles them where nobody else does.  A cluster sends SIGTERM before it kills.
 
 Ctrl-C is the first, as it is what may raise in the middle of anything where nobody handles it: it is taken over first and given back last.
@@ -34,8 +34,8 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            now = {number: signal.getsignal(number) for number in SIGNALS}
-            self._before = {number: now[number] for number, (_, usual) in SIGNALS.items() if now[number] in usual}
+            now = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+            self._before = {number: now[number] for number, (_, usual) in STOP_SIGNALS.items() if now[number] in usual}
             for number in self._before:
                 signal.signal(number, self._handle)
         return self
@@ -54,4 +54,4 @@ class StopRequest:
             (before if callable(before) else signal.default_int_handler)(number, frame)
         self.asked = True
         with contextlib.suppress(Exception):  # nobody may be there to read it
-            sys.stderr.write(f"\n{SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand; again to stop at once.\n")
+            sys.stderr.write(f"\n{STOP_SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand; again to stop at once.\n")

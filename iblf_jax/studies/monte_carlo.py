@@ -68,7 +68,7 @@ def monte_carlo(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       sampler: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
-      backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
+      backend: "auto", "native", "gpu", "xla" or "vmap".
       chunk: runs in flight on the devices at a time; from `memory` if not given.  It changes no result.
       memory: bytes that runs in flight may take.
       devices: devices to use; all of this process if not given.

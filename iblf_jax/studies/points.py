@@ -104,7 +104,7 @@ def _design(scenario: Scenario, grid: Mapping[str, Any], design: str, count: int
         designed = split(
             unit_points(design, sum(int(np.prod(s, dtype=int)) for s in shapes.values()), count, 1, seed, _SALT), shapes, dtype
         )
-    values = _draw_points(Cases(scenario, by_path, jax.random.fold_in(jax.random.key(seed), _SALT)), targets, count, designed)
+    values = _draw_points(Cases(scenario, by_path, jax.random.fold_in(jax.random.PRNGKey(seed), _SALT)), targets, count, designed)
     return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
 
 

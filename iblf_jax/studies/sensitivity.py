@@ -113,7 +113,7 @@ def sensitivity(
       seed: whole number that fixes the design.
       method: "rk4", "heun" or "euler".
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
-      backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
+      backend: "auto", "native", "gpu", "xla" or "vmap".
       memory: bytes that runs in flight may take.
       devices: devices to use; all of this process if not given.
       progress: a progress bar; shown where somebody watches if not given.

@@ -91,6 +91,6 @@ def prepare(
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
     program = StudyRun(targets, steps, method, backend)
-    shared = StudyInputs(Cases(scenario, by_path, jax.random.key(seed)), folds, step)
+    shared = StudyInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), folds, step)
     setup = Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
     return dataclasses.replace(setup, program=with_chosen_backend(program, shared, setup.lanes(np.arange(block_size()))))

@@ -96,7 +96,7 @@ class Study:
 
     @property
     def backend(self) -> str:
-        """What the runs ran on: "native", "xla" or "vmap", whatever was asked for."""
+        """What the runs ran on: "native", "gpu", "xla" or "vmap", whatever was asked for."""
         return self.setup.program.backend
 
     @property

@@ -97,7 +97,7 @@ def sweep(
       replicates: number of independent designs that a designed sampler is made of.
       store: folder to write to, unit by unit, and to go on from; needs the extra `sweep`.
       unit: cases that are written together; chosen if not given.
-      backend: "auto", or one of `iblf_jax.lowering.BACKENDS`.
+      backend: "auto", "native", "gpu", "xla" or "vmap".
       chunk: cases in flight on the devices at a time; from `memory` if not given.
       memory: bytes that cases in flight may take.
       devices: devices to use; all of this process if not given.

@@ -140,7 +140,7 @@ def falsify(
     push = partial(_push, cube, jnp.asarray(dt, dtype), steps=steps, method=method, backend=backend)
     seed = check_seed(seed)
     u = cube.admissible_points(starts, [seed, 3])
-    valid, ever, best, history = u.copy(), np.zeros(starts, bool), None, []
+    last_valid, ever, best, history = u.copy(), np.zeros(starts, bool), None, []
     with bar(progress, iterations + 1, unit="steps") as shown:
         for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
             margin, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
@@ -151,12 +151,12 @@ def falsify(
                 best = (float(margin[s]), u[s].copy(), int(status[s]))
             if rate is not None:
                 stepped = np.clip(u - rate * np.sign(np.where(np.isfinite(slope), slope, 0.0)), 0.0, 1.0)
-                ahead = np.where(fine[:, None], stepped, 0.5 * (u + valid))
-                valid, ever = np.where(fine[:, None], u, valid), ever | fine
+                ahead = np.where(fine[:, None], stepped, 0.5 * (u + last_valid))
+                last_valid, ever = np.where(fine[:, None], u, last_valid), ever | fine
                 if not ever.all():  # an attack that has nowhere to go back to starts somewhere else
                     anew = cube.admissible_points(starts, [seed, 3, len(history)])
-                    valid, ahead = (np.where(ever[:, None], x, anew) for x in (valid, ahead))
-                u = np.stack([_back(cube.refused, *pair) for pair in zip(valid, ahead, strict=True)])
+                    last_valid, ahead = (np.where(ever[:, None], x, anew) for x in (last_valid, ahead))
+                u = np.stack([_back(cube.refused, *pair) for pair in zip(last_valid, ahead, strict=True)])
             shown.update(1)
             shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} rad")
     if best is None:
@@ -172,13 +172,13 @@ def falsify(
     return Attack(worst, values, best[0], first, best[2], np.stack(history), starts * (iterations + 1), timing)
 
 
-def _back(refused: Callable[[np.ndarray], str], valid: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """`ahead`, or the first of the points halfway back to `valid` that is admissible."""
+def _back(refused: Callable[[np.ndarray], str], last_valid: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """`ahead`, or the first of the points halfway back to `last_valid` that is admissible."""
     for _ in range(HALVINGS):
         if not refused(ahead):
             return ahead
-        ahead = 0.5 * (valid + ahead)
-    return valid
+        ahead = 0.5 * (last_valid + ahead)
+    return last_valid
 
 
 @partial(jax.jit, static_argnames=("steps", "method", "backend"))

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.plan import FORWARD_MOST
+from iblf_jax.engine.plan import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import check_seed
@@ -132,7 +132,7 @@ def pareto(
     tolerance, pair = checks.positive_number("tolerance", tolerance, "1", zero=True), _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, scalarisation="log", mode="forward")
-    if len(problem.box.z) > FORWARD_MOST:
+    if not differentiates_forward(len(problem.box.z)):
         raise checks.fail("parameters", f"{len(problem.box.z)} numbers", f"at most {FORWARD_MOST} for a front", "Tie or leave out some.")
     checks.fits("points", points, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = np.repeat(problem.box.z[None], points, axis=0)

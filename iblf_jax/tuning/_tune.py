@@ -85,7 +85,7 @@ def tune(
       risk: "mean", "worst", "cvar" or `cvar(level)`.
       resample: draw the runs anew at every step (adam only); the same ones for all steps otherwise.
       method: integrator.
-      backend: what values and forward mode run on, see `iblf_jax.lowering`: "auto", "native", "xla" or "vmap".  Reverse mode is plain XLA.
+      backend: what values and forward mode run on, as in `monte_carlo`.  Reverse mode is plain XLA.
       optimiser: "newton" (Gauss-Newton in a trust region), "lbfgs", "adam", or "auto": newton where forward mode is used, else lbfgs, and
         adam where runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
@@ -94,7 +94,7 @@ def tune(
       sharpenings: how many times the smoothing of the objective's peaks is divided by 4, each time once the starts have converged; 0 where
         nothing is smoothed, and with adam.
       iterations: steps of the optimiser at most.
-      tolerance: relative change of the loss below which a start has settled.
+      tolerance: relative change of the loss below which a start has converged.
       patience: stop (before the last sharpening: sharpen) after so many steps without a better result.
       learning_rate: of adam, in squashed coordinates.
       report_runs, report_seed: fresh runs for the report, and their seed (seed + 1 if not given); without perturbations it is on the one
@@ -137,7 +137,7 @@ def tune(
     # The line search of L-BFGS is a loop of JAX's around the problem.
     evaluator = CountedProblem(problem.formulation._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
-    stages = sharpenings if method_.settles and is_smoothed(problem.shared.objective) else 0
+    stages = sharpenings if method_.converges and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
     loop.rescue = partial(way_in, problem, seed)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
@@ -208,7 +208,7 @@ def build(
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
     formulation = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
-    problem = Problem(formulation, ProblemInputs(Cases(scenario, by_path, jax.random.key(seed)), ones, step), box, runs)
+    problem = Problem(formulation, ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step), box, runs)
     if not is_complete(goal):
         derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient
         start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), formulation=formulation).value.exact[0])

@@ -30,7 +30,7 @@ def squashed(box: Box, w: np.ndarray):
 class Adam:
     """Adam for S starts at once, with a cosine schedule; its state is a dict of arrays."""
 
-    settles = False
+    converges = False
 
     def __init__(self, box: Box, iterations: int, learning_rate: float = 0.1, schedule: str = "cosine"):
         self.box = box
@@ -43,7 +43,7 @@ class Adam:
         w = np.stack([unsquash(x, self.box) for x in z])
         inner = jax.tree.map(np.asarray, jax.vmap(self.optimiser.init)(jnp.asarray(w)))
         starts = len(z)
-        return {"w": w, "safe": w.copy(), "inner": inner, "slower": np.ones(starts), "converged": np.zeros(starts, bool)}
+        return {"w": w, "safe": w.copy(), "inner": inner, "slower": np.ones(starts), "done": np.zeros(starts, bool)}
 
     def restart(self, state, start: int) -> None:
         """Nothing is kept that a change of the loss would make wrong."""
@@ -71,7 +71,7 @@ class Adam:
 class LBFGS:
     """L-BFGS of optax with its zoom line search, one start after another; its state is a dict of arrays."""
 
-    settles = True
+    converges = True
 
     def __init__(self, box: Box, tolerance: float = 1e-6, memory: int = 10, line_steps: int = 12):
         self.box, self.tolerance = box, tolerance
@@ -83,16 +83,16 @@ class LBFGS:
         """The state before the first step."""
         w = np.stack([unsquash(x, self.box) for x in z])
         inner = jax.tree.map(np.array, jax.vmap(self.optimiser.init)(jnp.asarray(w)))
-        return {"w": w, "inner": inner, "loss": np.full(len(z), np.inf), "converged": np.zeros(len(z), bool)}
+        return {"w": w, "inner": inner, "loss": np.full(len(z), np.inf), "done": np.zeros(len(z), bool)}
 
     def restart(self, state, start: int) -> None:
         """Forget curvature and line search of one start."""
         _put(state["inner"], self.optimiser.init(jnp.asarray(state["w"][start])), start)
-        state["converged"][start] = False
+        state["done"][start] = False
 
     def retire(self, state, start: int) -> None:
         """No more line searches from one start."""
-        state["converged"][start] = True
+        state["done"][start] = True
 
     def _search(self, shared, lanes, w, inner, *, derive):
         """One line search for one start; lanes has one row."""
@@ -120,7 +120,7 @@ class LBFGS:
 
     def step(self, evaluate: Any, state):
         """One line search for every start; args and returns as `Newton.step`."""
-        for s in np.flatnonzero(~state["converged"]).tolist():
+        for s in np.flatnonzero(~state["done"]).tolist():
             shared, lanes = evaluate.row(s)
             inner = jax.tree.map(lambda x, s=s: jnp.asarray(x[s]), state["inner"])
             w, inner = self.compiled(shared, lanes, jnp.asarray(state["w"][s]), inner, derive=evaluate.derive)
@@ -130,7 +130,7 @@ class LBFGS:
         z, _ = squashed(self.box, state["w"])
         found = evaluate(z)
         drop = state["loss"] - found.value.loss
-        state["converged"] |= np.abs(drop) < self.tolerance * np.maximum(1e-3, np.abs(found.value.loss))
+        state["done"] |= np.abs(drop) < self.tolerance * np.maximum(1e-3, np.abs(found.value.loss))
         state["loss"] = np.array(found.value.loss)
         return z, found
 

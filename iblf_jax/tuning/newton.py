@@ -43,7 +43,7 @@ def box_step(gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np
 class Newton:
     """The method, for S starts at once; its state is a dict of arrays."""
 
-    settles = True
+    converges = True
     """Whether it knows by itself when it is done."""
 
     def __init__(self, box: Box, tolerance: float = 1e-6, radius: float = FIRST_RADIUS):
@@ -61,18 +61,18 @@ class Newton:
             "secant": square.copy(),
             "radius": np.full(starts, self.radius),
             "fresh": np.zeros(starts, bool),
-            "converged": np.zeros(starts, bool),
+            "done": np.zeros(starts, bool),
         }
 
     def restart(self, state: dict[str, np.ndarray], start: int) -> None:
         """After a change of the loss: evaluate again at the same z before the next step."""
-        state["fresh"][start], state["converged"][start] = False, False
+        state["fresh"][start], state["done"][start] = False, False
         state["secant"][start] = 0.0
         state["radius"][start] = max(state["radius"][start], 0.1 * self.radius)
 
     def retire(self, state: dict[str, np.ndarray], start: int) -> None:
         """One start is given up: no more trials."""
-        state["converged"][start] = True
+        state["done"][start] = True
 
     def step(self, evaluate: Any, state: dict[str, np.ndarray]):
         """One trial for every start.
@@ -94,7 +94,7 @@ class Newton:
     def _plan(self, state, s: int) -> tuple[np.ndarray, float]:
         """The next trial of one start, and what the model foretells; the point itself where there is no model yet."""
         z = state["z"][s]
-        if not state["fresh"][s] or not np.isfinite(state["loss"][s]) or state["converged"][s]:
+        if not state["fresh"][s] or not np.isfinite(state["loss"][s]) or state["done"][s]:
             return z, 0.0
         reach = state["radius"][s]
         low, high = np.maximum(self.box.low - z, -reach), np.minimum(self.box.high - z, reach)
@@ -104,13 +104,13 @@ class Newton:
     def _judge(self, state, s: int, trial: np.ndarray, foretold: float, found) -> None:
         loss, gradient, matrix = (float(found.value.loss[s]), found.gradient[s], found.hessian[s])
         valid = np.isfinite(loss) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(matrix))
-        if state["converged"][s]:
+        if state["done"][s]:
             return
         if not state["fresh"][s]:
             state["fresh"][s] = True
             if valid:
                 state["loss"][s], state["gradient"][s], state["matrix"][s] = loss, gradient, matrix
-            state["converged"][s] = not valid
+            state["done"][s] = not valid
             return
         step = trial - state["z"][s]
         gain = (state["loss"][s] - loss) / foretold if valid and foretold > 0 else -np.inf
@@ -124,7 +124,7 @@ class Newton:
         elif gain > 0.7 and size > 0.9 * state["radius"][s]:
             state["radius"][s] = min(2 * state["radius"][s], LARGEST_RADIUS)
         small = self.tolerance * max(1e-3, abs(state["loss"][s]))
-        state["converged"][s] = foretold < small or size < 1e-7
+        state["done"][s] = foretold < small or size < 1e-7
 
     def _learn(self, state, s: int, step: np.ndarray, gradient: np.ndarray) -> None:
         """The symmetric rank-one update of the secant part."""

@@ -232,17 +232,17 @@ class Loop:
     def _outer(self, s: int, found: Slope) -> None:
         """Updates the multipliers of one start when it is time, or marks it finished."""
         state = self.state
-        converged = bool(state["method"]["converged"][s])
+        done = bool(state["method"]["done"][s])
         state["since"][s] += 1
-        if state["finished"][s] or not (converged or state["since"][s] >= INNER):
+        if state["finished"][s] or not (done or state["since"][s] >= INNER):
             return
         if state["lam"].shape[1] == 0 or not found.value.valid[s]:
-            state["finished"][s] = converged
+            state["finished"][s] = done
             return
         excess = found.value.excess[s]
         new = np.maximum(0.0, state["lam"][s] + state["mu"][s] * excess)
         worst = float(np.max(np.maximum(excess, -state["lam"][s] / state["mu"][s])))
-        if converged and (abs(worst) < 1e-3 or state["outer"][s] >= OUTER):
+        if done and (abs(worst) < 1e-3 or state["outer"][s] >= OUTER):
             state["finished"][s] = True
             return
         if max(worst, 0.0) > 0.25 * state["worst"][s]:
@@ -258,8 +258,7 @@ class Loop:
 
 def fingerprint(formulation: Formulation, shared: ProblemInputs, options: Any) -> str:
     """A hash of everything that a checkpoint must agree with."""
-    cases = shared.cases._replace(key=jax.random.key_data(shared.cases.key))
-    leaves, structure = jax.tree.flatten(shared._replace(cases=cases))
+    leaves, structure = jax.tree.flatten(shared)
     digest = hashlib.sha256(repr((formulation, structure, options)).encode())
     for x in leaves:
         digest.update(np.asarray(x).tobytes() + str(np.shape(x)).encode())

@@ -36,7 +36,7 @@ INVALID = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 
 
 class Formulation(NamedTuple):
-    """What is compiled; static."""
+    """What is fixed of a tuning problem: which leaves move, how long the runs are, how they are weighed; static."""
 
     blocks: tuple[Block, ...]
     targets: tuple[Target, ...]

@@ -50,7 +50,7 @@ class Quantity(Protocol):
         ...
 
 
-SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1", "deficit": "rad"}
+TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1", "deficit": "rad"}
 """Signal -> unit."""
 
 
@@ -139,7 +139,7 @@ class Peak:
     joints: jax.Array = leaf("1", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     smoothing: jax.Array = leaf("1", sign="positive", shape="scalar", default=0.01)
-    units: ClassVar[dict[str, str]] = {name: unit for name, unit in SIGNALS.items() if name != "outside"}
+    units: ClassVar[dict[str, str]] = {name: unit for name, unit in TUNED_SIGNALS.items() if name != "outside"}
 
     def check(self) -> None:
         """Raises ValueError for an unknown signal."""
