@@ -56,7 +56,7 @@ def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int])
         try:
             jax.config.update("jax_num_cpu_devices", devices)
         except RuntimeError:  # who calls `main` where JAX has run
-            expected = f"{jax.local_device_count()} devices, as JAX has in this process"
+            expected = f"{jax.local_device_count()}, as many as JAX has in this process"
             raise checks.fail("--devices", devices, expected, "Start the command in a process of its own.") from None
     job = (args.coordinator, args.num_processes, args.process_id)
     try:

@@ -91,13 +91,13 @@ def simulate(
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario.n)
     step_size = jnp.asarray(dt, dtype)
-    result = trajectory(scenario, folds, step_size, steps=steps, method=method, record_every=record_every, backend=backend)
+    result = simulate_unchecked(scenario, folds, step_size, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
         _report(result, steps, throw)
     return result
 
 
-def trajectory(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "auto") -> Rollout:
+def simulate_unchecked(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "auto") -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds)):

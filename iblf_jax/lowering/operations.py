@@ -54,9 +54,9 @@ def _arithmetic(numpy: Callable, xla: Callable, sign: str, cost: int = 1, **more
     return Operation(numpy, xla, cost, dict.fromkeys("fi", f"{{}} {sign} {{}}"), **more)
 
 
-def _comparison(numpy: Callable, xla: Callable, sign: str, of_flags: str | None = None) -> Operation:
+def _comparison(numpy: Callable, xla: Callable, sign: str, of_flags: str | None = None, **more: Any) -> Operation:
     c = dict.fromkeys("fi", f"MASK({{}} {sign} {{}})") | ({"b": of_flags} if of_flags else {})
-    return Operation(numpy, xla, 1, c, cheap=True, commutes=of_flags is not None)
+    return Operation(numpy, xla, 1, c, cheap=True, **more)
 
 
 def _logic(numpy: Callable, xla: Callable, sign: str) -> Operation:
@@ -103,8 +103,8 @@ OPERATIONS: dict[str, Operation] = {
     "erfc": Operation(np.vectorize(math.erfc, otypes=[float]), lax.erfc, None),
     "logistic": Operation(_logistic, lax.logistic, 30),
     "is_finite": Operation(np.isfinite, lax.is_finite, 2),
-    "eq": _comparison(np.equal, lax.eq, "==", of_flags="~({} ^ {})"),
-    "ne": _comparison(np.not_equal, lax.ne, "!=", of_flags="({} ^ {})"),
+    "eq": _comparison(np.equal, lax.eq, "==", of_flags="~({} ^ {})", commutes=True),
+    "ne": _comparison(np.not_equal, lax.ne, "!=", of_flags="({} ^ {})", commutes=True),
     "lt": _comparison(np.less, lax.lt, "<"),
     "le": _comparison(np.less_equal, lax.le, "<="),
     "gt": _comparison(np.greater, lax.gt, ">"),

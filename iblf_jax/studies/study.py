@@ -23,7 +23,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status, describe
-from iblf_jax.engine.simulate import SimulationWarning, trajectory
+from iblf_jax.engine.simulate import SimulationWarning, simulate_unchecked
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
@@ -306,7 +306,7 @@ class Study:
         if not all(np.array_equal(x, self.metrics[name][i], equal_nan=True) for name, x in again.metrics.items()):
             warnings.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.", stacklevel=2)
         program, shared = self.setup.program, self.setup.shared
-        run = trajectory(
+        run = simulate_unchecked(
             paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
             shared.folds,
             shared.dt,

@@ -13,7 +13,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.simulate import trajectory
+from iblf_jax.engine.simulate import simulate_unchecked
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
@@ -131,7 +131,7 @@ class TuneResult:
         setup = self.setup
         dtype, steps = self.start.initial.q.dtype, checks.whole_steps(setup.duration, setup.dt)
         folds, step = as_folds(None, dtype), jnp.asarray(setup.dt, dtype)
-        run = partial(trajectory, folds=folds, dt=step, steps=steps, method=setup.method, record_every=1)
+        run = partial(simulate_unchecked, folds=folds, dt=step, steps=steps, method=setup.method, record_every=1)
         return run(canonical(self.start)), run(canonical(self.scenario))
 
     @cached_property
