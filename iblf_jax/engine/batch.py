@@ -10,11 +10,10 @@ import jax.numpy as jnp
 
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import Shape
-from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, probe_steps, probed, start, verdict
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, fastest_mode, probe_steps, probed, start, verdict
 from iblf_jax.simulation.accuracy import places
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.stability import growth_rate
 
 
 class Leaves(NamedTuple):
@@ -108,7 +107,7 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, jax.Arr
     """The carry before the first step, and the mode at the start [1/s]."""
     around = batch.each(lambda inputs: probed(jnp.zeros_like(inputs.dt), initial_state(inputs.scenario)))
     found = _probed(executor, batch, around)
-    return batch.each(lambda inputs, jacobian: start(inputs, method, jacobian), found.jacobian), growth_rate(found.growth)
+    return batch.each(lambda inputs, found: (start(inputs, method, found.jacobian), fastest_mode(found)), found)
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
@@ -134,8 +133,8 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, mode: jax.Arra
     apart = batch.each(critical, carry)
     if batch.runs is not None:
         apart = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), apart)
-    found = growth_rate(_probed(executor, twice, apart).growth).reshape(*jnp.shape(mode), 2)
-    modes = jnp.concatenate([mode[..., None], found], axis=-1)
+    found = twice.each(lambda inputs, found: fastest_mode(found), _probed(executor, twice, apart))
+    modes = jnp.concatenate([mode[..., None], found.reshape(*jnp.shape(mode), 2)], axis=-1)
     return batch.each(lambda inputs, carry, modes: verdict(inputs, run, carry, modes), carry, modes)
 
 

@@ -233,7 +233,8 @@ class Probed(NamedTuple):
 class Probe:
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the units of the numbers that `accuracy` watches, then those of the power iteration.
+    The directions are at first the units of the numbers that `accuracy` watches.  Where these are the whole state, the modes follow from
+    them; else more directions do, those of the power iteration.
     """
 
     def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
@@ -249,8 +250,9 @@ class Probe:
         def rate_at(y):
             return ravel_pytree(form.piece(evaluate)(inputs.scenario, carry.time, whole(y), jnp.zeros_like(inputs.dt))[0])[0]
 
-        w = stability.along(rate_at, x, direction)
-        growth = keep_if(iteration < 0, carry.growth, stability.grown(carry.growth, w, iteration))
+        w, growth = stability.along(rate_at, x, direction), carry.growth
+        if len(watched) < x.size:
+            growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
         column = jnp.arange(watched.size, dtype=index.dtype) == index
         jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
         return Probed(carry.time, x, growth, jacobian), ()
@@ -258,7 +260,15 @@ class Probe:
 
 def probe_steps(scenario: Scenario) -> int:
     """Steps of a `Probe`."""
-    return accuracy.places(initial_state(scenario)).size + stability.POWER_ITERATIONS
+    state = initial_state(scenario)
+    watched = accuracy.places(state).size
+    return watched + (0 if watched == ravel_pytree(state)[0].size else stability.POWER_ITERATIONS)
+
+
+def fastest_mode(probed: Probed) -> jax.Array:
+    """The mode that a `Probe` has found, () [1/s]."""
+    complete = len(probed.jacobian) == probed.state.size
+    return stability.growth_rate(stability.growth_by(probed.jacobian) if complete else probed.growth)
 
 
 def probed(time: jax.Array, state: LoopState) -> Probed:

@@ -5,7 +5,7 @@ explicit step is stable only while dt times that mode stays inside the method's 
 without any physics behind them.  So every run measures its fastest mode, at its start, where it was nearest to its bound
 (there the barrier is stiffest) and at its end, and says when the step was too large.
 
-Derivatives of the loop are differences of its rate: the rate is compiled as it is, its derivative would take thrice as long.
+Derivatives of the loop are central differences of its rate: the rate is compiled as it is, its derivative would take thrice as long.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.core.linalg import matvec
 from iblf_jax.simulation.closed_loop import LoopState, rate
 from iblf_jax.simulation.scenario import Scenario
 
@@ -51,12 +52,20 @@ def growth_rate(growth: Growth) -> jax.Array:
     return jnp.exp(growth.total / AVERAGED)
 
 
+def growth_by(jacobian: jax.Array) -> Growth:
+    """The growth after the power iteration of a Jacobian that is known, (m, m)."""
+
+    def iterate(growth, iteration):
+        return grown(growth, matvec(jacobian, growth.direction), iteration), None
+
+    return jax.lax.scan(iterate, growth_start(jacobian[0]), jnp.arange(POWER_ITERATIONS))[0]
+
+
 def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
     """The derivative of `rate_at`, (m,) -> (m,), at x along a direction, one evaluation at a time."""
-    # One-sided: a scalar program computes the rate at x once for all directions, and each costs one evaluation instead of two.
-    size = jnp.finfo(x.dtype).eps ** 0.5 * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
-    rates = jax.lax.map(rate_at, jnp.stack([x + size * direction, x]))
-    return (rates[0] - rates[1]) / size
+    size = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
+    rates = jax.lax.map(rate_at, jnp.stack([x + size * direction, x - size * direction]))
+    return (rates[0] - rates[1]) / (2.0 * size)
 
 
 @jax.jit
