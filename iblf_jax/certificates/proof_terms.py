@@ -240,6 +240,8 @@ def along_run(scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.
     # One step against two half steps: the envelopes are held against a run in which V2 has fallen below what the integrator resolves.
     whole, halves = (run_from(scenario, dt, place, step=Onward(method), steps=k + 2)[1][1] for k, place in enumerate(places))
     proof, M0, sample = jax.tree.map(lambda x: np.asarray(x[:, 0]), found)
-    eigenvalues = np.linalg.eigvalsh(M0)
+    # NumPy raises at what is not finite, where the terms say NaN.
+    finite = np.all(np.isfinite(M0), axis=(1, 2), keepdims=True)
+    eigenvalues = np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, M0, 0.0)), np.nan)
     defect = 2.0 * np.abs(np.asarray(whole)[:, 1] - np.asarray(halves)[:, 2])  # times two for safety
     return ProofTerms(**proof | {"lambda_min": eigenvalues[:, 0], "lambda_max": eigenvalues[:, -1]}), sample, defect
