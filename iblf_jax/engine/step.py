@@ -268,7 +268,7 @@ def probe_steps(scenario: Scenario) -> int:
 def fastest_mode(probed: Probed) -> jax.Array:
     """The mode that a `Probe` has found, () [1/s]."""
     complete = len(probed.jacobian) == probed.state.size
-    return stability.growth_rate(stability.growth_by(probed.jacobian) if complete else probed.growth)
+    return stability.growth_rate_by(probed.jacobian) if complete else stability.growth_rate(probed.growth)
 
 
 def probed(time: jax.Array, state: LoopState) -> Probed:
