@@ -26,8 +26,6 @@ sys.path.insert(0, str(ROOT / "tests"))
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
-# An array of another type is a slip, not a promotion.  (Ranks are promoted: the package broadcasts leading axes throughout.)
-jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 hypothesis.settings.register_profile("default", deadline=None, max_examples=100, derandomize=bool(os.environ.get("CI")))
 hypothesis.settings.load_profile("default")
@@ -55,6 +53,15 @@ def resident() -> int:
 def memory() -> dict[str, int]:
     """The bytes from which `bounded_memory` lets go."""
     return {"most": MEMORY}
+
+
+def pytest_configure(config):
+    """In the default run an array of another type is a slip, not a promotion; with the slow tests it is as in a user's session.
+
+    Ranks are promoted in both: the package broadcasts leading axes throughout.
+    """
+    if "not slow" in config.option.markexpr:
+        jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
 @pytest.fixture(autouse=True)

@@ -93,7 +93,7 @@ def test_the_rate_is_the_loops_own_with_memory_in_law_and_observer(paper):
     assert m == 2 + 2 + 8 * 2 + 2 + 2
     assert field.names[4:6] == ("controller[0, 0]", "controller[0, 1]")
     assert field.names[-4:] == ("observer.p_hat[0]", "observer.p_hat[1]", "observer.f_hat[0]", "observer.f_hat[1]")
-    x = field.start + 0.01 * jnp.arange(m)
+    x = field.start + 0.01 * jnp.arange(m, dtype=field.start.dtype)
     state = field.unpack(x)
     assert jax.tree.structure(state) == jax.tree.structure(initial_state(field.scenario))
     expected = rate(field.scenario, jnp.array(0.3), state)
