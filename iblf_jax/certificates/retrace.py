@@ -18,12 +18,11 @@ import numpy as np
 
 from iblf_jax.certificates.proof_terms import Onward, Place, along_run
 from iblf_jax.core import checks
-from iblf_jax.core.status import Status, describe
+from iblf_jax.core.status import UNTRUSTED, Status, describe
 from iblf_jax.engine.execute import run_from
 from iblf_jax.engine.plan import CERTIFY_STRETCH
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
 
-DISBELIEVED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
 TORQUES = ("tau", "disturbance", "disturbance_estimate")
 
@@ -49,7 +48,7 @@ def states_of(run: Any) -> LoopState:
 
 def believed(run: Any) -> bool:
     """Whether the run's status leaves something to judge."""
-    return not int(run.status) & int(DISBELIEVED)
+    return not int(run.status) & int(UNTRUSTED)
 
 
 def stretches(run: Any) -> Iterator[Stretch]:

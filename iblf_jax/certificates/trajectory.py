@@ -24,8 +24,8 @@ import numpy as np
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.eigenvalues import Extremes, eigenvalues_over
 from iblf_jax.certificates.proof_terms import rounding
-from iblf_jax.certificates.retrace import DISBELIEVED, Stretch, believed, check_status, grid, stretches
-from iblf_jax.core.status import describe
+from iblf_jax.certificates.retrace import Stretch, believed, check_status, grid, stretches
+from iblf_jax.core.status import UNTRUSTED, describe
 from iblf_jax.engine.plan import CERTIFY_KEPT
 from iblf_jax.simulation.scenario import Scenario
 
@@ -137,7 +137,7 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
     if believed(run):
         check_status(run, float(tally.margin))
     else:
-        no_run = f"the run is not to be believed: {describe(int(run.status) & int(DISBELIEVED))}"
+        no_run = f"the run is not to be believed: {describe(int(run.status) & int(UNTRUSTED))}"
     no_claim = claims.why_no_claim(run.scenario)
     constants = None if no_claim else claims.claim(run.scenario)
     over_box = eigenvalues_over(run.scenario.model, tally.low, tally.high)

@@ -38,6 +38,9 @@ class Status(enum.IntFlag):
 FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
 """The flags that make a run one that did not do its job."""
 
+UNTRUSTED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
+"""The flags of a run whose numbers say nothing: no loss and no certificate is made of them."""
+
 VELOCITY_LIMIT = 1e4
 """rad/s (or m/s).  No robot moves so; beyond it a run has diverged, and stopping there keeps every number finite in
 float32, so that neither a batch nor its gradient meets an infinity."""

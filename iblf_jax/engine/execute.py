@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
-from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all, split
+from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
@@ -212,7 +212,7 @@ def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps:
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
     inputs = _inputs(scenario, (), dt, Run(steps))
-    batch = Batch(split(inputs, {}), jax.tree.leaves(carry)[0].shape[0], plan.STATES)
+    batch = Batch.of(inputs, None, plan.STATES)._replace(runs=jax.tree.leaves(carry)[0].shape[0])
     name = automatic()[0]
     if name != "xla" and _operations(inputs) <= plan.LONG_EVALUATION:
         try:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.status import Status
+from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch, run_for_reverse
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.paths import with_parameters
@@ -30,9 +30,6 @@ from iblf_jax.tuning.parameters import Block, values_at
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.robust import Risk, combine, worst_share
 from iblf_jax.tuning.tangents import by_coordinates
-
-INVALID = Status.NOT_FINITE | Status.STEP_TOO_LARGE
-"""Runs with these flags have no loss: a step that makes one is rejected."""
 
 
 class Formulation(NamedTuple):
@@ -152,7 +149,7 @@ def _loss(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: j
 
 
 def _value(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth, exact, status) -> Value:
-    valid = jnp.all(status & int(INVALID) == 0) & jnp.all(jnp.isfinite(smooth))
+    valid = jnp.all(status & int(UNTRUSTED) == 0) & jnp.all(jnp.isfinite(smooth))
     return Value(
         jnp.where(valid, _loss(formulation, shared, lane, smooth), jnp.inf),
         _objective(formulation, shared, lane, exact),

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.simulate import simulate_unchecked
 from iblf_jax.engine.step import Run
@@ -22,7 +23,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.problem import INVALID, NUMBERS_A_RUN
+from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
@@ -203,7 +204,7 @@ class TuneResult:
         options = {"steps": steps, "method": setup.method, "backend": setup.backend}
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), **options)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
-        valid = np.asarray(outcome.status) & int(INVALID) == 0
+        valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
         return a, b, np.where(valid, np.asarray(values), np.inf).reshape(points, points)
 
     def plot(self, **options):
