@@ -21,6 +21,16 @@ def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.sum(left[:, :, None] * right[None, :, :], axis=1)
 
 
+def matmul_in_order(left: jax.Array, right: jax.Array) -> jax.Array:
+    """The product of two matrices in a loop over its terms: XLA orders those of a reduction by the number of runs beside it."""
+
+    def add(total, term):
+        column, row = term
+        return total + column[:, None] * row, None
+
+    return jax.lax.scan(add, jnp.zeros((len(left), right.shape[1]), left.dtype), (left.T, right))[0]
+
+
 def inner(u: jax.Array, v: jax.Array) -> jax.Array:
     """u^T v, (), for two (n,) vectors."""
     return jnp.sum(u * v)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.core.linalg import matmul, matvec
+from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.simulation.closed_loop import LoopState, rate
 from iblf_jax.simulation.scenario import Scenario
 
@@ -56,18 +56,19 @@ def growth_rate_by(jacobian: jax.Array) -> jax.Array:
     """The mode that the power iteration of a Jacobian finds, () [1/s]: of all its steps at once, as J^16 and J^32 are found by squaring."""
     tiny = jnp.finfo(jacobian.dtype).tiny
 
-    def scaled(matrix, logarithm):
-        size = jnp.maximum(jnp.max(jnp.abs(matrix)), tiny)
-        return matrix / size, logarithm + jnp.log(size)
+    def squared(_, powers):
+        _, last, logarithm = powers
+        size = jnp.maximum(jnp.max(jnp.abs(last)), tiny)
+        last = last / size
+        return last, matmul_in_order(last, last), 2.0 * (logarithm + jnp.log(size))
 
-    last, logarithm = scaled(jacobian, 0.0)  # J^AVERAGED in the end, up to a factor, and the logarithm of that
-    for _ in range(AVERAGED.bit_length() - 1):
-        last, logarithm = scaled(matmul(last, last), 2.0 * logarithm)
-    first, _ = scaled(matmul(last, last), 0.0)
-    before = matvec(first, growth_start(jacobian[0]).direction)
-    after = matvec(last, before)
-    lengths = [jnp.log(jnp.maximum(jnp.sqrt(jnp.sum(w * w)), tiny)) for w in (before, after)]
-    return jnp.exp((logarithm + lengths[1] - lengths[0]) / AVERAGED)
+    # J^AVERAGED and its square in the end, up to a factor, and the logarithm of the square's.
+    powers = (jacobian, jacobian, jnp.zeros((), jacobian.dtype))
+    last, first, logarithm = jax.lax.fori_loop(0, AVERAGED.bit_length(), squared, powers)
+    before = matmul_in_order(first, growth_start(jacobian[0]).direction[:, None])
+    after = matmul_in_order(last, before)
+    lengths = [jnp.log(jnp.maximum(jnp.sqrt(matmul_in_order(w.T, w)[0, 0]), tiny)) for w in (before, after)]
+    return jnp.exp((logarithm / 2.0 + lengths[1] - lengths[0]) / AVERAGED)
 
 
 def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
