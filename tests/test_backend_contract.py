@@ -53,7 +53,11 @@ CASES = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_backends_agree_with_the_reference(name, dtype):
-    agree(name, dtype, WHOLE, ["xla", "native"] if has_compiler() else ["xla"])
+    """The whole run on native; on xla, which compiles a step of Runge-Kutta for a minute, it is the paper's alone."""
+    whole = name == "zhang_yan_2024" and dtype == "float64"
+    agree(name, dtype, WHOLE, ["xla"] * whole + ["native"] * has_compiler())
+    if not whole:
+        agree(name, dtype, SHORT, ["xla"])
 
 
 def test_native_agrees_on_a_short_run():

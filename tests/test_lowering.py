@@ -20,6 +20,7 @@ from iblf_jax.lowering import program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.packed import Shapes, pack
+from iblf_jax.lowering.passes import written_out
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 
@@ -96,7 +97,7 @@ def numbers(leaves) -> list:
 
 
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
-def test_every_member_lowers_and_its_program_is_its_step(family, name):
+def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypatch):
     scenario = canonical(with_member(family, name, getattr(ij, family).MEMBERS[name]))
     dt, index = jnp.asarray(DT), jnp.int32(3)
     varied = {"initial.q": jnp.asarray([[0.8, 0.8]]), "plant.mass[1]": jnp.asarray([0.9])}
@@ -106,8 +107,14 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name):
     inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.lane])
     p, _ = program_of(step, run, carries)
     expected = numbers(jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, Form(rolled=True))[0])(carry)))
-    found = evaluate(p, numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index)
-    np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
+    monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
+    called, _ = program_of(step, run, carries)
+    assert sum(node.op == "call" for node in called.nodes) == 2  # one a stage
+    for each in (p, called):
+        found = evaluate(
+            written_out(each), numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index
+        )
+        np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
 
 
 def lowered_function(f, *arrays):

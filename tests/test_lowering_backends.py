@@ -189,11 +189,15 @@ def test_one_run_and_threads():
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("record_every", [None, 100])
-def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
-    """Cut into pieces of fifty operations, the numbers stay: only the places of some products with sums differ."""
+@pytest.mark.parametrize("parts", ["functions", "calls", "both"])
+def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
+    """Cut into pieces of fifty operations, or with its stages as calls, the numbers stay: the places of some products with sums differ."""
     whole = batch(record_every=record_every)
-    monkeypatch.setattr(plan, "NATIVE_LONG", 0)
-    monkeypatch.setattr(plan, "NATIVE_SEGMENT", 50)
+    if parts != "calls":
+        monkeypatch.setattr(plan, "NATIVE_LONG", 0)
+        monkeypatch.setattr(plan, "NATIVE_SEGMENT", 50)
+    if parts != "functions":
+        monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
     native.kernel.cache_clear()
     monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
     del COMPILED["float64", "native", 400, record_every]
@@ -206,7 +210,9 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, record_every):
 
 @pytest.mark.slow
 @needs_compiler
-def test_forward_sensitivities():
+@pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
+def test_forward_sensitivities(monkeypatch, written_out):
+    monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
     directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}

@@ -22,8 +22,10 @@ from iblf_jax.engine.derivatives import Directions, run_with_tangents
 from iblf_jax.engine.executors import lowered_on, program_of, scan
 from iblf_jax.engine.step import Inputs, Run, TimeStep
 from iblf_jax.lowering import nvrtc
-from iblf_jax.lowering.emit_c import CUDA, Layout, source
+from iblf_jax.lowering.emit_c import CUDA, source
+from iblf_jax.lowering.layout import Layout
 from iblf_jax.lowering.packed import Shapes, pack
+from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -60,7 +62,7 @@ def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
     layout, values = Layout.of(program), np.zeros(len(program.kinds), object)
     values[layout.floats], values[layout.ints] = list(np.asarray(carry.floats)), list(np.asarray(carry.ints))
     for i in range(steps):
-        values = evaluate(program, np.asarray(shared), np.asarray(lane), list(values), i)
+        values = evaluate(written_out(program), np.asarray(shared), np.asarray(lane), list(values), i)
         values = [np.broadcast_to(v, np.shape(carry.floats)[1:]) for v in values]
     return np.asarray(values, float)
 
@@ -128,7 +130,9 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
 
 @pytest.mark.slow
 @needs_compiler
-def test_records_agree_with_the_reference(on_cpu):
+@pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
+def test_records_agree_with_the_reference(on_cpu, monkeypatch, written_out):
+    monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
     found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
     assert_same(found, expected, 1e-9)
 

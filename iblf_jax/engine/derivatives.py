@@ -144,8 +144,7 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
 
     def numbers(flat, eps, t, dt):
         slope, sample = evaluate(directions.moved(scenario, eps), t, unravel(flat), dt)
-        flags = {name: getattr(sample, name) for name in FLAGS}
-        return ravel_pytree((slope, without_flags(sample)))[0], flags
+        return (slope, without_flags(sample)), {name: getattr(sample, name) for name in FLAGS}
 
     @jax.custom_jvp
     def floats(flat, eps, t, dt):
@@ -156,17 +155,15 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
         flat, eps, t, dt = primals
         units = np.eye(flat.size + eps.size, dtype=flat.dtype)
         value = lambda x: numbers(x[: flat.size], x[flat.size :], t, dt)[0]  # noqa: E731
-        here = jnp.concatenate([flat, eps])
+        here, along = jnp.concatenate([flat, eps]), jnp.concatenate(tangents[:2])
         columns = jax.vmap(lambda unit: jax.jvp(value, (here,), (unit,))[1])(units)
-        return floats(*primals), jnp.concatenate(tangents[:2]) @ columns
+        # Number by number: what a stage does not read of the sample is not computed.
+        return floats(*primals), jax.tree.map(lambda column: jnp.tensordot(along, column, 1), columns)
 
     def loop(moved, t, state, dt=0.0):
-        dt = jnp.asarray(dt, t.dtype)
-        slope, sample = jax.eval_shape(lambda: evaluate(scenario, t, state, dt))
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (slope, without_flags(sample)))
-        flat = ravel_pytree(state)[0]
-        slope, values = ravel_pytree(zeros)[1](floats(flat, eps, t, dt))
-        return slope, Sample(**values, **numbers(*jax.lax.stop_gradient((flat, eps, t, dt)))[1])
+        at = ravel_pytree(state)[0], eps, t, jnp.asarray(dt, t.dtype)
+        slope, values = floats(*at)
+        return slope, Sample(**values, **numbers(*jax.lax.stop_gradient(at))[1])
 
     return loop
 

@@ -17,7 +17,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax.engine import plan, vector_math
 from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.program import Node, Program
+from iblf_jax.lowering.program import Node, Program, needed
 
 
 class Entry(NamedTuple):
@@ -50,14 +50,10 @@ class Evaluator:
 
     def compute(self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None) -> None:
         """Adds `wanted`, and what it needs, to `known` (node -> array, or entry of `row`)."""
-        nodes, needed, stack = self.program.nodes, set(), list(wanted)
-        while stack:
-            i = stack.pop()
-            if i not in known and i not in needed:
-                needed.add(i)
-                stack.extend(nodes[i].args)
-        known |= {i: np.asarray(nodes[i].value, self.types[nodes[i].kind]) for i in needed if nodes[i].op == "const"}
-        order = sorted(i for i in needed if nodes[i].op != "const")
+        nodes = self.program.nodes
+        missing = needed(nodes, wanted, known)
+        known |= {i: np.asarray(nodes[i].value, self.types[nodes[i].kind]) for i in missing if nodes[i].op == "const"}
+        order = [i for i in missing if nodes[i].op != "const"]
         stored = self._stored(order, wanted)
         size = plan.XLA_SEGMENT if self.bordered else max(len(order), 1)
         for start in range(0, len(order), size):

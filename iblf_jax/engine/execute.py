@@ -26,7 +26,8 @@ from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
-from iblf_jax.lowering.program import UnsupportedError
+from iblf_jax.lowering.passes import written_out
+from iblf_jax.lowering.program import Program, UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
@@ -92,8 +93,14 @@ def _executor(name: str) -> Executor:
     return lowered_on(EXECUTORS[name].run)
 
 
+def _nodes(name: str, program: Program) -> int:
+    """How many an executor's compiler sees: XLA has no functions."""
+    return len(written_out(program).nodes) if name == "xla" else program.size
+
+
 def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], nested: bool = False) -> Batch:
-    return Batch.of(inputs, varied, plan.lowered_shape(jax.default_backend(), len(next(iter(varied.values()))), nested))
+    shape = plan.lowered_shape(jax.default_backend(), _operations(inputs), len(next(iter(varied.values()))), nested)
+    return Batch.of(inputs, varied, shape)
 
 
 def _operations(inputs: Inputs) -> int:
@@ -160,8 +167,8 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
-      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native for short
-        steps where there is a compiler.  What is long or does not lower is, on "auto" and "xla", on scan, without a warning.
+      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native where there is a compiler.  What
+        is long or does not lower is, on "auto" and "xla", on scan, without a warning.
     """
     inputs = _inputs(scenario, folds, dt, run)
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]})
@@ -174,13 +181,14 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     if backend in plan.COMPILED.values():
         return with_fallback(backend, run_on, on_scan)
-    if jax.default_backend() != "cpu" or _shape(inputs, None, False).function == "parts":
+    compiled = backend == "auto" and not native.unavailable()
+    name = plan.executor_of_one_run(compiled, jax.default_backend(), _operations(inputs))
+    if name is None:
         return on_scan()
-    name = "native" if backend == "auto" and not native.unavailable() else "xla"
     try:
         step = TimeStep(run.method, run.record_every is not None)
         program, _ = program_of(step, batch, carry_shapes(batch, run.method))
-        return run_on(name) if plan.lowers_one_run(len(program.nodes)) else on_scan()
+        return run_on(name) if plan.lowers_one_run(name, _nodes(name, program)) else on_scan()
     except (UnsupportedError, ToolchainError):
         return on_scan()
 
@@ -254,7 +262,7 @@ def run_batch_jvp(
         batch = _lowered_batch(inputs, varied, nested)
         if backend == "auto":
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
-            if not plan.lowers_derivatives(name, len(program.nodes), along.tangents):
+            if not plan.lowers_derivatives(name, _nodes(name, program), along.tangents):
                 return on_scan()
         return run_with_tangents(_executor(name), batch, along, run)
 

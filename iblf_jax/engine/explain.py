@@ -16,6 +16,7 @@ from iblf_jax.engine.execute import automatic
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.step import Inputs, TimeStep
 from iblf_jax.lowering.operations import OPERATIONS
+from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
 from iblf_jax.lowering.toolchain import threads
 from iblf_jax.simulation.integrators import tableau
@@ -78,7 +79,7 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
     one = Batch.of(Inputs(scenario, folds, *jnp.asarray([1e-3, 1.0], dtype)), leaves)
-    program, _ = program_of(TimeStep(method), one, carry_shapes(one, method))
+    program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}

@@ -19,7 +19,8 @@ import numpy as np
 
 from iblf_jax.engine import plan
 from iblf_jax.lowering import nvrtc
-from iblf_jax.lowering.emit_c import CUDA, Layout, header, sizes, source
+from iblf_jax.lowering.emit_c import CUDA, header, sizes, source
+from iblf_jax.lowering.layout import Layout
 from iblf_jax.lowering.packed import Packed, record_shapes
 from iblf_jax.lowering.program import Program
 from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded

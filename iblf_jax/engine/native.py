@@ -43,9 +43,8 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
       ToolchainError: no compiler, or an error from it.
       UnsupportedError: an operation that C has no word for.
     """
-    library, key = built(
-        source(program, shared, lane, segment=plan.native_segment(len(program.nodes))), ("-DVECTOR_BYTES=16",) if narrow else ()
-    )
+    segment, flags = plan.native_build(program.size)
+    library, key = built(source(program, shared, lane, segment=segment), (*flags, *(("-DVECTOR_BYTES=16",) if narrow else ())))
     name = f"iblf_jax_{key}"
     if name not in _registered:
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="cpu")

@@ -30,12 +30,15 @@ LONGEST_FUNCTION = 60_000
 """Operations over which LLVM takes minutes as one machine function."""
 
 # Scalar programs: numbers of operations are nodes of a step.
-LONGEST_ONE_RUN = 2500
-"""Nodes up to which one run is lowered unasked: a longer one gains less by it than it takes to compile."""
-LIMITS = Limits(choices=64, table=4096, tables=50_000, scan=64)
+LONGEST_ONE_RUN = {"native": 60_000, "xla": 2500}
+"""Nodes up to which one run is lowered unasked, by executor: a longer one gains less by it than it takes to compile.  A run of
+`presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 on scan; its first result takes 11 s of a busy processor there, 30 where
+the kernel has to be built, and 24 on scan."""
+LIMITS = Limits(choices=64, table=4096, tables=50_000, scan=64, written_out=1000)
 """What is lowered at all, on native, where a step of the paper's scenario takes 90 ns: a choice among 64 entries takes 9 ns, one among 256
 entries 70; twelve tables of 4096 numbers take 18 ns and 2 s to lower and build, 48 of them 100 ns and 7 s; a scan of 64 rounds with a sine
-in each takes 140 ns, and one of 256 takes 6 s to build."""
+in each takes 140 ns, and one of 256 takes 6 s to build.  To call the loop of three joints, 1,000 nodes, takes 4 % of a step's time; of
+four joints 2 %, and the step builds in two thirds of the time."""
 XLA_DEAR, XLA_STORED = 8, 8
 """What an operation costs on CPU where a cheap one costs 1, and the cost from which a number with several uses is stored: XLA would
 compute it again for each use."""
@@ -50,9 +53,10 @@ XLA_STRETCH = 4096
 """Steps whose signals are tabulated at once, at most."""
 XLA_SEGMENT = 2000
 """Nodes in one XLA computation on CPU: its passes take more than linear time."""
-NATIVE_LONG, NATIVE_SEGMENT = 20_000, 5000
-"""Nodes above which the C of a step is cut into functions, and of how many each: a chain of seven builds in 28 s instead of 96 s, and runs
-at two thirds of the speed."""
+NATIVE_LONG, NATIVE_SEGMENT, NATIVE_FLAGS = 10_000, 2000, ("-O1",)
+"""Nodes above which the C of a step is cut into functions, of how many each, and how it is built then: one of `presets.ur5` builds in 6 s
+instead of 27 and runs as fast (cut it takes 5 % longer, with less optimisation 20 % shorter).  A short step would take 1.6 times as long,
+one of 8,000 nodes 1.1 times."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
 GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100
@@ -115,9 +119,12 @@ def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -
     return Shape("together", "whole" if (runs or 1) <= SMALL_BATCH else "none", runs is None)
 
 
-def lowered_shape(platform: str, runs: int, nested: bool) -> Shape:
-    """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time; for 48 runs XLA refuses a fusion."""
-    return Shape("together", "parts" if platform == "cpu" and runs == 1 and not nested else "none", False)
+def lowered_shape(platform: str, operations: int, runs: int, nested: bool) -> Shape:
+    """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time; of 48 runs, and of arms of many joints,
+    XLA refuses a fusion.
+    """
+    parts = platform == "cpu" and runs == 1 and operations <= LONG_EVALUATION and not nested
+    return Shape("together", "parts" if parts else "none", False)
 
 
 def executors_for(backend: str, platform: str) -> tuple[str, ...]:
@@ -127,9 +134,24 @@ def executors_for(backend: str, platform: str) -> tuple[str, ...]:
     return () if backend == "vmap" else (*wanted, "xla")
 
 
-def lowers_one_run(nodes: int) -> bool:
+def executor_of_one_run(compiled: bool, platform: str, operations: int) -> str | None:
+    """The executor that one run is given unasked if its program is short enough; None for scan.
+
+    Args:
+      compiled: whether kernels can be, and may be, built here.
+      platform: as JAX names it.
+      operations: of one evaluation of the closed loop.
+    """
+    if platform != "cpu":
+        return None
+    if compiled:
+        return "native"
+    return "xla" if operations <= LONG_EVALUATION else None
+
+
+def lowers_one_run(executor: str, nodes: int) -> bool:
     """Whether one run is lowered unasked."""
-    return nodes <= LONGEST_ONE_RUN
+    return nodes <= LONGEST_ONE_RUN[executor]
 
 
 def lowers_derivatives(executor: str, nodes: int, tangents: int) -> bool:
@@ -152,9 +174,9 @@ def xla_stretch(steps: int, every: int) -> int:
     return exact if exact > most // 16 else most
 
 
-def native_segment(nodes: int) -> int | None:
-    """Nodes of a function of the generated C; None for one function."""
-    return NATIVE_SEGMENT if nodes > NATIVE_LONG else None
+def native_build(nodes: int) -> tuple[int | None, tuple[str, ...]]:
+    """Nodes of a function of the generated C, None for one function, and how the compiler is told to take it."""
+    return (NATIVE_SEGMENT, NATIVE_FLAGS) if nodes > NATIVE_LONG else (None, ())
 
 
 def gpu_threads(runs: int, processors: int) -> int:

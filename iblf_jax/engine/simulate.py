@@ -67,9 +67,9 @@ def simulate(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
       backend: "native": generated code, built by the system's compiler once for a structure and kept on disk; "xla": the same program
-        without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native for short steps where
-        there is a compiler, else xla; a long step (an arm of many joints) runs as plain JAX on "auto" and "xla".  Inside your own `jit`,
-        `vmap` or `grad` a run is always plain JAX.
+        without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native where there is a
+        compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside your own `jit`, `vmap` or `grad` a run
+        is always plain JAX.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.

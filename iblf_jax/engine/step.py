@@ -248,7 +248,7 @@ class Probe:
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
-            return ravel_pytree(form.piece(evaluate)(inputs.scenario, carry.time, whole(y), jnp.zeros_like(inputs.dt))[0])[0]
+            return ravel_pytree(form.piece(evaluate)(inputs.scenario, carry.time, whole(y), inputs.dt)[0])[0]
 
         w, growth = stability.along(rate_at, x, direction), carry.growth
         if len(watched) < x.size:

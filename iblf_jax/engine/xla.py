@@ -20,6 +20,7 @@ from iblf_jax.engine import plan
 from iblf_jax.engine.evaluator import Entry, Evaluator, Table, on_cpu
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.lowering.packed import Packed
+from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program, UnsupportedError, frontier
 
 
@@ -31,6 +32,7 @@ def run(
     Raises:
       UnsupportedError: the step is too long for XLA.
     """
+    program = written_out(program)
     if len(program.nodes) > plan.XLA_LONGEST:
         raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
     runs = carry.floats.shape[1]

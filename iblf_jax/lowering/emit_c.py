@@ -7,32 +7,18 @@ makes of a name a vector of runs, `c/mathlib.h` has the elementary functions and
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from importlib.resources import files
-from typing import NamedTuple
 
 import numpy as np
 
+from iblf_jax.lowering.layout import Calls, Layout, literal, places, unpacked
 from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.program import LANE, SHARED, TIME, Node, Program, UnsupportedError, frontier
+from iblf_jax.lowering.program import LANE, TIME, Node, Program, UnsupportedError, frontier, needed
 
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
-
-
-def literal(node: Node, dtype: np.dtype) -> str:
-    """A constant as a vector of runs."""
-    if node.kind == "b":
-        return f"splat_i({-1 if node.value else 0})"
-    if node.kind == "i":
-        return f"splat_i({node.value})"
-    if math.isnan(node.value):
-        return "splat(NAN)"
-    if math.isinf(node.value):
-        return f"splat({'-' if node.value < 0 else ''}INFINITY)"
-    return f"splat({node.value.hex()}{'f' if dtype == np.float32 else ''})"
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
@@ -52,21 +38,34 @@ def _conversion(source: str, target: str, arg: str) -> str:
     return f"to_float({arg})" if target == "f" else f"to_int({arg})"
 
 
+SEEN_BY_FUNCTION = ("const word *constants", "const F *once", "const F *p", "const I *q")
+SEEN_BY_ADVANCE = (
+    "const word *constants",
+    "const F *leaves",
+    "const F *floats",
+    "const I *ints",
+    "const word *row",
+    "const F *once",
+    "F *r",
+    "I *s",
+)
+"""What the generated functions are given, besides their places."""
+
+
 class _Emitter:
     """Statements for nodes; `names` are the C expressions of nodes that were read or computed already.
 
-    `tables` says into which table each lookup looks, `definitions` is the C of the tables.
+    `tables` says into which table each lookup looks, by the table's text; `calls` where the numbers of a call are.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Program, tables: dict[str, str], calls: Calls) -> None:
         self.program = program
         self.classes = program.classes()
         self.lines: list[str] = []
-        names: dict[str, str] = {}
         self.tables = {
-            i: names.setdefault(self._numbers(node), f"table_{len(names)}") for i, node in enumerate(program.nodes) if node.op == "lookup"
+            i: tables.setdefault(self._numbers(node), f"table_{len(tables)}") for i, node in enumerate(program.nodes) if node.op == "lookup"
         }
-        self.definitions = "\n".join(f"TABLE {name}[] = {{{numbers}}};" for numbers, name in names.items())
+        self.calls = calls
 
     def _numbers(self, lookup: Node) -> str:
         """The bits of its table, which are constants for every compiler; infinity is a function's result for some."""
@@ -75,14 +74,7 @@ class _Emitter:
 
     def needed(self, names: dict[int, str], wanted: Iterable[int]) -> list[int]:
         """The nodes without a name that `wanted` needs, in order."""
-        nodes = self.program.nodes
-        stack, needed = list(wanted), set()
-        while stack:
-            i = stack.pop()
-            if i not in names and i not in needed:
-                needed.add(i)
-                stack.extend(nodes[i].args)
-        return sorted(needed)
+        return needed(self.program.nodes, wanted, names)
 
     def statements(self, names: dict[int, str], wanted: Iterable[int]) -> None:
         """Adds statements for `wanted` and what it needs."""
@@ -92,7 +84,14 @@ class _Emitter:
             if node.op == "const":
                 names[i] = literal(node, self.program.dtype)
                 continue
+            if node.op == "result":
+                names[i] = self.calls.results[i]
+                continue
             args = [names[a] for a in node.args]
+            if node.op == "call":
+                self.lines += self.calls.statement(i, args)
+                names[i] = "called"
+                continue
             if node.op == "lookup":
                 text = f"f_lookup({self.tables[i]}, {len(node.value)}, {args[0]})"
             else:
@@ -104,33 +103,6 @@ class _Emitter:
         """The C function of the statements so far."""
         body, self.lines = "\n".join(self.lines), []
         return f"{head} {{\n{body}\n}}\n"
-
-
-def _unpacked(node: Node, place: str) -> str:
-    return f"splat({place}.f)" if node.kind == "f" else f"splat_i({place}.i)"
-
-
-class Layout(NamedTuple):
-    """Which numbers of a program stand where in the generated code."""
-
-    constants: list[int]
-    """Nodes that are computed once."""
-    columns: list[int]
-    """Nodes that are computed once a step."""
-    floats: list[int]
-    ints: list[int]
-    """Places in the carry."""
-
-    @staticmethod
-    def of(program: Program) -> Layout:
-        """That of a program."""
-        classes, kinds = program.classes(), program.kinds
-        return Layout(
-            frontier(program, classes, SHARED, lambda c: c != SHARED),
-            frontier(program, classes, TIME, lambda c: bool(c & LANE)),
-            [i for i, kind in enumerate(kinds) if kind == "f"],
-            [i for i, kind in enumerate(kinds) if kind != "f"],
-        )
 
 
 def sizes(program: Program, shared_leaves: int, lane_leaves: int) -> str:
@@ -148,10 +120,14 @@ def source(
     program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE, segment: int | None = None
 ) -> str:
     """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of `segment` operations if given."""
-    e, layout = _Emitter(program), Layout.of(program)
+    layout, tables = Layout.of(program), dict[str, str]()
+    calls = Calls(program, layout)
+    e = _Emitter(program, tables, calls)
+    functions = _functions(calls, tables, segment)
     before, after = target
-    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before), e.definitions]
-    parts += [_constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
+    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before)]
+    parts += [f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()]
+    parts += [*functions, _constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
     parts += [_advance_in_segments(e, segment, *layout) if segment else _advance(e, *layout)]
     return "\n".join([*parts, *map(header, after)])
 
@@ -159,6 +135,25 @@ def source(
 def header(name: str) -> str:
     """The text of a file in `c/`."""
     return (files("iblf_jax.lowering") / "c" / name).read_text()
+
+
+def _functions(calls: Calls, tables: dict[str, str], segment: int | None) -> list[str]:
+    """The functions that a program calls, each cut into some of `segment` operations if given."""
+    texts = []
+    for k, (function, given) in enumerate(zip(calls.functions, calls.given, strict=True)):
+        e = _Emitter(function, tables, calls)
+        names = {i: given[node.value] for i, node in enumerate(function.nodes) if node.op == "argument"}
+        if segment:
+            segments = _Segments(e, names, segment, f"part_{k}", SEEN_BY_FUNCTION)
+            parts = segments.add(sorted(set(function.samples)), kept=False)
+            texts += segments.functions
+            e.lines += [segments.room, *(f"  {part}" for part in parts)]
+        else:
+            e.statements(names, function.samples)
+        for i, place in zip(function.samples, places([function.nodes[i] for i in function.samples], "r", "s")[0], strict=True):
+            e.lines.append(f"  {place} = {names[i]};")
+        texts.append(e.function(f"SEPARATE void function_{k}({', '.join([*SEEN_BY_FUNCTION, 'F *r', 'I *s'])})"))
+    return texts
 
 
 def _constants(e: _Emitter, constants: list[int]) -> str:
@@ -175,7 +170,7 @@ def _part(node: Node) -> str:
 
 def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
     nodes = e.program.nodes
-    names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
+    names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: "index" for i, n in enumerate(nodes) if n.op == "index"}
     e.lines.append("  I index = from(first);")
     e.statements(names, columns)
@@ -193,7 +188,7 @@ HEAD_OF_ADVANCE = (
 
 def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
     program, nodes, classes = e.program, e.program.nodes, e.classes
-    names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
+    names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
     for c in [*floats, *ints]:
@@ -202,8 +197,9 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
         if program.carry[c][0] >= 0:
             names[program.carry[c][0]] = f"c{c}"
     e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
-    e.lines.append("  for (int s = 0; s < count; s++, row += COLUMNS) {")
-    names |= {i: _unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
+    e.lines += [e.calls.room, *e.calls.filled(names)] if e.calls.functions else []
+    e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
+    names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
     e.statements(names, [o for _, o in program.carry])
     if program.samples:
         _record(e, names)
@@ -218,14 +214,12 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
 class _Segments:
     """The statements of a long step, cut into functions of `size` operations; a number that one hands to another has a place in memory."""
 
-    head = (
-        "static __attribute__((noinline)) void {}(const word *constants, const F *leaves, const F *floats, const I *ints,\n"
-        "                    const word *row, F *__restrict__ x, I *__restrict__ y)"
-    )
-    arguments = "(constants, leaves, floats, ints, row, x, y)"
-
-    def __init__(self, e: _Emitter, names: dict[int, str], size: int):
-        self.e, self.names, self.size = e, names, size
+    def __init__(self, e: _Emitter, names: dict[int, str], size: int, name: str, parameters: tuple[str, ...]):
+        """`name` begins those of the functions; `parameters` are what they see of the function that calls them."""
+        self.e, self.names, self.size, self.name = e, names, size, name
+        places = ("F *__restrict__ x", "I *__restrict__ y")
+        self.head = f"SEPARATE void {{}}({', '.join([*parameters, *places])})"
+        self.arguments = f"({', '.join(p.split()[-1].lstrip('*') for p in [*parameters, *places])})"
         self.functions: list[str] = []
         self.free: dict[str, list[str]] = {"x": [], "y": []}
         self.sizes = {"x": 0, "y": 0}
@@ -233,7 +227,7 @@ class _Segments:
     def add(self, wanted: list[int], kept: bool) -> list[str]:
         """Cuts `wanted` and what it needs; returns the calls.  `kept`: their places are never given to other numbers."""
         nodes, needed = self.e.program.nodes, self.e.needed(self.names, wanted)
-        computed = [i for i in needed if nodes[i].op != "const"]
+        computed = [i for i in needed if nodes[i].op not in ("const", "result")]
         part = {i: k // self.size for k, i in enumerate(computed)}
         last = dict.fromkeys(computed, -1) | dict.fromkeys(wanted, len(computed))
         for i in computed:
@@ -243,11 +237,17 @@ class _Segments:
         calls = []
         for k in range(0, len(computed), self.size):
             here = computed[k : k + self.size]
-            calls.append(self._one(here, {i: last[i] for i in here if last[i] > part[i]}))
+            calls.append(self._one(here, {i: last[i] for i in here if last[i] > part[i] and nodes[i].op != "call"}))
             if not kept:
-                for i in (i for i in computed if i in self.names and last[i] == k // self.size):
+                for i in (i for i in computed if i in self.names and last[i] == k // self.size and nodes[i].op != "call"):
                     self.free[self.names[i][0]].append(self.names[i])
+        self.names |= {i: self.e.calls.results[i] for i in needed if nodes[i].op == "result"}
         return calls
+
+    @property
+    def room(self) -> str:
+        """The places."""
+        return f"  F x[{max(1, self.sizes['x'])}]; I y[{max(1, self.sizes['y'])}];"
 
     def _one(self, here: list[int], outlive: dict[int, int]) -> str:
         inner = dict(self.names)
@@ -259,7 +259,8 @@ class _Segments:
                 self.sizes[array] += 1
             self.names[i] = self.free[array].pop()
             self.e.lines.append(f"  {self.names[i]} = {inner[i]};")
-        name = f"segment_{len(self.functions)}"
+        self.names |= {i: inner[i] for i in here if self.e.program.nodes[i].op == "call"}
+        name = f"{self.name}_{len(self.functions)}"
         self.functions.append(self.e.function(self.head.format(name)))
         return f"{name}{self.arguments};"
 
@@ -274,20 +275,21 @@ def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> 
 def _advance_in_segments(e: _Emitter, segment: int, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
     """`_advance` for long steps, over which a compiler would take minutes: its time grows with the square of a function's length."""
     program, nodes, classes = e.program, e.program.nodes, e.classes
-    names = {i: _unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
-    names |= {i: _unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
+    names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
+    names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
     names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
-    segments = _Segments(e, names, segment)
+    segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
     before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
     outputs = sorted({o for _, o in program.carry})
     within = segments.add(sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False)
     signs = [f"  {places[c]} = -{places[c]};" for c in ints if program.kinds[c] == "b"]
     constant = {o: literal(nodes[o], program.dtype) for _, o in program.carry if nodes[o].op == "const"}
     moved = [(c, (segments.names | constant)[o]) for c, (a, o) in enumerate(program.carry) if a != o]
-    e.lines += [f"  F x[{max(1, segments.sizes['x'])}]; I y[{max(1, segments.sizes['y'])}];", *signs, *(f"  {call}" for call in before)]
-    e.lines += ["  for (int s = 0; s < count; s++, row += COLUMNS) {", *(f"  {call}" for call in within)]
+    e.lines += [segments.room, e.calls.room, *signs]
+    e.lines += [*(f"  {call}" for call in before), *e.calls.filled(segments.names)]
+    e.lines += ["  for (int step = 0; step < count; step++, row += COLUMNS) {", *(f"  {call}" for call in within)]
     if program.samples:
         _record(e, segments.names)
     e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
@@ -298,9 +300,9 @@ def _advance_in_segments(e: _Emitter, segment: int, constants: list[int], column
 
 def _record(e: _Emitter, names: dict[int, str]) -> None:
     """The samples of a step that is recorded, written for the runs that exist."""
-    e.lines.append("  if (every > 0 && (first + s) % every == 0) {")
+    e.lines.append("  if (every > 0 && (first + step) % every == 0) {")
     inner = dict(names)
     e.statements(inner, e.program.samples)
     e.lines.append(f"  F sample[] = {{{', '.join(inner[i] for i in e.program.samples)}}};")
-    e.lines.append("  write_sample(&records, sample, (first + s) / every, runs, run);")
+    e.lines.append("  write_sample(&records, sample, (first + step) / every, runs, run);")
     e.lines.append("  }")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jax.extend import core
 
+from iblf_jax.lowering.functions import apply
 from iblf_jax.lowering.program import Builder, Ids, UnsupportedError, constants
 from iblf_jax.lowering.rules import RULES
 
@@ -19,6 +20,9 @@ INLINED = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr",
 }  # fmt: skip
+
+READ_AGAIN = 50
+"""Equations up to which an inner function is read again at each call: that is as quick as to remember it."""
 
 
 def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Ids]) -> list[Ids]:
@@ -28,10 +32,22 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
     def read(atom):
         return constants(b, atom.val) if isinstance(atom, core.Literal) else known[atom]
 
+    live = _live(jaxpr)
+    uses = {id(eqn): tuple(v in live for v in eqn.outvars) for eqn in jaxpr.eqns}
+    calls: dict[int, list] = {}
     for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "jit":
+            calls.setdefault(id(eqn.params["jaxpr"]), []).append(uses[id(eqn)])
+
+    for eqn in jaxpr.eqns:
+        if not any(uses[id(eqn)]):
+            continue
         name = eqn.primitive.name
         operands = [read(v) for v in eqn.invars]
-        if name in INLINED:
+        results: Sequence[Ids | None]
+        if name == "jit" and len(eqn.params["jaxpr"].eqns) > READ_AGAIN:
+            results = apply(b, eqn.params["jaxpr"], operands, uses[id(eqn)], calls[id(eqn.params["jaxpr"])], closed)
+        elif name in INLINED:
             results = closed(b, eqn.params[INLINED[name]], operands)
         elif name in CONTROL:
             results = CONTROL[name](b, eqn, operands)
@@ -43,10 +59,21 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         else:
             raise UnsupportedError(f"the primitive {name!r} is not lowered")
         for v, ids in zip(eqn.outvars, results, strict=True):
+            if ids is None:
+                continue
             if ids.shape != v.aval.shape:
                 raise UnsupportedError(f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}")
             known[v] = ids
     return [read(v) for v in jaxpr.outvars]
+
+
+def _live(jaxpr: Any) -> set:
+    """The variables that the outputs need."""
+    live = {v for v in jaxpr.outvars if isinstance(v, core.Var)}
+    for eqn in reversed(jaxpr.eqns):
+        if any(v in live for v in eqn.outvars):
+            live.update(v for v in eqn.invars if isinstance(v, core.Var))
+    return live
 
 
 def _check_float(b: Builder, dtype, eqn) -> None:

@@ -70,6 +70,10 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
             operands.append(np.asarray(ids, np.int64).reshape(shape))
             read += ids if op == "carry" else []
     operands.append(np.asarray(b.input("index", 0, "i"), np.int64))
+    begin = len(shared.items) + len(lane.items)
+    for place, leaf in enumerate(jaxpr.jaxpr.outvars[: len(after)]):
+        if leaf is jaxpr.jaxpr.invars[begin + place]:
+            b.still.update(operands[begin + place].ravel().tolist())
     out = closed(b, jaxpr, operands)
     carry_out = [int(i) for ids in out[: len(after)] for i in ids.ravel()]
     samples = [_as_float(b, int(i)) for ids in out[len(after) :] for i in ids.ravel()]

@@ -8,8 +8,9 @@ the choice of their reciprocals.
 from __future__ import annotations
 
 from collections import Counter
+from functools import lru_cache
 
-from iblf_jax.lowering.program import INPUTS, LANE, Builder, Program, finished
+from iblf_jax.lowering.program import LANE, Builder, Program, finished
 
 
 def rebuilt(program: Program, rule) -> Program:
@@ -18,17 +19,27 @@ def rebuilt(program: Program, rule) -> Program:
     new: list[int] = []
     for i, node in enumerate(program.nodes):
         args = tuple(new[a] for a in node.args)
-        if node.op == "const":
-            new.append(b.constant(node.value, node.kind))
-        elif node.op in INPUTS:
-            new.append(b.input(node.op, node.value, node.kind))
-        elif node.op == "lookup":
-            new.append(b.lookup(node.value, *args))
-        else:
-            made = rule(b, node, args, i)
-            new.append(b.emit(node.op, *args, kind=node.kind) if made is None else made)
+        made = rule(b, node, args, i)
+        new.append(b.again(node, args) if made is None else made)
     carry_in = [new[a] if a >= 0 else -1 for a, _ in program.carry]
     return finished(b, carry_in, [new[o] for _, o in program.carry], [new[s] for s in program.samples], program.recorded)
+
+
+@lru_cache(maxsize=64)
+def written_out(program: Program) -> Program:
+    """The program with its functions written out wherever they are called."""
+    found: dict[int, list[int]] = {}
+
+    def rule(b: Builder, node, args, i):
+        if node.op == "call":
+            function, new = node.value, list[int]()
+            for inner in function.nodes:
+                new.append(args[inner.value] if inner.op == "argument" else b.again(inner, [new[a] for a in inner.args]))
+            found[i] = [new[s] for s in function.samples]
+            return -1
+        return found[node.args[0]][node.value] if node.op == "result" else None
+
+    return rebuilt(program, rule)
 
 
 def with_reciprocals(program: Program) -> Program:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +25,9 @@ from iblf_jax.lowering.identities import fold, simplify
 from iblf_jax.lowering.operations import OPERATIONS
 
 SHARED, LANE, TIME = 0, 1, 2
-INPUTS = ("shared", "lane", "carry", "index")
-"""Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step to step, number of the step."""
+INPUTS = ("shared", "lane", "carry", "index", "argument")
+"""Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step to step, number of the step, and of a
+function that a program calls, what it is given."""
 
 
 Ids = np.ndarray
@@ -51,6 +52,8 @@ def kind_of(dtype) -> str:
 class Node(NamedTuple):
     """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a constant, an input's index, or the
     numbers among which a "lookup" chooses by its whole-numbered argument (the nearest end, outside).
+
+    A "call" is no number: it has the results of a function, a program whose "samples" they are; a "result" is one of them.
     """
 
     op: str
@@ -70,6 +73,8 @@ class Limits(NamedTuple):
     """Numbers that the tables of one indexing may have in all."""
     scan: float = math.inf
     """Steps up to which an inner scan is unrolled."""
+    written_out: float = math.inf
+    """Nodes up to which a function is written out wherever it is called."""
 
 
 NO_LIMITS = Limits()
@@ -86,7 +91,10 @@ class Builder:
         self.sparse = sparse
         self.limits = limits
         self.nodes: list[Node] = []
+        self.still: set[int] = set()
+        """Nodes of carried numbers that a step leaves alone."""
         self._known: dict[tuple, int] = {}
+        self._moves: list[bool] = []
 
     def constant(self, value, kind: str) -> int:
         """The node of a constant."""
@@ -99,8 +107,11 @@ class Builder:
 
     def emit(self, op: str, *args: int, kind: str = "f") -> int:
         """The node of op(*args): folded, simplified, or new."""
-        nodes = [self.nodes[a] for a in args]
-        if all(n.op == "const" for n in nodes):
+        for a in args:
+            if self.nodes[a].op != "const":
+                break
+        else:
+            nodes = [self.nodes[a] for a in args]
             folded = fold(op, [n.value for n in nodes], [n.kind for n in nodes], kind, self.dtype)
             if folded is not None:
                 return self.constant(folded, kind)
@@ -112,6 +123,34 @@ class Builder:
     def lookup(self, table: tuple[float, ...], index: int) -> int:
         """The node of table[index], for an index that only the run knows."""
         return self._add(Node("lookup", (index,), "f", table), tuple(x.hex() for x in table))
+
+    def call(self, function: Program, args: Sequence[int]) -> int:
+        """The node of a call of a function."""
+        return self._add(Node("call", tuple(args), "call", function), id(function))
+
+    def result(self, call: int, number: int) -> int:
+        """The node of one of its results."""
+        function = self.nodes[call].value
+        return self._add(Node("result", (call,), function.nodes[function.samples[number]].kind, number), number)
+
+    def again(self, node: Node, args: Sequence[int]) -> int:
+        """A node of another builder, on nodes of this one."""
+        if node.op == "const":
+            return self.constant(node.value, node.kind)
+        if node.op in INPUTS:
+            return self.input(node.op, node.value, node.kind)
+        if node.op == "lookup":
+            return self.lookup(node.value, *args)
+        if node.op == "call":
+            return self.call(node.value, args)
+        return self.result(args[0], node.value) if node.op == "result" else self.emit(node.op, *args, kind=node.kind)
+
+    def moves(self, node: int) -> bool:
+        """Whether a node depends on what goes from step to step."""
+        for new in self.nodes[len(self._moves) :]:
+            moves = new.op in ("carry", "argument") and len(self._moves) not in self.still
+            self._moves.append(moves or any(self._moves[a] for a in new.args))
+        return self._moves[node]
 
     def value(self, node: int):
         """The value of a constant node, else None."""
@@ -141,7 +180,7 @@ class Program(NamedTuple):
       dtype: floating-point type of every "f".
       nodes: in an order in which each uses earlier ones only.
       carry: (input node, output node) of every number that goes from step to step; input -1 where the step does not read it.
-      samples: output nodes that a record may ask for.
+      samples: output nodes that a record may ask for; the results of a function.
       kinds: kind of every carried number.
       recorded: how many of the samples each recorded array has, in order.
     """
@@ -162,10 +201,13 @@ class Program(NamedTuple):
                 result.append(SHARED)
             elif node.op == "index":
                 result.append(TIME)
-            elif node.op in ("lane", "carry"):
+            elif node.op in ("lane", "carry", "argument"):
                 result.append(LANE if node.op == "lane" or i in fixed else LANE | TIME)
             else:
-                result.append(int(np.bitwise_or.reduce([result[a] for a in node.args], initial=0)))
+                found = 0
+                for a in node.args:
+                    found |= result[a]
+                result.append(found)
         return result
 
     def counts(self) -> dict[int, Counter]:
@@ -175,6 +217,23 @@ class Program(NamedTuple):
             if node.op not in INPUTS and node.op != "const":
                 result[c][node.op] += 1
         return result
+
+    @property
+    def size(self) -> int:
+        """Nodes that a compiler sees: those of a function once, however often it is called."""
+        functions = {id(node.value): node.value for node in self.nodes if node.op == "call"}
+        return len(self.nodes) + sum(function.size for function in functions.values())
+
+
+def needed(nodes: Sequence[Node], wanted: Iterable[int], known: Container[int] = ()) -> list[int]:
+    """The nodes that `wanted` needs, itself included, in order; what is known needs nothing and is left out."""
+    stack, found = list(wanted), set()
+    while stack:
+        i = stack.pop()
+        if i not in known and i not in found:
+            found.add(i)
+            stack.extend(nodes[i].args)
+    return sorted(found)
 
 
 def finished(builder: Builder, carry_in: list[int], carry_out: list[int], samples: list[int], recorded: tuple[int, ...] = ()) -> Program:

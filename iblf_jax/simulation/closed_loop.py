@@ -11,7 +11,6 @@ integrator) the compiler drops the rest.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +37,7 @@ def initial_state(scenario: Scenario) -> LoopState:
     return LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), scenario.observer.init(q, dq, scenario.model))
 
 
-@partial(jax.jit, inline=True)  # so that it is traced once for all the places that call it, and leaves no call behind
+@jax.jit  # so that it is traced once for all the places that call it, and `lowering` sees that they call one function
 def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0) -> tuple[LoopState, Sample]:
     """The rate of the state and the sample at time t.
 
