@@ -80,6 +80,19 @@ class Limits(NamedTuple):
 NO_LIMITS = Limits()
 
 
+def extend_classes(classes: list[int], nodes: Sequence[Node], still: Container[int]) -> None:
+    """Adds the classes of the nodes that have none yet; `still`: carried numbers that a step leaves alone, of class LANE."""
+    of_input = {"const": SHARED, "shared": SHARED, "index": TIME, "lane": LANE}
+    for node in nodes[len(classes) :]:
+        if node.args:
+            found = 0
+            for a in node.args:
+                found |= classes[a]
+        else:
+            found = LANE if len(classes) in still else of_input.get(node.op, LANE | TIME)
+        classes.append(found)
+
+
 class Builder:
     """Makes nodes; equal ones are made once."""
 
@@ -94,7 +107,7 @@ class Builder:
         self.still: set[int] = set()
         """Nodes of carried numbers that a step leaves alone."""
         self._known: dict[tuple, int] = {}
-        self._moves: list[bool] = []
+        self._classes: list[int] = []
 
     def constant(self, value, kind: str) -> int:
         """The node of a constant."""
@@ -146,11 +159,9 @@ class Builder:
         return self.result(args[0], node.value) if node.op == "result" else self.emit(node.op, *args, kind=node.kind)
 
     def moves(self, node: int) -> bool:
-        """Whether a node depends on what goes from step to step."""
-        for new in self.nodes[len(self._moves) :]:
-            moves = new.op in ("carry", "argument") and len(self._moves) not in self.still
-            self._moves.append(moves or any(self._moves[a] for a in new.args))
-        return self._moves[node]
+        """Whether a node is of class LANE|TIME."""
+        extend_classes(self._classes, self.nodes, self.still)
+        return self._classes[node] == LANE | TIME
 
     def value(self, node: int):
         """The value of a constant node, else None."""
@@ -194,20 +205,8 @@ class Program(NamedTuple):
 
     def classes(self) -> list[int]:
         """The class of every node (head of this module); a carried number that a step leaves alone is of class LANE."""
-        fixed = {a for a, b in self.carry if a == b}
         result: list[int] = []
-        for i, node in enumerate(self.nodes):
-            if node.op in ("shared", "const"):
-                result.append(SHARED)
-            elif node.op == "index":
-                result.append(TIME)
-            elif node.op in ("lane", "carry", "argument"):
-                result.append(LANE if node.op == "lane" or i in fixed else LANE | TIME)
-            else:
-                found = 0
-                for a in node.args:
-                    found |= result[a]
-                result.append(found)
+        extend_classes(result, self.nodes, {a for a, b in self.carry if a == b})
         return result
 
     def counts(self) -> dict[int, Counter]:
