@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.plan import Shape
 from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, fastest_mode, probe_steps, probed, start, verdict
 from iblf_jax.simulation.accuracy import places
@@ -62,12 +64,23 @@ class Batch(NamedTuple):
     """None: one run, and no array has a run axis."""
     shape: Shape = TOGETHER
     """How its parts are compiled."""
+    mechanism: Mechanism | None = None
+    """What of the robots is compiled in."""
 
     @staticmethod
-    def of(inputs: Inputs, varied: Mapping[str, jax.Array] | None, shape: Shape = TOGETHER) -> Batch:
+    def of(inputs: Inputs, varied: Mapping[str, jax.Array] | None, shape: Shape = TOGETHER, mechanism: Mechanism | None = None) -> Batch:
         """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
         runs = jax.tree.leaves(dict(varied))[0].shape[0] if varied else None
-        return Batch(split(inputs, varied or {}), runs, shape)
+        return Batch(split(inputs, varied or {}), runs, shape, mechanism)
+
+    @property
+    def known(self) -> tuple:
+        """What is known of the shared numbers."""
+        if self.mechanism is None:
+            return ()
+        one, other = iter(self.leaves.shared), iter(self.leaves.lane)
+        sizes = [math.prod(next(other).shape[1:]) if lane else next(one).size for lane in self.leaves.is_lane]
+        return self.mechanism.of_shared(self.leaves.is_lane, sizes)
 
     @property
     def dtype(self):

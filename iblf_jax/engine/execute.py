@@ -25,6 +25,7 @@ from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
+from iblf_jax.engine.mechanism import Mechanism, mechanism_of
 from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import Program, UnsupportedError
@@ -98,9 +99,9 @@ def _nodes(name: str, program: Program) -> int:
     return len(written_out(program).nodes) if name == "xla" else program.size
 
 
-def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], nested: bool = False) -> Batch:
+def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, nested: bool = False) -> Batch:
     shape = plan.lowered_shape(jax.default_backend(), _operations(inputs), len(next(iter(varied.values()))), nested)
-    return Batch.of(inputs, varied, shape)
+    return Batch.of(inputs, varied, shape, run.mechanism)
 
 
 def _operations(inputs: Inputs) -> int:
@@ -154,7 +155,7 @@ def run_batch(
     inputs = _inputs(scenario, folds, dt, run)
 
     def run_on(name):
-        return run_all(_executor(name), _lowered_batch(inputs, varied, nested), run)
+        return run_all(_executor(name), _lowered_batch(inputs, varied, run, nested), run)
 
     def on_scan():
         return _scanned(inputs, varied, nested, lambda batch: run_all(scan, batch, run))
@@ -171,7 +172,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
         is long or does not lower is, on "auto" and "xla", on scan, without a warning.
     """
     inputs = _inputs(scenario, folds, dt, run)
-    batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]})
+    batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)
 
     def run_on(name):
         return jax.tree.map(lambda x: x[0], run_all(_executor(name), batch, run))
@@ -205,7 +206,6 @@ def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> 
     return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 
-@partial(jax.jit, static_argnames=("step", "steps"))
 def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps: int = 1) -> tuple[Any, Any]:
     """A step of a kind of its own, made `steps` times from each of many states.
 
@@ -219,8 +219,13 @@ def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps:
     Returns:
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
-    inputs = _inputs(scenario, (), dt, Run(steps))
-    batch = Batch.of(inputs, None, plan.STATES)._replace(runs=jax.tree.leaves(carry)[0].shape[0])
+    return _run_from(scenario, dt, carry, step=step, run=Run(steps, mechanism=mechanism_of(scenario)))
+
+
+@partial(jax.jit, static_argnames=("step", "run"))
+def _run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, run: Run) -> tuple[Any, Any]:
+    inputs, steps = _inputs(scenario, (), dt, run), run.steps
+    batch = Batch.of(inputs, None, plan.STATES, run.mechanism)._replace(runs=jax.tree.leaves(carry)[0].shape[0])
     name = automatic()[0]
     if name != "xla" and _operations(inputs) <= plan.LONG_EVALUATION:
         try:
@@ -259,7 +264,7 @@ def run_batch_jvp(
     inputs, along = _inputs(scenario, folds, dt, run), Directions.of(directions)
 
     def run_on(name):
-        batch = _lowered_batch(inputs, varied, nested)
+        batch = _lowered_batch(inputs, varied, run, nested)
         if backend == "auto":
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
             if not plan.lowers_derivatives(name, _nodes(name, program), along.tangents):
@@ -272,11 +277,20 @@ def run_batch_jvp(
     return with_fallback(backend, run_on, on_scan)
 
 
-def chosen_backend(backend: str, scenario: Scenario, varied: Mapping[str, Any], folds: Any, dt: jax.Array, *, method: str) -> str:
+def chosen_backend(
+    backend: str,
+    scenario: Scenario,
+    varied: Mapping[str, Any],
+    folds: Any,
+    dt: jax.Array,
+    *,
+    method: str,
+    mechanism: Mechanism | None = None,
+) -> str:
     """The backend that a batch will run on, fallbacks and their warnings included; builds the kernels if it is a compiled one.
 
     Args:
-      backend, scenario, folds, dt, method: as `run_batch`.
+      backend, scenario, folds, dt, method, mechanism: as `run_batch`, and its `run`.
       varied: path -> values or their shapes, batch axis first.
 
     Returns:
@@ -286,19 +300,19 @@ def chosen_backend(backend: str, scenario: Scenario, varied: Mapping[str, Any], 
       ValueError: an unknown backend.
     """
     flat, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
-    return _chosen_backend(backend, method, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
+    run = Run(1, method, mechanism=mechanism)
+    return _chosen_backend(backend, run, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
 
 
 @lru_cache(maxsize=64)
-def _chosen_backend(backend: str, method: str, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
+def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
     """`chosen_backend` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
 
     def trace(leaves):
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
-        run = Run(1, method)
 
         def run_on(name):
-            run_all(_executor(name), _lowered_batch(_inputs(scenario, folds, dt, run), varied), run)
+            run_all(_executor(name), _lowered_batch(_inputs(scenario, folds, dt, run), varied, run), run)
             return name
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))

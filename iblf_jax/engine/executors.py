@@ -101,7 +101,7 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
     # A derivative's literal zero says "does not depend".
     sparse = getattr(step, "is_derivative", False)
     shapes = Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), Shapes.of(flat, 1)
-    return lowered(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse)
+    return lowered(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
 
 
 def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]]) -> Executor:

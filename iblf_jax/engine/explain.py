@@ -14,6 +14,7 @@ from iblf_jax.core import checks
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import automatic
 from iblf_jax.engine.executors import program_of
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Inputs, TimeStep
 from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.passes import written_out
@@ -78,7 +79,7 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
-    one = Batch.of(Inputs(scenario, folds, *jnp.asarray([1e-3, 1.0], dtype)), leaves)
+    one = Batch.of(Inputs(scenario, folds, *jnp.asarray([1e-3, 1.0], dtype)), leaves, mechanism=mechanism_of(scenario))
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)

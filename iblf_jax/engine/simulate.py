@@ -14,6 +14,7 @@ from iblf_jax.bounds import tube_at
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine import execute
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
@@ -101,7 +102,7 @@ def simulate_unchecked(scenario: Scenario, folds, dt, *, steps: int, method: str
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds)):
-        outcome = _run_one(scenario, folds, dt, run, backend=backend)
+        outcome = _run_one(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend)
     else:
         outcome = _run_transformable(scenario, folds, dt, run)
     arrays, controller_state, observer_state = outcome.records

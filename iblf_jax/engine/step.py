@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
+from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.simulation import accuracy, integrators, stability
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
@@ -36,6 +37,8 @@ class Run(NamedTuple):
     method: str = "rk4"
     record_every: int | None = None
     """Every so-many-th instant is recorded, from t = 0; None: metrics only."""
+    mechanism: Mechanism | None = None
+    """What of the robots is compiled in."""
 
 
 class Inputs(NamedTuple):

@@ -93,10 +93,12 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
     pattern: list[tuple] = []
     for place, i in enumerate(operands):
         node = b.nodes[i]
-        if node.op == "const":
+        if i == b.absent:
+            pattern.append((node.kind, None))
+        elif node.op == "const":
             pattern.append((node.kind, node.value.hex() if node.kind == "f" else node.value))
         else:
-            pattern.append((node.kind, first.setdefault(i, place), b.moves(i)))
+            pattern.append((node.kind, first.setdefault(i, place), b.moves(i), i in b.known_finite))
     return tuple(pattern)
 
 
@@ -104,10 +106,15 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
 def _template(called: Called) -> Template:
     b = Builder(called.dtype, sparse=called.sparse, limits=called.limits._replace(written_out=math.inf))
 
-    def node_of(kind, value, *moves):
-        if not moves:
+    def node_of(kind, value, *known):
+        if value is None:
+            return b.absent
+        if not known:
             return b.constant(float.fromhex(value) if kind == "f" else value, kind)
-        return b.input("argument" if moves[0] else "shared", value, kind)
+        moves, finite = known
+        node = b.input("argument" if moves else "shared", value, kind)
+        b.known_finite.update([node] if finite else [])
+        return node
 
     numbers = iter([node_of(*entry) for entry in called.pattern])
     operands = [np.asarray([next(numbers) for _ in range(math.prod(shape))], np.int64).reshape(shape) for shape in called.shapes]

@@ -37,6 +37,18 @@ def simplify(b: Builder, op: str, args: tuple[int, ...], kind: str) -> int | Non
     return rule(b, args, kind) if rule else None
 
 
+def without_absent(b: Builder, op: str, args: tuple[int, ...]) -> int | None:
+    """op(*args), of which one is not there (`Builder.absent`); None for an operation to which it is a zero as any other."""
+    x, y = args[0], args[-1]
+    if op in ("mul", "neg") or (op == "div" and y != b.absent):
+        return b.absent
+    if op == "add":
+        return y if x == b.absent else x
+    if op == "sub":
+        return x if y == b.absent else b.emit("neg", y)
+    return None
+
+
 def _add(b: Builder, args, kind):
     x, y = args
     for one, other in ((x, y), (y, x)):
@@ -51,6 +63,8 @@ def _sub(b: Builder, args, kind):
     x, y = args
     if b.value(y) == 0:
         return x
+    if x == y and x in b.known_finite:
+        return b.absent
     if b.value(x) == 0 and kind == "f":
         return b.emit("neg", y, kind=kind)
     if b.nodes[y].op == "neg":
@@ -64,6 +78,8 @@ def _mul(b: Builder, args, kind):
             return other
         if b.sparse and b.value(one) == 0 and kind == "f":
             return one
+        if b.value(one) == 0 and other in b.known_finite:
+            return b.absent
         if b.value(one) == -1:
             return b.emit("neg", other, kind=kind)
         if b.nodes[one].op == "neg":

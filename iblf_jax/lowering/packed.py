@@ -12,7 +12,7 @@ import numpy as np
 
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.passes import with_reciprocals
-from iblf_jax.lowering.program import Builder, Limits, Program, UnsupportedError, finished, kind_of
+from iblf_jax.lowering.program import Builder, Known, Limits, Program, UnsupportedError, finished, kind_of
 
 
 class Shapes(NamedTuple):
@@ -48,10 +48,19 @@ class Lowered(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry: Shapes, limits: Limits, sparse: bool = False) -> Lowered:
+def lowered(
+    step: Callable,
+    dtype: np.dtype,
+    shared: Shapes,
+    lane: Shapes,
+    carry: Shapes,
+    limits: Limits,
+    sparse: bool = False,
+    known: tuple[Known | None, ...] = (),
+) -> Lowered:
     """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, records)`.
 
-    `limits`: what is too long; `sparse`: for steps that hold derivatives, see `Builder`.
+    `limits`: what is too long; `sparse`: for steps that hold derivatives, see `Builder`; `known`: of each shared number.
 
     Raises:
       UnsupportedError: the step holds something that a scalar program cannot express.
@@ -65,7 +74,7 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
         for shape, array_dtype in group.items:
             kind = _accepted(kind_of(array_dtype), array_dtype, op, dtype)
             size = int(np.prod(shape))
-            ids = [b.input(op, count + i, kind) for i in range(size)]
+            ids = [_shared(b, i, known) if op == "shared" else b.input(op, i, kind) for i in range(count, count + size)]
             count += size
             operands.append(np.asarray(ids, np.int64).reshape(shape))
             read += ids if op == "carry" else []
@@ -81,6 +90,18 @@ def lowered(step: Callable, dtype: np.dtype, shared: Shapes, lane: Shapes, carry
         raise UnsupportedError("the step changes the types of what it carries")
     program = finished(b, read, carry_out, samples, tuple(ids.size for ids in out[len(after) :]))
     return Lowered(with_reciprocals(program), records)
+
+
+def _shared(b: Builder, number: int, known: tuple[Known | None, ...]) -> int:
+    """The node of a shared number."""
+    found = known[number] if known else None
+    if found is None:
+        return b.input("shared", number, "f")
+    if found.value is not None:
+        return b.constant(found.value, "f") if found.value else b.absent
+    node = b.input("shared", number if found.same is None else found.same, "f")
+    b.known_finite.add(node)
+    return node if found.sign > 0 else b.emit("neg", node)
 
 
 def _accepted(kind: str, array_dtype, op: str, dtype) -> str:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.lowering.identities import fold, simplify
+from iblf_jax.lowering.identities import fold, simplify, without_absent
 from iblf_jax.lowering.operations import OPERATIONS
 
 SHARED, LANE, TIME = 0, 1, 2
@@ -60,6 +60,16 @@ class Node(NamedTuple):
     args: tuple[int, ...]
     kind: str
     value: Any = None
+
+
+class Known(NamedTuple):
+    """What is known beforehand of a shared number that is finite."""
+
+    value: float | None = None
+    """0, 1 or -1, if it is that: a constant, and what is multiplied by such a zero is not there."""
+    same: int | None = None
+    """The shared number that it is equal to, up to a sign."""
+    sign: int = 1
 
 
 class Limits(NamedTuple):
@@ -108,6 +118,10 @@ class Builder:
         """Nodes of carried numbers that a step leaves alone."""
         self._known: dict[tuple, int] = {}
         self._classes: list[int] = []
+        self.known_finite: set[int] = set()
+        """Inputs that are known to be finite (`Known`), and what was computed of them alone."""
+        self.absent = self._add(Node("const", (), "f", 0.0), "absent")
+        """The zero of what is not there: a product with it is not there either, whatever the other factor."""
 
     def constant(self, value, kind: str) -> int:
         """The node of a constant."""
@@ -120,6 +134,10 @@ class Builder:
 
     def emit(self, op: str, *args: int, kind: str = "f") -> int:
         """The node of op(*args): folded, simplified, or new."""
+        if self.absent in args and kind == "f":
+            rest = without_absent(self, op, args)
+            if rest is not None:
+                return rest
         for a in args:
             if self.nodes[a].op != "const":
                 break
@@ -131,7 +149,10 @@ class Builder:
         simpler = simplify(self, op, args, kind)
         if simpler is not None:
             return simpler
-        return self._add(Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None)
+        new = self._add(Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None)
+        if self.known_finite and all(a in self.known_finite or self.nodes[a].op == "const" for a in args):
+            self.known_finite.add(new)
+        return new
 
     def lookup(self, table: tuple[float, ...], index: int) -> int:
         """The node of table[index], for an index that only the run knows."""

@@ -62,8 +62,11 @@ def rotation(quaternion: jax.Array) -> jax.Array:
     """Rotation matrices of quaternions (w, x, y, z) of any length but zero, (..., 4) -> (..., 3, 3)."""
     q = unit(quaternion)
     w, v, one = q[..., :1, None], q[..., 1:], jnp.eye(3, dtype=q.dtype)
-    straight = (w**2 - jnp.sum(v**2, axis=-1)[..., None, None]) * one
-    return straight + 2.0 * (v[..., :, None] * v[..., None, :] + w * cross(one, v[..., None, :]))
+    # Square by square, so that equal ones cancel: a right angle has zeros on the diagonal.
+    signs = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]], q.dtype)
+    diagonal = jnp.sum(signs * (q**2)[..., None, :], axis=-1)
+    above = 2.0 * (v[..., :, None] * v[..., None, :] + w * cross(one, v[..., None, :]))
+    return jnp.where(np.eye(3, dtype=bool), diagonal[..., None], above)
 
 
 def pseudo_inertia(mass: jax.Array, centre: jax.Array, inertia: jax.Array) -> jax.Array:

@@ -25,6 +25,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import Status, flag
 from iblf_jax.engine import plan
 from iblf_jax.engine.execute import chosen_backend, run_batch
+from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.step import Run
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
@@ -36,6 +37,7 @@ class StudyRun(NamedTuple):
     steps: int
     method: str
     backend: str
+    mechanism: Mechanism | None = None
 
 
 class StudyInputs(NamedTuple):
@@ -90,14 +92,16 @@ def with_chosen_backend(program: StudyRun, shared: StudyInputs, lanes: Lanes) ->
       ValueError: an unknown backend.
     """
     varied, _, _ = jax.eval_shape(partial(_draws, program), shared, lanes)
-    backend = chosen_backend(program.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=program.method)
+    backend = chosen_backend(
+        program.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=program.method, mechanism=program.mechanism
+    )
     return program._replace(backend=backend)
 
 
 def _block(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
     """Draws and runs one block."""
     varied, drawn, admissible = _draws(program, shared, lanes)
-    run = Run(program.steps, program.method)
+    run = Run(program.steps, program.method, mechanism=program.mechanism)
     outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=program.backend)
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
@@ -107,7 +111,7 @@ def _block(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
 def _record_block(program: StudyRun, shared: StudyInputs, lanes: Lanes, record_every: int):
     """Positions of a block's runs, (B, T, n), and their status."""
     varied, _, admissible = _draws(program, shared, lanes)
-    run = Run(program.steps, program.method, record_every)
+    run = Run(program.steps, program.method, record_every, program.mechanism)
     outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=program.backend)
     arrays = outcome.records[0]
     return {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}, arrays["t"], outcome.status, admissible

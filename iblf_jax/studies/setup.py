@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -90,7 +91,7 @@ def prepare(
         shapes = sample_size(targets, by_path)
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
-    program = StudyRun(targets, steps, method, backend)
+    program = StudyRun(targets, steps, method, backend, mechanism_of(scenario))
     shared = StudyInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), folds, step)
     setup = Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
     return dataclasses.replace(setup, program=with_chosen_backend(program, shared, setup.lanes(np.arange(block_size()))))

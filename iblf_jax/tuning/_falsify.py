@@ -27,6 +27,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import Run
@@ -137,7 +138,8 @@ def falsify(
     checks.fits("iterations", iterations, 8 * starts)
     cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
-    push = partial(_push, cube, jnp.asarray(dt, dtype), steps=steps, method=method, backend=backend)
+    run = Run(steps, method, mechanism=mechanism_of(scenario))
+    push = partial(_push, cube, jnp.asarray(dt, dtype), run=run, backend=backend)
     seed = check_seed(seed)
     u = cube.admissible_points(starts, [seed, 3])
     last_valid, ever, best, history = u.copy(), np.zeros(starts, bool), None, []
@@ -181,13 +183,13 @@ def _back(refused: Callable[[np.ndarray], str], last_valid: np.ndarray, ahead: n
     return last_valid
 
 
-@partial(jax.jit, static_argnames=("steps", "method", "backend"))
-def _push(cube: Cube, dt, u, *, steps, method, backend):
+@partial(jax.jit, static_argnames=("run", "backend"))
+def _push(cube: Cube, dt, u, *, run, backend):
     """Smallest margin (S,) [rad], its gradient by u (S, d) and the status of each attack."""
     one: Any = jnp.ones_like(dt)
     fold = Quantities((Peak(one, "deficit", smoothing=one * SMOOTHING),))
     varied = jax.vmap(cube.values)(u)
     slopes = jax.vmap(jax.jacfwd(cube.values))(u)
-    found = by_coordinates(cube.cases.scenario, varied, slopes, (fold,), dt, Run(steps, method), backend=backend)
+    found = by_coordinates(cube.cases.scenario, varied, slopes, (fold,), dt, run, backend=backend)
     margin = -found.outcome.metrics["tuning_exact"][:, 0]
     return margin, -found.tangents["tuning_smooth"][:, :, 0], found.outcome.status

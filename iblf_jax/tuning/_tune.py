@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS, differentiates_forward
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -207,7 +208,8 @@ def build(
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
-    formulation = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, timing.get("backend", "auto"))
+    backend, mechanism = timing.get("backend", "auto"), mechanism_of(scenario)
+    formulation = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, backend, mechanism=mechanism)
     problem = Problem(formulation, ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step), box, runs)
     if not is_complete(goal):
         derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch, run_for_reverse
+from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
@@ -48,6 +49,8 @@ class Formulation(NamedTuple):
     """What values and forward mode run on; reverse mode is plain XLA."""
     nested: bool = False
     """Whether they are called from a loop of JAX's."""
+    mechanism: Mechanism | None = None
+    """What of the robots is compiled in."""
 
 
 class ProblemInputs(NamedTuple):
@@ -186,7 +189,7 @@ def value(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Va
         varied,
         fold,
         shared.dt,
-        Run(formulation.steps, formulation.method),
+        Run(formulation.steps, formulation.method, mechanism=formulation.mechanism),
         backend=formulation.backend,
         nested=formulation.nested,
     )
@@ -204,7 +207,7 @@ def slope(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Sl
     moving = {path: x for path, x in _flat(jacobian).items() if any(overlap(path, block.path) for block in formulation.blocks)}
     tied = [b.path for b in formulation.blocks if b.size == 1 and not any(overlap(b.path, t.path) for t in formulation.targets)]
     varied = _flat(_of_lanes(formulation, shared, lanes))
-    run = Run(formulation.steps, formulation.method)
+    run = Run(formulation.steps, formulation.method, mechanism=formulation.mechanism)
     found = by_coordinates(
         shared.cases.scenario, varied, moving, fold, shared.dt, run, backend=formulation.backend, nested=formulation.nested, together=tied
     )

@@ -14,6 +14,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.simulate import simulate_unchecked
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation import paths
@@ -44,9 +45,9 @@ class AtLimit(NamedTuple):
         return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}"
 
 
-@partial(jax.jit, static_argnames=("steps", "method", "backend"))
-def _slice(scenario, changes, folds, dt, *, steps, method, backend):
-    return run_batch(scenario, changes, folds, dt, Run(steps, method), backend=backend)
+@partial(jax.jit, static_argnames=("run", "backend"))
+def _slice(scenario, changes, folds, dt, *, run, backend):
+    return run_batch(scenario, changes, folds, dt, run, backend=backend)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -200,9 +201,8 @@ class TuneResult:
         setup, scenario = self.setup, canonical(self.scenario)
         dtype = scenario.initial.q.dtype
         folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario.n)
-        steps = checks.whole_steps(setup.duration, setup.dt)
-        options = {"steps": steps, "method": setup.method, "backend": setup.backend}
-        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), **options)
+        run = Run(checks.whole_steps(setup.duration, setup.dt), setup.method, mechanism=mechanism_of(scenario))
+        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), run=run, backend=setup.backend)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
         valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
         return a, b, np.where(valid, np.asarray(values), np.inf).reshape(points, points)

@@ -1,0 +1,78 @@
+"""What of a robot's mechanism is compiled in: which numbers of its geometry are 0, 1 or -1, and which are equal to others.
+
+Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree.  A scalar program that knows it needs fewer
+operations.  Numbers themselves are never compiled in, nor anything of masses, gains and loads, so new ones compile nothing: a robot says
+which of its fields are its `geometry`.  What differs between runs is not shared, and nothing is known of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.lowering.program import Known
+from iblf_jax.simulation.scenario import Scenario
+
+QUATERNIONS = ("rotation", "tip_rotation")
+"""Fields whose rows hold equal numbers for a reason: a right angle."""
+
+
+class Mechanism(NamedTuple):
+    """What is known of every number of a scenario, leaf after leaf, None where nothing is; hashable."""
+
+    numbers: tuple[Known | None, ...]
+
+    def of_shared(self, is_lane: Sequence[bool], sizes: Sequence[int]) -> tuple[Known | None, ...]:
+        """What is known of the numbers that are shared, for leaves of these sizes of which the scenario's come first."""
+        place: dict[int, int] = {}
+        number = 0
+        for lane, size in zip(is_lane, sizes, strict=True):
+            if not lane:
+                place.update({number + i: len(place) + i for i in range(size)})
+            number += size
+        found: list[Known | None] = [None] * len(place)
+        for i, known in enumerate(self.numbers):
+            if known is not None and i in place:
+                same = known.same if known.same is None else place.get(known.same)
+                found[place[i]] = known._replace(same=same)
+        return tuple(found)
+
+
+def mechanism_of(scenario: Scenario) -> Mechanism | None:
+    """What is known of a scenario's numbers; None where they are tracers, or no robot has a geometry."""
+    robots = {name: getattr(getattr(scenario, name), "geometry", ()) for name in ("plant", "model")}
+    if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
+        return None
+    numbers: list[Known | None] = []
+    begin: dict[str, tuple[int, np.ndarray]] = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
+        names = [getattr(key, "name", "") for key in path]
+        if len(names) == 2 and names[1] in robots.get(names[0], ()):
+            values = np.asarray(leaf, float)
+            twin = begin.get(names[1])
+            begin.setdefault(names[1], (len(numbers), values))
+            row = values.shape[-1] if names[1] in QUATERNIONS else 1
+            flat = values.ravel()
+            for i, x in enumerate(flat):
+                numbers.append(_known(x, flat[i - i % row : i], len(numbers) - i % row))
+                if twin and numbers[-1] == Known() and twin[1].shape == values.shape and twin[1].flat[i] == x:
+                    numbers[-1] = Known(same=twin[0] + i)
+        else:
+            numbers += [None] * int(np.size(leaf))
+    return Mechanism(tuple(numbers))
+
+
+def _known(x: float, before: np.ndarray, start: int) -> Known | None:
+    """What is known of a number, given those before it in its row, of which the first has the number `start`."""
+    if not np.isfinite(x):
+        return None
+    if x in (0.0, 1.0, -1.0):
+        return Known(float(x))
+    for k, y in enumerate(before):
+        if abs(x) == abs(y):
+            return Known(same=start + k, sign=int(np.sign(x) * np.sign(y)))
+    return Known()

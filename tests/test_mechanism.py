@@ -1,0 +1,150 @@
+"""The mechanism that is compiled in: which zeros of an arm are left out, that every number still counts, and that nothing hides a NaN."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_lowering import DT, PRESET, STANDARD, evaluate, numbers
+
+import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.engine import execute
+from iblf_jax.engine.batch import Batch, begin
+from iblf_jax.engine.executors import program_of, scan
+from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.step import Form, Inputs, Run, TimeStep
+from iblf_jax.lowering.passes import written_out
+from iblf_jax.lowering.program import LANE, TIME
+from iblf_jax.simulation.paths import get, with_parameters
+from iblf_jax.simulation.scenario import canonical
+
+QUARTER = (0.7071067811865476, 0.7071067811865475, 0.0, 0.0)
+"""A turn about x by a right angle."""
+STEP = TimeStep("euler")
+
+
+@lru_cache(maxsize=1)
+def square_arm() -> ij.Scenario:
+    """The paper's law on an arm of two joints with right angles; the model has no load."""
+    arm = ij.robots.Arm(
+        mass=[2.0, 1.0],
+        centre=[[0.1, 0.0, 0.0], [0.0, 0.2, 0.05]],
+        inertia=[[0.02, 0.03, 0.03, 0.0, 0.0, 0.0], [0.01, 0.01, 0.02, 0.0, 0.001, 0.0]],
+        position=[[0.0, 0.0, 0.3], [0.4, 0.0, 0.0]],
+        rotation=[[1.0, 0.0, 0.0, 0.0], QUARTER],
+        tip_position=[0.0, 0.0, 0.25],
+        tip_rotation=QUARTER,
+        payload=0.5,
+    )
+    return canonical(dataclasses.replace(PRESET, plant=arm, model=dataclasses.replace(arm, payload=0.0)))
+
+
+FIELDS = [f.name for f in dataclasses.fields(ij.robots.Arm) if isinstance(getattr(square_arm().plant, f.name), jax.Array)]
+
+
+def batch_of(scenario, varied=()) -> Batch:
+    """One run, lowered with what is known of the mechanism."""
+    leaves = {path: jnp.asarray(get(scenario, path))[None] for path in ("initial.q", *varied)}
+    return Batch.of(Inputs(scenario, STANDARD, jnp.asarray(DT), jnp.asarray(10.0)), leaves, mechanism=mechanism_of(scenario))
+
+
+def lowered(scenario, varied=()):
+    """The batch, a carry, and the program of a step."""
+    batch = batch_of(scenario, varied)
+    carries, _ = begin(scan, batch, "euler")
+    return batch, carries, written_out(program_of(STEP, batch, carries).program)
+
+
+@jax.jit
+def by_jax(inputs, carry, index):
+    return jax.tree.leaves(STEP(inputs, carry, index, Form())[0])
+
+
+def both(scenario, varied=()):
+    """What a step gives by its program and by JAX."""
+    batch, carries, program = lowered(scenario, varied)
+    carry, lane = (jax.tree.map(lambda x: x[0], x) for x in (carries, batch.leaves.lane))
+    inputs = batch.leaves.together(batch.leaves.shared, lane)
+    values = (numbers(x) for x in (batch.leaves.shared, lane, jax.tree.leaves(carry)))
+    index = jnp.int32(3)
+    return evaluate(program, *values, index), numbers(by_jax(inputs, carry, index))
+
+
+def moving(program) -> int:
+    return sum(program.counts()[LANE | TIME].values())
+
+
+def nothing_known(scenario) -> int:
+    """Operations of a step that knows nothing of the mechanism."""
+    batch = batch_of(scenario)._replace(mechanism=None)
+    return moving(written_out(program_of(STEP, batch, begin(scan, batch, "euler")[0]).program))
+
+
+def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_joints():
+    scenario = square_arm()
+    assert moving(lowered(scenario)[2]) < 0.8 * nothing_known(scenario)
+
+
+@pytest.mark.parametrize("robot", ["plant", "model"])
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_number_of_an_arm_counts_once_it_is_changed(robot, field):
+    """Zeros, ones and equal numbers, each made a number of its own: the program is that of the new arm."""
+    scenario, path = square_arm(), f"{robot}.{field}"
+    before = np.asarray(get(scenario, path))
+    change = 0.01 * np.abs(np.cos(1.0 + np.arange(before.size))).reshape(before.shape)
+    by_program, expected = both(with_parameters(scenario, {path: jnp.asarray(np.where(np.isfinite(before), before + change, before))}))
+    np.testing.assert_allclose(by_program, expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("path", ["plant.axis", "model.rotation", "plant.g", "plant.position[0]", "model.tip_position"])
+def test_what_differs_between_runs_is_never_compiled_in(path):
+    """The same program for other numbers: a run beside it may have anything there."""
+    scenario = square_arm()
+    batch, carries, program = lowered(scenario, (path,))
+    carry = jax.tree.map(lambda x: x[0], carries)
+    moved = [x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape)) for x in batch.leaves.lane]
+    inputs = batch.leaves.together(batch.leaves.shared, moved)
+    values = (numbers(x) for x in (batch.leaves.shared, moved, jax.tree.leaves(carry)))
+    expected = numbers(by_jax(inputs, carry, jnp.int32(3)))
+    np.testing.assert_allclose(evaluate(program, *values, 3), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("path", ["plant.mass", "model.mass[0]", "plant.payload", "plant.carried.mass", "controller.K2", "model.armature"])
+@pytest.mark.parametrize("value", [1e-6, 1.0, 2.0, 0.7])
+def test_new_masses_gains_and_loads_compile_nothing(path, value):
+    scenario = square_arm()
+    changed = with_parameters(scenario, {path: jnp.full_like(get(scenario, path), value)})
+    assert mechanism_of(changed) == mechanism_of(scenario)
+    assert hash(mechanism_of(changed)) == hash(mechanism_of(scenario))
+
+
+def test_another_number_that_is_none_of_these_compiles_nothing():
+    scenario = square_arm()
+    longer = {f"{robot}.position[1]": jnp.asarray([0.5, 0.0, 0.0]) for robot in ("plant", "model")}
+    assert mechanism_of(with_parameters(scenario, longer)) == mechanism_of(scenario)
+    assert mechanism_of(with_parameters(scenario, {"plant.position[1]": jnp.asarray([0.5, 0.0, 0.0])})) != mechanism_of(scenario)
+
+
+def test_robots_without_a_geometry_and_tracers_have_none():
+    assert mechanism_of(canonical(PRESET)) is None
+    jax.jit(lambda s: jnp.asarray([mechanism_of(s) is None]) if mechanism_of(s) is None else pytest.fail("read a tracer"))(square_arm())
+
+
+@partial(jax.jit, static_argnames="run")
+def status_of(scenario, *, run):
+    return execute.run_batch(scenario, {"initial.q": scenario.initial.q[None]}, STANDARD, jnp.asarray(DT), run, backend="native").status[0]
+
+
+@pytest.mark.parametrize("path", ["initial.q", "initial.dq", "plant.mass", "plant.position", "model.g", "controller.K2"])
+def test_a_run_that_is_not_finite_is_seen_to_be_so(path):
+    """A product with a zero of the mechanism is left out, whatever the other factor: no run may look sound by it."""
+    scenario = square_arm()
+    value = get(scenario, path)
+    for number, expected in ((value, 0), (jnp.full_like(value, jnp.nan), int(Status.NOT_FINITE))):
+        changed = jax.jit(lambda s, x: with_parameters(s, {path: x}))(scenario, number)  # where nothing looks at the number
+        assert int(status_of(changed, run=Run(5, "euler", mechanism=mechanism_of(changed)))) & int(Status.NOT_FINITE) == expected
