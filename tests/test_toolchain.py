@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -19,6 +20,7 @@ from conftest import ROOT
 
 from iblf_jax import cli
 from iblf_jax.core import drafts
+from iblf_jax.core.cache import directory, keep_programs
 from iblf_jax.engine import execute, native
 from iblf_jax.lowering import nvrtc, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
@@ -171,6 +173,7 @@ def chosen_cache(monkeypatch):
     monkeypatch.setattr(jax.config, "update", seen.__setitem__)
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
     monkeypatch.setattr(warnings, "warn", lambda text, *_, **__: said.append(text))
+    keep_programs.cache_clear()
     cli.prepare_jax()
     return seen.get("jax_compilation_cache_dir"), said
 
@@ -200,8 +203,62 @@ def test_files_and_folders_of_others_are_not_used(cache, monkeypatch):
     (cache / "jit_run-cache").unlink()
     os.chown(cache, 12345, 12345)
     assert chosen_cache(monkeypatch)[0] is None
-    with pytest.raises(ToolchainError, match="not a directory of this user"):
-        toolchain.cache_directory()
+    with pytest.raises(OSError, match="not a directory of this user"):
+        directory()
+
+
+def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
+    """A file that is no program of ours or JAX's stays, and so does what another process may be about to load."""
+    cache.mkdir(parents=True)
+    now, days = time.time(), 24 * 3600.0
+    for name, age in (("a.so", 9 * days), ("jit_b-cache", 7 * days), ("c.so", 5 * days), ("d.so", 60.0), ("notes.txt", 99 * days)):
+        (cache / name).write_bytes(bytes(1000))
+        os.utime(cache / name, (now - age, now - age))
+    monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 2500)
+    chosen_cache(monkeypatch)
+    assert sorted(path.name for path in cache.iterdir()) == ["c.so", "d.so", "notes.txt"]
+    monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 0)
+    chosen_cache(monkeypatch)
+    assert sorted(path.name for path in cache.iterdir()) == ["d.so", "notes.txt"]
+
+
+FRESH = """
+import jax
+events = []
+jax.monitoring.register_event_listener(lambda name, **_: events.append(name))
+import jax.numpy as jnp
+jnp.ones(3) + 1.0  # something of the user's that JAX has compiled before
+import iblf_jax as ij
+print(repr(jax.config.jax_compilation_cache_dir), end=" ")
+ij.simulate(ij.presets.zhang_yan_2024(), duration=0.1, dt=1e-3)
+print(repr(jax.config.jax_compilation_cache_dir), [sum(e.endswith(x) for e in events) for x in ("cache_hits", "cache_misses")])
+"""
+
+
+def fresh(tmp_path, **more: str) -> list[str]:
+    """What a user's script prints in a process of its own: JAX's folder at the import and after a run, hits and misses."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT), **more}
+    done = subprocess.run([sys.executable, "-c", FRESH], env=environment, check=True, capture_output=True, text=True, timeout=250)
+    return done.stdout.split(" ", 2)
+
+
+@pytest.mark.slow
+def test_a_script_keeps_its_programs_without_being_told(tmp_path):
+    """Not at the import, but from the first run on; a second process compiles nothing of it."""
+    folder = repr(str(tmp_path / "iblf_jax"))
+    for again in (False, True):
+        before, after, counts = fresh(tmp_path)
+        assert (before, after) == ("None", folder)
+        hits, misses = json.loads(counts)
+        assert (misses == 0 < hits) if again else (misses > hits)
+
+
+@pytest.mark.slow
+def test_who_told_jax_is_obeyed(tmp_path):
+    own = str(tmp_path / "own")
+    assert fresh(tmp_path, JAX_COMPILATION_CACHE_DIR=own)[:2] == [repr(own), repr(own)]
+    assert fresh(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0")[:2] == ["None", "None"]
 
 
 # ------------------------------------------------------------------------------------------------------------- an unusable cache
@@ -272,7 +329,7 @@ UNUSABLE = {
 def test_an_unusable_cache_is_one_line_and_xla(tmp_path, monkeypatch, way):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "base"))
     UNUSABLE[way](tmp_path / "base", monkeypatch)
-    assert falls_back(lambda: toolchain.built(SOURCE)).startswith("The native backend is not available (the kernel cache ")
+    assert falls_back(lambda: toolchain.built(SOURCE)).startswith("The native backend is not available (the cache ")
     chosen_cache(monkeypatch)
 
 

@@ -21,7 +21,7 @@ import jax
 
 from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.core import checks
-from iblf_jax.lowering.toolchain import ToolchainError, cache_directory, not_ours
+from iblf_jax.core.cache import keep_programs
 
 COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "presets", "parameters")
 
@@ -125,19 +125,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def prepare_jax() -> None:
-    """Float64, and compiled programs kept between calls in a folder of the user's (unless he has chosen one, or none can be written)."""
+    """Float64, and compiled programs kept from the first on."""
     jax.config.update("jax_enable_x64", True)
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
-        return
-    try:
-        folder = cache_directory()
-        stranger = not_ours(folder)
-    except (ToolchainError, OSError):
-        return
-    if stranger is not None:
-        warnings.warn(f"compiled programs are not kept: {folder} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
-        return
-    if os.access(folder, os.W_OK | os.X_OK):
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    keep_programs()

@@ -12,8 +12,21 @@ import jax.numpy as jnp
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.plan import Shape
-from iblf_jax.engine.step import Carry, Inputs, Outcome, Probe, Probed, Run, TimeStep, fastest_mode, probe_steps, probed, start, verdict
-from iblf_jax.simulation.accuracy import places
+from iblf_jax.engine.step import (
+    Carry,
+    Inputs,
+    Kick,
+    Outcome,
+    Probe,
+    Probed,
+    Run,
+    TimeStep,
+    probe_steps,
+    probed,
+    start,
+    verdict,
+)
+from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 
@@ -116,45 +129,50 @@ def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
     return executor(Probe(), batch, carry, steps, None)[0]
 
 
-def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, jax.Array]:
-    """The carry before the first step, and the mode at the start [1/s]."""
+def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]:
+    """The carry before the first step, and what a `Probe` has found at the start."""
     around = batch.each(lambda inputs: probed(jnp.zeros_like(inputs.dt), initial_state(inputs.scenario)))
     found = _probed(executor, batch, around)
-    return batch.each(lambda inputs, found: (start(inputs, method, found.jacobian), fastest_mode(found)), found)
+    return batch.each(lambda inputs, found: start(inputs, method, found.jacobian), found), found
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry."""
 
     def one(inputs):
-        size = places(initial_state(inputs.scenario)).size
+        size = accuracy.places(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     return jax.eval_shape(lambda: batch.each(one))
 
 
-def end(executor: Executor, batch: Batch, run: Run, carry: Carry, mode: jax.Array) -> Outcome:
-    """The outcome after the last step, without records; `mode` is that at the start."""
+def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Probed) -> Outcome:
+    """The outcome after the last step, without records; `at_start` is what a `Probe` has found there."""
 
     def critical(inputs, carry):
-        instants = ((carry.nearest.t, carry.nearest.state), (inputs.dt * run.steps, carry.state))
+        instants = ((carry.nearest.t, carry.nearest.state), (inputs.dt * inputs.steps, carry.state))
         return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant) for instant in instants))
+
+    def judged(inputs, carry, kicked, at_start, later):
+        return verdict(inputs, run.method, carry, kicked, jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later))
 
     # Both instants of a run are probed as two runs, by the program that probed the start.
     lane = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.lane]
     twice = batch._replace(leaves=batch.leaves._replace(lane=lane), runs=2 * (batch.runs or 1))
     apart = batch.each(critical, carry)
-    if batch.runs is not None:
-        apart = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), apart)
-    found = twice.each(lambda inputs, found: fastest_mode(found), _probed(executor, twice, apart))
-    modes = jnp.concatenate([mode[..., None], found.reshape(*jnp.shape(mode), 2)], axis=-1)
-    return batch.each(lambda inputs, carry, modes: verdict(inputs, run, carry, modes), carry, modes)
+    if batch.runs is None:
+        later = _probed(executor, twice, apart)
+    else:
+        later = _probed(executor, twice, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), apart))
+        later = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), later)
+    unseen = batch.each(lambda inputs: accuracy.unseen(inputs.scenario, run.method, inputs.dt, inputs.steps))
+    return batch.each(judged, carry, executor(Kick(), batch, unseen, 1, None)[0], at_start, later)
 
 
 def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:
     """All runs, from the start to the outcome."""
-    carry, mode = begin(executor, batch, run.method)
+    carry, at_start = begin(executor, batch, run.method)
     step = TimeStep(run.method, run.record_every is not None)
     carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)
-    outcome = end(executor, batch, run, carry, mode)
+    outcome = end(executor, batch, run, carry, at_start)
     return outcome if run.record_every is None else outcome._replace(records=records)

@@ -226,8 +226,8 @@ def run_with_tangents(executor: Executor, batch: Batch, directions: Directions, 
         full = jnp.zeros((directions.tangents,) * 2, inputs.dt.dtype)
         return tangents, tuple(full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products)
 
-    carry, mode = begin(executor, batch, run.method)
+    carry, instant = begin(executor, batch, run.method)
     before = batch.each(at_start, carry)
     after, _ = executor(DerivativeStep(run.method, directions), batch, before, run.steps + 1, None)
     tangents, products = batch.each(at_end, after)
-    return Tangents(end(executor, batch, run, after.carry, mode), tangents, products)
+    return Tangents(end(executor, batch, run, after.carry, instant), tangents, products)

@@ -280,11 +280,29 @@ def probed(time: jax.Array, state: LoopState) -> Probed:
     return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype)))
 
 
-def verdict(inputs: Inputs, run: Run, carry: Carry, modes: jax.Array) -> Outcome:
-    """The folds' results and the accuracy, and the status with the verdict on the step, given the measured modes [1/s]."""
-    estimate = accuracy.between_stages(inputs.scenario, carry.accuracy, run.method, inputs.dt, run.steps)
+@dataclasses.dataclass(frozen=True)
+class Kick:
+    """What the torque that the stages did not see accelerates, in one step: the only thing at the end of a run that needs its robot."""
+
+    def __call__(self, inputs: Inputs, carry: accuracy.Unseen, index: jax.Array, form: Form):
+        """The carry with accelerations; nothing is recorded."""
+        return accuracy.kicked(inputs.scenario, carry), ()
+
+
+def verdict(inputs: Inputs, method: str, carry: Carry, kicked: accuracy.Unseen, instants: Probed) -> Outcome:
+    """The folds' results and the accuracy, and the status with the verdict on the step.
+
+    Args:
+      inputs: of the run.
+      method: the integrator.
+      carry: after the last step.
+      kicked: what a `Kick` has found.
+      instants: what a `Probe` has found at some of them.
+    """
+    estimate = accuracy.between_stages(carry.accuracy, kicked)
+    modes = jax.vmap(fastest_mode)(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
-    status = carry.status | flag(inputs.dt * mode > integrators.tableau(run.method).stability, Status.STEP_TOO_LARGE)
+    status = carry.status | flag(inputs.dt * mode > integrators.tableau(method).stability, Status.STEP_TOO_LARGE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
     metrics = accuracy.results(estimate)
     for fold, acc in zip(inputs.folds, carry.accumulators, strict=True):

@@ -78,7 +78,7 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
     x = ravel_pytree(start)[0]
     watched = accuracy.places(start)
     estimate = accuracy.begin(method, jacobian(scenario, zero, start)[watched][:, watched], start)
-    estimate = accuracy.between_stages(scenario, estimate, method, dt, steps)
+    estimate = accuracy.between_stages(estimate, accuracy.kicked(scenario, accuracy.unseen(scenario, method, dt, steps)))
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
 

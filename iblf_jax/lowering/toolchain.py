@@ -27,6 +27,7 @@ from pathlib import Path
 
 import jax
 
+from iblf_jax.core.cache import directory
 from iblf_jax.core.drafts import draft, remove_abandoned
 
 FLAGS = (
@@ -133,35 +134,6 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
     return text
 
 
-def cache_directory() -> Path:
-    """Where kernels are kept: $XDG_CACHE_HOME/iblf_jax, mode 0700; ToolchainError if it cannot be made or is not this user's."""
-    path = None
-    try:
-        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if path.is_symlink():
-            raise ToolchainError(f"the kernel cache {path} is a link and not a directory of this user")
-        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        try:
-            status = os.fstat(folder)
-            if status.st_uid != os.getuid():
-                raise ToolchainError(f"the kernel cache {path} is not a directory of this user")
-            if stat.S_IMODE(status.st_mode) & 0o077:
-                os.fchmod(folder, 0o700)
-        finally:
-            os.close(folder)
-    except (OSError, RuntimeError) as error:
-        raise ToolchainError(f"the kernel cache {path or '~/.cache/iblf_jax'} cannot be made: {error}") from None
-    return path
-
-
-def not_ours(folder: Path) -> str | None:
-    """The name of something in a folder that another user owns, or that is a link; None if there is none."""
-    with os.scandir(folder) as entries:
-        found = (x.name for x in entries if x.is_symlink() or x.stat(follow_symlinks=False).st_uid != os.getuid())
-        return next(found, None)
-
-
 def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     """The shared library of a source and its key, compiled unless it is in the cache; ToolchainError on failure."""
     path = compiler()
@@ -184,21 +156,24 @@ def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) ->
       ToolchainError: it cannot be made, or there is no safe place or no room for it.
     """
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
-    directory = cache_directory()
-    path = directory / f"{key}{suffix}"
+    try:
+        folder = directory()
+    except OSError as error:
+        raise ToolchainError(str(error)) from None
+    path = folder / f"{key}{suffix}"
     try:
         if _checked(path) is None:
-            for left in directory.glob("tmp????????"):  # of version 0.1.0
+            for left in folder.glob("tmp????????"):  # of version 0.1.0
                 remove_abandoned(left, lockable=False)
-            with draft(directory, "kernel") as folder:
-                made = folder / f"made{suffix}"
+            with draft(folder, "kernel") as work:
+                made = work / f"made{suffix}"
                 make(made)
                 image = _read(made)
                 if not image:
                     raise ToolchainError("the compiler left no file")
-                _write(folder, image, path)
+                _write(work, image, path)
     except OSError as error:
-        raise ToolchainError(f"the kernel cache {directory} cannot be used: {error}") from None
+        raise ToolchainError(f"the cache {folder} cannot be used: {error}") from None
     return path, key
 
 

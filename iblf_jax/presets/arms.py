@@ -34,6 +34,7 @@ from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import Momentum, Printed
 from iblf_jax.references import Reference
 from iblf_jax.robots import Arm, Robot
+from iblf_jax.robots._base import mass_matrix_at
 from iblf_jax.simulation.scenario import Initial, Scenario
 
 ARMS = ("ur5", "iiwa14")
@@ -75,12 +76,8 @@ def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST
     for name in ("rate", "least"):
         if given[name].shape not in ((), (robot.n,)):
             raise checks.fail(name, given[name], f"one number, or {robot.n} (one a joint)")
-    return jnp.maximum(given["rate"] * _diagonal(robot, given["q"].astype(jnp.result_type(float))), given["least"])
-
-
-@jax.jit
-def _diagonal(robot: Robot, q: jax.Array) -> jax.Array:
-    return jnp.diagonal(robot.mass_matrix(q))
+    M = mass_matrix_at(robot, given["q"].astype(jnp.result_type(float)))
+    return jnp.maximum(given["rate"] * jnp.diagonal(M), given["least"])
 
 
 def arm_scenario(

@@ -16,8 +16,10 @@ from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.linalg import inner, matvec
 
 T = TypeVar("T")
@@ -73,6 +75,19 @@ def at_time(robot: T, t: jax.Array) -> T:
     """The robot as it is at time t [s]: itself, unless it has a method `at`."""
     _is_robot(robot)
     return robot.at(t) if hasattr(robot, "at") else robot
+
+
+@jax.jit
+def _mass_matrix(robot: Robot, q: jax.Array) -> jax.Array:
+    return robot.mass_matrix(q)
+
+
+def mass_matrix_at(robot: Robot, q: jax.Array) -> jax.Array:
+    """M(q), (n, n) [kg m^2], compiled once for all robots of one structure: of many joints that takes seconds."""
+    keep_programs()
+    if checks.is_concrete((robot, q)):
+        robot = jax.tree.map(lambda x: np.asarray(x, q.dtype), robot)  # a number's weak type would compile it again
+    return _mass_matrix(robot, q)
 
 
 def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:

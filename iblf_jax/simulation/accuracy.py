@@ -137,11 +137,22 @@ def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, s
     return Accuracy(tuple(pending), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
-def between_stages(scenario: Scenario, accuracy: Accuracy, method: str, dt: jax.Array, steps: int | jax.Array) -> Accuracy:
-    """The estimate, with what reference, bounds and disturbance do between the stages of a step.
+class Unseen(NamedTuple):
+    """The worst that the stages of a step cannot see, in the steps that were looked at."""
+
+    missed: jax.Array
+    """Of the rates of reference and bounds, (n,) [rad/s]."""
+    push: jax.Array
+    """Of the disturbance, (n,) [N m]; after `kicked` what it accelerates, (n,) [rad/s^2]."""
+    width: jax.Array
+    """Of the tube, where it is narrowest, (n,) [rad]."""
+
+
+def unseen(scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Array) -> Unseen:
+    """What reference, bounds and disturbance do between the stages of a step.
 
     In some steps the method's own quadrature of each signal is held against what the signal does: the rates of reference and bounds against
-    their change over the step, the disturbance's torque against Gauss's three points.  The worst is taken to last for 1/r.
+    their change over the step, the disturbance's torque against Gauss's three points.
     """
     table, n = tableau(method), scenario.n
     scenario, dt = jax.lax.stop_gradient((scenario, dt))
@@ -171,10 +182,20 @@ def between_stages(scenario: Scenario, accuracy: Accuracy, method: str, dt: jax.
     spread = jnp.asarray(np.arange(INSTANTS) * 0.6180339887498949 % 1.0, dt.dtype)
     indices = jnp.floor(spread * jnp.asarray(steps, spread.dtype)).astype(jnp.int32)
     missed, push, width = jax.vmap(at)(indices)
-    M = at_time(scenario.plant, jnp.zeros_like(dt)).mass_matrix(scenario.initial.q)
-    pushed = jnp.abs(matvec(accuracy.response[:, :n], solve_spd(M, jnp.max(push, axis=0))))
-    error = (jnp.max(missed, axis=0) + ONSET * pushed) / SLOWEST
-    relative = jnp.max(error / jnp.min(width, axis=0))
+    return Unseen(jnp.max(missed, axis=0), jnp.max(push, axis=0), jnp.min(width, axis=0))
+
+
+def kicked(scenario: Scenario, found: Unseen) -> Unseen:
+    """`found`, its torque turned into what it accelerates at the start."""
+    M = at_time(scenario.plant, jnp.zeros_like(found.push[0])).mass_matrix(scenario.initial.q)
+    return found._replace(push=jax.lax.stop_gradient(solve_spd(M, found.push)))
+
+
+def between_stages(accuracy: Accuracy, found: Unseen) -> Accuracy:
+    """The estimate, with what the stages did not see, given as accelerations; the worst is taken to last for 1/r."""
+    pushed = jnp.abs(matvec(accuracy.response[:, : found.push.size], found.push))
+    error = (found.missed + ONSET * pushed) / SLOWEST
+    relative = jnp.max(error / found.width)
     return accuracy._replace(error=jnp.maximum(accuracy.error, error), relative=jnp.maximum(accuracy.relative, relative))
 
 

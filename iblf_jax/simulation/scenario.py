@@ -19,12 +19,14 @@ import numpy as np
 from iblf_jax.bounds import Bounds, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.core import checks
+from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, leaf
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
+from iblf_jax.robots._base import mass_matrix_at
 
 
 @component
@@ -197,6 +199,7 @@ def canonical(scenario: Scenario) -> Scenario:
     """
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
+    keep_programs()
     check_values(scenario)
     dtype = _shared_dtype(scenario)
     scenario = _typed(scenario, dtype)
@@ -243,26 +246,26 @@ def _shaped(name: str, call, *shape: int) -> jax.Array:
 
 @jax.jit
 def _start(scenario: Scenario):
-    """Reference, bounds and mass matrices at the start.  Shapes are checked while this is traced, once a structure."""
+    """Reference and bounds at the start.  Shapes are checked while this is traced, once a structure."""
     n, q, dq, zero = scenario.n, scenario.initial.q, scenario.initial.dq, jnp.zeros((), scenario.initial.q.dtype)
     q_d = _shaped("reference.position(t)", lambda: scenario.reference.position(zero), n)
     _shaped("bounds.lower.at(t, q_d)", lambda: scenario.bounds.lower.at(zero, q_d), n)
     _shaped("bounds.upper.at(t, q_d)", lambda: scenario.bounds.upper.at(zero, q_d), n)
     tube = tube_at(scenario.reference, scenario.bounds, zero)
-    M = []
     for name, robot in (("plant", scenario.plant), ("model", scenario.model)):
-        M.append(_shaped(f"{name}.mass_matrix(q)", lambda r=robot: r.mass_matrix(q), n, n))
+        _shaped(f"{name}.mass_matrix(q)", lambda r=robot: r.mass_matrix(q), n, n)
         _shaped(f"{name}.coriolis(q, v, u)", lambda r=robot: r.coriolis(q, dq, dq), n)
         _shaped(f"{name}.gravity(q)", lambda r=robot: r.gravity(q), n)
     _shaped(
         "disturbance.torque(t, q, dq, plant, model)", lambda: scenario.disturbance.torque(zero, q, dq, scenario.plant, scenario.model), n
     )
-    return tube.q_d, tube.lower, tube.upper, jnp.stack(M)
+    return tube.q_d, tube.lower, tube.upper
 
 
 def _check_start(scenario: Scenario) -> None:
     q = np.asarray(scenario.initial.q)
-    q_d, lower, upper, M = (np.asarray(x) for x in _start(scenario))
+    q_d, lower, upper = (np.asarray(x) for x in _start(scenario))
+    M = [np.asarray(mass_matrix_at(robot, scenario.initial.q)) for robot in (scenario.plant, scenario.model)]
     for name, values in (("reference", q_d), ("bounds.lower", lower), ("bounds.upper", upper)):
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")

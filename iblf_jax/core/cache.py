@@ -1,0 +1,90 @@
+"""The folder of the user's in which compiled programs are kept between processes, XLA's and our own kernels.
+
+It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax.  It is used from the first run of a process on, unless JAX has been given a folder of
+its own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used longest ago is removed once all takes more than LIMIT;
+removing the folder loses nothing but time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import time
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+LIMIT = 2 * 2**30
+"""Bytes."""
+SUFFIXES = ("-cache", "-atime", ".so", ".cubin")
+"""Of the names of what may be removed: JAX's and ours."""
+IN_USE = 3600.0
+"""Seconds for which nobody removes what was used: another process may be about to load it."""
+
+
+def directory() -> Path:
+    """The folder, mode 0700; OSError, whose text is one line for the user, if it cannot be made or is not this user's."""
+    path = None
+    try:
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.is_symlink():
+            raise OSError("it is a link and not a directory of this user")
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            status = os.fstat(folder)
+            if status.st_uid != os.getuid():
+                raise OSError("it is not a directory of this user")
+            if stat.S_IMODE(status.st_mode) & 0o077:
+                os.fchmod(folder, 0o700)
+        finally:
+            os.close(folder)
+    except (OSError, RuntimeError) as error:
+        raise OSError(f"the cache {path or '~/.cache/iblf_jax'} cannot be made: {error}") from None
+    return path
+
+
+@cache
+def keep_programs() -> None:
+    """Has JAX keep what it compiles, unless the user has told it where, or not to, or no folder is safe to write to; once a process."""
+    config: Any = jax.config  # its fields are made when JAX starts
+    if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
+        return
+    try:
+        folder = directory()
+        stranger = _not_ours(folder)
+        _trim(folder)
+    except OSError:
+        return
+    if stranger is not None:
+        warnings.warn(f"compiled programs are not kept: {folder} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
+    elif os.access(folder, os.W_OK | os.X_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        reset_cache()  # what JAX has compiled before this has made it decide that it keeps nothing
+
+
+def _not_ours(folder: Path) -> str | None:
+    """The name of something in a folder that another user owns, or that is a link; None if there is none."""
+    with os.scandir(folder) as entries:
+        found = (x.name for x in entries if x.is_symlink() or x.stat(follow_symlinks=False).st_uid != os.getuid())
+        return next(found, None)
+
+
+def _trim(folder: Path) -> None:
+    """Removes what was used longest ago, until the rest is small enough."""
+    with os.scandir(folder) as entries:
+        kept = [(x.stat(follow_symlinks=False), x.path) for x in entries if x.name.endswith(SUFFIXES)]
+    size = sum(status.st_size for status, _ in kept)
+    for status, path in sorted(kept, key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime)):
+        if size <= LIMIT or max(status.st_atime, status.st_mtime) > time.time() - IN_USE:
+            break
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+            size -= status.st_size
