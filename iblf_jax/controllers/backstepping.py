@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax.barriers import Barrier, Integral
 from iblf_jax.barriers._base import CLAIMS, guard_is_active
@@ -56,7 +57,7 @@ class Backstepping:
 
     def advice(self) -> list[str]:
         """Warnings about gains outside the conditions of Theorem 2."""
-        if not checks.is_concrete(self.K2) or bool(jnp.all(self.K2 > 0.5)):
+        if not checks.is_concrete(self.K2) or bool(np.all(np.asarray(self.K2) > 0.5)):
             return []
         return [f"controller.K2 = {self.K2}: Theorem 2 needs K2 > 1/2 on every joint (3.17); below it nothing is claimed. Raise K2."]
 

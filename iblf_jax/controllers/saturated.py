@@ -78,9 +78,10 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
       ValueError: as `Saturated`.
     """
     effort = getattr(robot, "effort", jnp.inf)
-    if checks.is_concrete(effort) and not np.any(np.isfinite(effort)):
-        return law
-    return Saturated(law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge)
+    if not checks.is_concrete(effort):
+        return Saturated(law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge)
+    finite = np.isfinite(effort)
+    return Saturated(law=law, limit=np.where(finite, effort, UNLIMITED), edge=edge) if finite.any() else law
 
 
 def _smooth_clip(x: jax.Array) -> jax.Array:

@@ -156,7 +156,7 @@ def as_floats(name: str, value: Any) -> jax.Array:
     """An array of floating-point numbers, or a ValueError that names the field."""
     flat_enough(name, value)
     try:
-        array = jnp.asarray(value)
+        array = _from_host(value) if _is_plain(value) else jnp.asarray(value)
     except Exception as error:  # whatever NumPy and JAX make of it: too large, ragged, nested too deep, no numbers
         raise fail(name, value, "numbers in a rectangular array") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
@@ -164,6 +164,22 @@ def as_floats(name: str, value: Any) -> jax.Array:
     if jnp.issubdtype(array.dtype, jnp.integer):
         return array.astype(jnp.result_type(float))
     raise fail(name, value, "real numbers", f"Its type is {array.dtype}.")
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value is a number, an array or a list of numbers that JAX has nothing to do with."""
+    if isinstance(value, list | tuple):
+        return all(isinstance(x, int | float) for x in jax.tree.leaves(value))
+    return isinstance(value, int | float | np.ndarray | np.generic)
+
+
+def _from_host(value: Any) -> jax.Array:
+    """The array of a plain value; `jnp.asarray` compiles a program for every new shape, 20 ms each."""
+    host = np.array(value)  # a copy: JAX may share the memory of what it is given
+    if host.dtype.kind in "iu":
+        host = host.astype(jnp.result_type(float))
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(value if isinstance(value, float) else host)
 
 
 def check_values(name: str, array: Any, sign: str | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -55,7 +56,7 @@ class Printed:
 
 def kf_advice(kf: jax.Array) -> list[str]:
     """What to tell a user whose kf is below the condition of Theorem 2; nothing for traced values."""
-    if not checks.is_concrete(kf) or bool(jnp.all(kf > 0.5)):
+    if not checks.is_concrete(kf) or bool(np.all(np.asarray(kf) > 0.5)):
         return []
     need = "Theorem 2 needs kf > 1/2 on every joint (3.17), and kf > 1 where f changes (3.25)"
     return [f"observer.kf = {kf}: {need}; below it nothing is claimed. Raise kf."]

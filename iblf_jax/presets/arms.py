@@ -76,8 +76,8 @@ def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST
     for name in ("rate", "least"):
         if given[name].shape not in ((), (robot.n,)):
             raise checks.fail(name, given[name], f"one number, or {robot.n} (one a joint)")
-    M = mass_matrix_at(robot, given["q"].astype(jnp.result_type(float)))
-    return jnp.maximum(given["rate"] * jnp.diagonal(M), given["least"])
+    inertia = jnp.diagonal(mass_matrix_at(robot, given["q"].astype(jnp.result_type(float))))
+    return jnp.maximum(given["rate"] * inertia, given["least"])
 
 
 def arm_scenario(
@@ -116,7 +116,7 @@ def arm_scenario(
     checks.one_of("reading", reading, ("printed", "corrected"))
     checks.conforms("robot", robot, Robot)
     checks.conforms("reference", reference, Reference)
-    start = reference.position(jnp.zeros(()))
+    start = jax.jit(lambda reference: reference.position(jnp.zeros(())))(reference)
     K2 = inertial_gain(robot if model is None else model, jnp.broadcast_to(start, (robot.n,)) if jnp.ndim(start) == 0 else start)
     if law == "pd":  # its gains by name are for one size of joint
         controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)
