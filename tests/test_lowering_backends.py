@@ -187,6 +187,12 @@ def test_one_run_and_threads():
     assert_same(one, jax.tree.map(lambda x: x[:1], batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()})), 1e-12)
 
 
+def forget_kernels():
+    """What this process knows of kernels and their text."""
+    native.kernel.cache_clear()
+    native._text.cache_clear()
+
+
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("record_every", [None, 100])
@@ -199,11 +205,11 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
         monkeypatch.setattr(plan, "NATIVE_SEGMENT", 50)
     if parts != "functions":
         monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
-    native.kernel.cache_clear()
+    forget_kernels()
     monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
     del COMPILED["float64", "native", 400, record_every]
     cut = batch(record_every=record_every)
-    native.kernel.cache_clear()
+    forget_kernels()
     # The mode comes from differences of rates, which magnify the last digit.
     np.testing.assert_allclose(cut.fastest_mode, whole.fastest_mode, rtol=1e-9)
     assert_same(cut._replace(fastest_mode=whole.fastest_mode), whole, 1e-12)

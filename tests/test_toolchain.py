@@ -222,6 +222,38 @@ def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
     assert sorted(path.name for path in cache.iterdir()) == ["d.so", "notes.txt"]
 
 
+@needs_compiler
+def test_what_is_built_ahead_is_built_once(cache, tmp_path, monkeypatch):
+    """Who wants it meanwhile waits for it; what failed is tried again by who wants it, and told to him."""
+    calls = tmp_path / "calls"
+    fake(tmp_path, monkeypatch, compiles(f'echo once >> {calls}; sleep 0.5; exec "$REAL" "$@"'))
+    toolchain.build_ahead(SOURCE)
+    assert value() == 41
+    assert calls.read_text().split() == ["once"]
+    fake(tmp_path, monkeypatch, compiles("sleep 0.2; echo error: no >&2; exit 1"))
+    toolchain.build_ahead(OTHER)
+    with pytest.raises(ToolchainError, match="error: no"):
+        toolchain.built(OTHER)
+
+
+def test_who_stops_waiting_stops_the_compiler(cache, tmp_path, monkeypatch):
+    """Ctrl-C while another thread's compiler runs."""
+    pid = tmp_path / "pid"
+    fake(tmp_path, monkeypatch, compiles(f"echo $$ > {pid}; exec sleep 60"))
+    toolchain.build_ahead(SOURCE)
+    while not (pid.exists() and pid.read_text().strip()):
+        time.sleep(0.01)
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    with pytest.raises(KeyboardInterrupt):
+        toolchain.built(SOURCE)
+    for _ in range(200):
+        if not Path(f"/proc/{pid.read_text().strip()}").exists():
+            return
+        time.sleep(0.01)
+    pytest.fail("the compiler still runs")
+
+
 FRESH = """
 import jax
 events = []

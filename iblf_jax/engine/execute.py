@@ -27,6 +27,7 @@ from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.mechanism import Mechanism, mechanism_of
 from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
+from iblf_jax.lowering.packed import Shapes
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import Program, UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
@@ -104,6 +105,14 @@ def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, ne
     return Batch.of(inputs, varied, shape, run.mechanism)
 
 
+def _run_lowered(name: str, batch: Batch, run: Run) -> Outcome:
+    """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core."""
+    if name == "native":
+        program, _ = program_of(TimeStep(run.method, run.record_every is not None), batch, carry_shapes(batch, run.method))
+        native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
+    return run_all(_executor(name), batch, run)
+
+
 def _operations(inputs: Inputs) -> int:
     """Of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
@@ -155,7 +164,7 @@ def run_batch(
     inputs = _inputs(scenario, folds, dt, run)
 
     def run_on(name):
-        return run_all(_executor(name), _lowered_batch(inputs, varied, run, nested), run)
+        return _run_lowered(name, _lowered_batch(inputs, varied, run, nested), run)
 
     def on_scan():
         return _scanned(inputs, varied, nested, lambda batch: run_all(scan, batch, run))
@@ -175,7 +184,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)
 
     def run_on(name):
-        return jax.tree.map(lambda x: x[0], run_all(_executor(name), batch, run))
+        return jax.tree.map(lambda x: x[0], _run_lowered(name, batch, run))
 
     def on_scan():
         return _scanned(inputs, None, False, lambda batch: run_all(scan, batch, run))
@@ -312,7 +321,7 @@ def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], s
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
 
         def run_on(name):
-            run_all(_executor(name), _lowered_batch(_inputs(scenario, folds, dt, run), varied, run), run)
+            _run_lowered(name, _lowered_batch(_inputs(scenario, folds, dt, run), varied, run), run)
             return name
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))

@@ -16,7 +16,7 @@ from iblf_jax.engine import plan
 from iblf_jax.lowering.emit_c import source
 from iblf_jax.lowering.packed import Packed, record_shapes
 from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded, threads
+from iblf_jax.lowering.toolchain import ToolchainError, build_ahead, built, compiler, loaded, threads
 
 _registered: set[str] = set()
 
@@ -30,21 +30,37 @@ def unavailable() -> str | None:
     return None
 
 
+@lru_cache(maxsize=8)
+def _text(program: Program, shared: int, lane: int, narrow: bool, once: bool) -> tuple[str, tuple[str, ...]]:
+    """The C of a program's kernel, and the compiler's flags for it."""
+    segment, flags = plan.native_build(program.size, once)
+    return source(program, shared, lane, segment=segment), (*flags, *(("-DVECTOR_BYTES=16",) if narrow else ()))
+
+
+def _is_narrow(program: Program, runs: int) -> bool:
+    return runs * program.dtype.itemsize <= 16
+
+
+def ahead(program: Program, shared: int, lane: int, runs: int) -> None:
+    """Starts to build the kernel of a program that `run` will be asked to step more than once."""
+    build_ahead(*_text(program, shared, lane, _is_narrow(program, runs), once=False))
+
+
 @lru_cache(maxsize=64)
-def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
+def kernel(program: Program, shared: int, lane: int, narrow: bool, once: bool) -> str:
     """The name under which the kernel of a program is registered; builds it if need be.
 
     Args:
       program: what a step does.
       shared, lane: how many numbers of each kind of leaf go in.
       narrow: for one or two runs, vectors of 16 bytes.
+      once: it makes one step.
 
     Raises:
       ToolchainError: no compiler, or an error from it.
       UnsupportedError: an operation that C has no word for.
     """
-    segment, flags = plan.native_build(program.size)
-    library, key = built(source(program, shared, lane, segment=segment), (*flags, *(("-DVECTOR_BYTES=16",) if narrow else ())))
+    library, key = built(*_text(program, shared, lane, narrow, once))
     name = f"iblf_jax_{key}"
     if name not in _registered:
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="cpu")
@@ -69,8 +85,7 @@ def run(
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every `every`-th step.
     """
     runs = carry.floats.shape[1]
-    narrow = runs * program.dtype.itemsize <= 16
-    name = kernel(program, shared.size, lane.shape[0], narrow)
+    name = kernel(program, shared.size, lane.shape[0], _is_narrow(program, runs), steps == 1)
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(program, runs, steps, every)
     settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
     floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, jnp.asarray(settings))

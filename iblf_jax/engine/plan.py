@@ -174,9 +174,13 @@ def xla_stretch(steps: int, every: int) -> int:
     return exact if exact > most // 16 else most
 
 
-def native_build(nodes: int) -> tuple[int | None, tuple[str, ...]]:
-    """Nodes of a function of the generated C, None for one function, and how the compiler is told to take it."""
-    return (NATIVE_SEGMENT, NATIVE_FLAGS) if nodes > NATIVE_LONG else (None, ())
+def native_build(nodes: int, once: bool) -> tuple[int | None, tuple[str, ...]]:
+    """Nodes of a function of the generated C, None for one function, and how the compiler is told to take it.
+
+    `once`: it makes one step, and takes longer to build than to run.
+    """
+    long = nodes > NATIVE_LONG
+    return NATIVE_SEGMENT if long else None, NATIVE_FLAGS if long or once else ()
 
 
 def gpu_threads(runs: int, processors: int) -> int:

@@ -1,4 +1,5 @@
-"""C from a scalar program: one function for what only shared leaves decide, one for what time decides, one for a block of runs.
+"""C from a scalar program: one function for what only shared leaves decide, one for what time decides, one for a block of runs, and one for
+each function that the program calls (the closed loop of an arm).
 
 The text is plain statements, one a node, and the same for every target; the headers around it say what it means.  On a CPU `c/vector.h`
 makes of a name a vector of runs, `c/mathlib.h` has the elementary functions and `c/driver.h` the loops and threads; on a GPU
@@ -273,7 +274,10 @@ def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> 
 
 
 def _advance_in_segments(e: _Emitter, segment: int, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
-    """`_advance` for long steps, over which a compiler would take minutes: its time grows with the square of a function's length."""
+    """`_advance` for long steps, over which a compiler would take minutes: its time grows with the square of a function's length.
+
+    The functions that the step calls stay whole calls; each is itself cut (`_functions`).
+    """
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}

@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -101,6 +101,29 @@ def built_for() -> dict[str, str]:
     return {"processor": f"{', '.join(names) or platform.machine()}, features {features}", "compiler": f"{_version(path)}, {path}"}
 
 
+_running: set[int] = set()
+"""Compilers that run now."""
+_making: dict[str, threading.Lock] = {}
+"""Key -> the lock of who makes it."""
+
+
+def stop_compilers() -> None:
+    """Kills every compiler that this process has started."""
+    for pid in tuple(_running):
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(pid, signal.SIGKILL)
+
+
+def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
+    """Starts `built` beside what this process does meanwhile; whoever wants the result waits for it, and is told what went wrong."""
+
+    def build() -> None:
+        with contextlib.suppress(ToolchainError):
+            built(source, extra)
+
+    threading.Thread(target=build, daemon=True).start()
+
+
 def _run(command: list[str], stream: str, seconds: float) -> bytes:
     """What a command says on one of its streams; ToolchainError if it fails, or takes too long, it and all that it has started."""
     name, said = Path(command[0]).name, list[bytes]()
@@ -114,6 +137,7 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
         with getattr(process, stream) as pipe:
             said.append(pipe.read(MOST_TEXT))
 
+    _running.add(process.pid)
     listener, end = threading.Thread(target=listen, daemon=True), time.monotonic() + seconds
     listener.start()
     try:
@@ -126,6 +150,8 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
         if isinstance(error, subprocess.TimeoutExpired):
             raise ToolchainError(f"{name} took longer than {seconds:g} s and was stopped") from None
         raise
+    finally:
+        _running.discard(process.pid)
     text = said[0] if said else b""
     if code:
         lines = text.decode(errors="replace").splitlines()
@@ -161,12 +187,34 @@ def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) ->
     except OSError as error:
         raise ToolchainError(str(error)) from None
     path = folder / f"{key}{suffix}"
+    with _made_once(key):
+        _keep(folder, path, make)
+    return path, key
+
+
+@contextlib.contextmanager
+def _made_once(key: str) -> Iterator[None]:
+    """Waits while another thread makes the same; who stops waiting stops the compilers."""
+    lock = _making.setdefault(key, threading.Lock())
+    try:
+        lock.acquire()
+    except BaseException:
+        stop_compilers()
+        raise
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _keep(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
+    """Makes a file of `kept` unless it is there."""
     try:
         if _checked(path) is None:
             for left in folder.glob("tmp????????"):  # of version 0.1.0
                 remove_abandoned(left, lockable=False)
             with draft(folder, "kernel") as work:
-                made = work / f"made{suffix}"
+                made = work / f"made{path.suffix}"
                 make(made)
                 image = _read(made)
                 if not image:
@@ -174,7 +222,6 @@ def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) ->
                 _write(work, image, path)
     except OSError as error:
         raise ToolchainError(f"the cache {folder} cannot be used: {error}") from None
-    return path, key
 
 
 def _write(folder: Path, image: bytes, path: Path) -> None:
