@@ -12,6 +12,7 @@ What is no such loop has no claim here, and `why_no_claim` says why.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -71,6 +72,7 @@ def claim(scenario: Scenario) -> Claim:
     return Claim(decay, law.K2, observer.kf)
 
 
+@partial(jax.jit, static_argnames="case")
 def rho_terms(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
     """The three terms of which rho is the least, (3,) [1/s].                                               (3.19), (3.27)
 
@@ -86,6 +88,7 @@ def rho_terms(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> 
     ])  # fmt: skip
 
 
+@partial(jax.jit, static_argnames="case")
 def rho(constants: Claim, lambda_max: jax.typing.ArrayLike, case: int) -> jax.Array:
     """The rate of the claim, () [1/s].                                                                      (3.19), (3.27)"""
     return jnp.min(rho_terms(constants, lambda_max, case))

@@ -35,14 +35,12 @@ class Extremes(NamedTuple):
     searched: str
 
 
-@partial(jax.jit, static_argnames="sign")
-def _signed_eigenvalue(robot: Robot, q: jax.Array, sign: int) -> jax.Array:
-    """lambda_max(M0) for sign 1, -lambda_min(M0) for sign -1."""
+@jax.jit
+@partial(jax.value_and_grad, argnums=1)
+def _with_gradient(robot: Robot, q: jax.Array, sign: int) -> jax.Array:
+    """lambda_max(M0) for sign 1, -lambda_min(M0) for sign -1, and its gradient by q."""
     eigenvalues = jnp.linalg.eigvalsh(robot.mass_matrix(q))
-    return eigenvalues[-1] if sign > 0 else -eigenvalues[0]
-
-
-_with_gradient = jax.jit(jax.value_and_grad(_signed_eigenvalue, argnums=1), static_argnames="sign")
+    return jnp.where(sign > 0, eigenvalues[-1], -eigenvalues[0])
 
 
 @jax.jit
@@ -84,14 +82,14 @@ def eigenvalues_over(robot: Robot, low: np.ndarray, high: np.ndarray) -> Extreme
       robot: the model, of n joints.
       low, high: the box, (n,) [rad].
     """
-    dtype = jnp.result_type(robot.mass_matrix(jnp.asarray(low)))
+    dtype = jax.eval_shape(robot.mass_matrix, jnp.asarray(low)).dtype
     low, high = np.asarray(low, float), np.asarray(high, float)
     points, words = points_in(low, high)
-    ends = np.asarray(_both_ends(robot, jnp.asarray(points, dtype)), float)
+    ends = np.asarray(_both_ends(robot, points.astype(dtype)), float)
     found = {}
     for sign, values in ((1, ends[:, -1]), (-1, -ends[:, 0])):
         starts = points[np.argsort(values)[::-1][:REFINED]]
-        tries = [maximise(lambda x, s=sign: _with_gradient(robot, jnp.asarray(x, dtype), sign=s), start, low, high) for start in starts]
+        tries = [maximise(lambda x, s=sign: _with_gradient(robot, np.asarray(x, dtype), s), start, low, high) for start in starts]
         found[sign] = max([*tries, (float(values.max()), points[np.argmax(values)])], key=lambda pair: pair[0])
     searched = f"{words}, the best {REFINED} improved by L-BFGS-B"
     return Extremes(-found[-1][0], found[1][0], found[-1][1], found[1][1], searched)

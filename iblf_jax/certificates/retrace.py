@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.proof_terms import Onward, Place, along_run
@@ -110,7 +109,7 @@ def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopSt
         states = jax.tree.map(lambda x, rows=rows: x[rows], recorded)
         for offset in range(0, every, length):
             first = rows * every + offset
-            place = Place(jnp.asarray(first, run.dt.dtype), jnp.full(first.shape, run.dt), states)
+            place = Place(jax.device_put(first.astype(run.dt.dtype)), jax.device_put(np.full(first.shape, run.dt, run.dt.dtype)), states)
             (_, _, states), (path, _) = run_from(run.scenario, run.dt, place, step=Onward(run.method), steps=length)
             index = first[:, None] + np.arange(length)
             keep = (np.arange(at, at + together) < count)[:, None] & (np.arange(offset, offset + length) < every) & (index <= last)
@@ -130,7 +129,7 @@ def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> St
     """What there is at some steps, by a program of one size."""
     size, places = index.size, np.minimum(np.arange(CERTIFY_STRETCH), index.size - 1)
     t = index.astype(run.t.dtype) * run.dt
-    padded = jax.tree.map(lambda x: jnp.asarray(x)[places], states)
+    padded = jax.tree.map(lambda x: np.asarray(x)[places], states)
     found = along_run(run.scenario, index[places], padded, run.dt, method=run.method)
     proof, sample, defect = jax.tree.map(lambda x: x[:size], found)
     return Stretch(t, sample, proof, defect, index % every == 0)
