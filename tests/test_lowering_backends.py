@@ -16,7 +16,7 @@ import iblf_jax as ij
 from iblf_jax.core.cache import directory
 from iblf_jax.engine import execute, native, plan
 from iblf_jax.engine.step import Run
-from iblf_jax.lowering import toolchain
+from iblf_jax.lowering import packed, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
@@ -185,6 +185,34 @@ def test_one_run_and_threads():
         del os.environ["IBLF_JAX_THREADS"]
     assert one.status.shape == (1,)
     assert_same(one, jax.tree.map(lambda x: x[:1], batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()})), 1e-12)
+
+
+@needs_compiler
+@pytest.mark.parametrize("runs", [1, 3, 64, 65, 200])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_leaves_become_rows_and_leaves_again(runs, dtype):
+    """As by JAX's own operations, for every type and shape that a carry may have."""
+    rng, leaves = np.random.default_rng(runs), []
+    for kind in (dtype, "int32", "bool", dtype, "int64", "int16", "int8"):
+        for shape in ((), (2,), (3, 2), (0,), (2, 1, 5)):
+            leaves.append(jnp.asarray(rng.normal(size=(runs, *shape)) * 9).astype(kind))
+    leaves[0] = leaves[0].at[0].set(jnp.nan)
+    shapes = packed.Shapes.of(leaves, 1)
+    rows = jax.jit(lambda x: native.pack(x, shapes, np.dtype(dtype), runs))(leaves)
+    for found, expected in zip(rows, packed.pack(leaves, shapes, np.dtype(dtype), runs), strict=True):
+        np.testing.assert_array_equal(found, expected, strict=True)
+    for found, expected in zip(jax.jit(lambda x: native.unpack(x, shapes, runs))(rows), leaves, strict=True):
+        np.testing.assert_array_equal(found, expected, strict=True)
+
+
+@needs_compiler
+def test_rows_of_another_size_are_an_error_and_no_crash():
+    """What XLA is told of the shapes is checked where memory is written."""
+    leaf, rows = jnp.ones((4, 3)), [jax.ShapeDtypeStruct((n, 4), t) for n, t in ((2, jnp.float64), (0, jnp.int32))]
+    with pytest.raises(jax.errors.JaxRuntimeError, match="does not fit"):
+        jax.block_until_ready(native._turned("pack", rows, leaf))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="without an array"):
+        jax.block_until_ready(native._turned("pack", [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]], leaf))
 
 
 def forget_kernels():

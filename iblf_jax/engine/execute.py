@@ -92,7 +92,7 @@ def _inputs(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
 
 
 def _executor(name: str) -> Executor:
-    return lowered_on(EXECUTORS[name].run)
+    return lowered_on(native.run, native.pack, native.unpack) if name == "native" else lowered_on(EXECUTORS[name].run)
 
 
 def _nodes(name: str, program: Program) -> int:

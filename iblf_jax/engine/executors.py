@@ -104,14 +104,14 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
     return lowered(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
 
 
-def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]]) -> Executor:
-    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`, `xla.run`)."""
+def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]], pack: Callable = pack, unpack: Callable = unpack) -> Executor:
+    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`, `xla.run`), between `pack` and `unpack`."""
 
     def executor(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
         found, runs, dtype = program_of(step, batch, carry), batch.runs or 1, batch.dtype
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
-        shared = jnp.concatenate([*(jnp.ravel(x).astype(dtype) for x in batch.leaves.shared), jnp.zeros((0,), dtype)])
+        shared = pack([x[None] for x in batch.leaves.shared], Shapes.of(batch.leaves.shared), dtype, 1).floats[:, 0]
         lane = pack(batch.leaves.lane, Shapes.of(batch.leaves.lane, 1), dtype, runs).floats
         after, arrays = run_program(found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every)
         records = unpacked_records(found.records, arrays) if every else ()

@@ -6,6 +6,7 @@ cache finds the same kernel in another process.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import jax
@@ -13,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine import plan
-from iblf_jax.lowering.emit_c import source
-from iblf_jax.lowering.packed import Packed, record_shapes
+from iblf_jax.lowering.emit_c import header, source
+from iblf_jax.lowering.packed import Packed, Shapes, record_shapes
 from iblf_jax.lowering.program import Program
 from iblf_jax.lowering.toolchain import ToolchainError, build_ahead, built, compiler, loaded, threads
 
@@ -66,6 +67,31 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool, once: bool) -
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="cpu")
         _registered.add(name)
     return name
+
+
+def _turned(name: str, outputs: list[jax.ShapeDtypeStruct], *arrays: jax.Array) -> Sequence[jax.Array]:
+    """`iblf_jax_pack` or `iblf_jax_unpack` of `c/leaves.h`."""
+    text = "\n".join(["#define RECORDED 0", "#define RECORDED_SIZES {0}", header("frame.h"), header("leaves.h")])
+    library, key = built(text)
+    target = f"iblf_jax_{name}_{key}"
+    if target not in _registered:
+        function = f"iblf_jax_{name}"
+        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(loaded(library, function), function)), platform="cpu")
+        _registered.add(target)
+    return jax.ffi.ffi_call(target, outputs)(*arrays)
+
+
+def pack(leaves: Sequence[jax.Array], shapes: Shapes, dtype, runs: int) -> Packed:
+    """As `packed.pack`, in one call."""
+    kinds = shapes.kinds()
+    floats = kinds.count("f")
+    rows = [jax.ShapeDtypeStruct((floats, runs), dtype), jax.ShapeDtypeStruct((len(kinds) - floats, runs), jnp.int32)]
+    return Packed(*_turned("pack", rows, *leaves))
+
+
+def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
+    """As `packed.unpack`, in one call."""
+    return list(_turned("unpack", [jax.ShapeDtypeStruct((runs, *shape), dtype) for shape, dtype in shapes.items], *packed))
 
 
 def run(
