@@ -210,9 +210,9 @@ def test_rows_of_another_size_are_an_error_and_no_crash():
     """What XLA is told of the shapes is checked where memory is written."""
     leaf, rows = jnp.ones((4, 3)), [jax.ShapeDtypeStruct((n, 4), t) for n, t in ((2, jnp.float64), (0, jnp.int32))]
     with pytest.raises(jax.errors.JaxRuntimeError, match="does not fit"):
-        jax.block_until_ready(native._turned("pack", rows, leaf))
+        jax.block_until_ready(jax.ffi.ffi_call(native._turner("pack"), rows)(leaf))
     with pytest.raises(jax.errors.JaxRuntimeError, match="without an array"):
-        jax.block_until_ready(native._turned("pack", [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]], leaf))
+        jax.block_until_ready(jax.ffi.ffi_call(native._turner("pack"), [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]])(leaf))
 
 
 def forget_kernels():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -62,23 +63,23 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool, once: bool) -
       UnsupportedError: an operation that C has no word for.
     """
     library, key = built(*_text(program, shared, lane, narrow, once))
-    name = f"iblf_jax_{key}"
-    if name not in _registered:
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="cpu")
-        _registered.add(name)
-    return name
+    return _register(f"iblf_jax_{key}", library, "iblf_jax_kernel")
 
 
-def _turned(name: str, outputs: list[jax.ShapeDtypeStruct], *arrays: jax.Array) -> Sequence[jax.Array]:
-    """`iblf_jax_pack` or `iblf_jax_unpack` of `c/leaves.h`."""
+@lru_cache(maxsize=2)
+def _turner(name: str) -> str:
+    """The name under which `iblf_jax_pack` or `iblf_jax_unpack` of `c/leaves.h` is registered."""
     text = "\n".join(["#define RECORDED 0", "#define RECORDED_SIZES {0}", header("frame.h"), header("leaves.h")])
     library, key = built(text)
-    target = f"iblf_jax_{name}_{key}"
+    return _register(f"iblf_jax_{name}_{key}", library, f"iblf_jax_{name}")
+
+
+def _register(target: str, library: Path, function: str) -> str:
+    """Makes a function of a library known to XLA under a name, and gives the name."""
     if target not in _registered:
-        function = f"iblf_jax_{name}"
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(loaded(library, function), function)), platform="cpu")
         _registered.add(target)
-    return jax.ffi.ffi_call(target, outputs)(*arrays)
+    return target
 
 
 def pack(leaves: Sequence[jax.Array], shapes: Shapes, dtype, runs: int) -> Packed:
@@ -86,12 +87,13 @@ def pack(leaves: Sequence[jax.Array], shapes: Shapes, dtype, runs: int) -> Packe
     kinds = shapes.kinds()
     floats = kinds.count("f")
     rows = [jax.ShapeDtypeStruct((floats, runs), dtype), jax.ShapeDtypeStruct((len(kinds) - floats, runs), jnp.int32)]
-    return Packed(*_turned("pack", rows, *leaves))
+    return Packed(*jax.ffi.ffi_call(_turner("pack"), rows)(*leaves))
 
 
 def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
     """As `packed.unpack`, in one call."""
-    return list(_turned("unpack", [jax.ShapeDtypeStruct((runs, *shape), dtype) for shape, dtype in shapes.items], *packed))
+    leaves = [jax.ShapeDtypeStruct((runs, *shape), dtype) for shape, dtype in shapes.items]
+    return list(jax.ffi.ffi_call(_turner("unpack"), leaves)(*packed))
 
 
 def run(
