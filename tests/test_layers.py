@@ -132,7 +132,7 @@ def test_time_is_scanned_in_one_place():
 
 
 def test_the_session_is_left_alone():
-    """jax.config belongs to the user: the command line, a program of its own, sets it, and the cache of compiled programs its own fields."""
+    """jax.config belongs to the user: the command line, a program of its own, sets it, and the cache of compiled programs its fields."""
     users = {p.relative_to(PACKAGE) for p, text in SOURCES.items() if calls(text, "jax.config")}
     assert {p for p in users if p.parts[0] != "cli"} == {Path("core/cache.py")}
 

@@ -174,7 +174,7 @@ def test_another_scenario_law_or_backend_is_refused(finished):
 def test_another_processor_is_named(finished, table, monkeypatch):
     if ij.load_sweep(finished).attrs["backend"] != "native":
         pytest.skip("the store is not tied to a processor")
-    monkeypatch.setattr(toolchain, "_processor", lambda: "model name : Another 9000\nflags : avx")
+    monkeypatch.setattr(toolchain, "processor", lambda: "model name : Another 9000\nflags : avx")
     with pytest.raises(ij.StoreError, match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*xla") as caught:
         cases.table(store=finished)
     assert "program" not in str(caught.value)

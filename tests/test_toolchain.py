@@ -20,7 +20,7 @@ from conftest import ROOT
 
 from iblf_jax import cli
 from iblf_jax.core import drafts
-from iblf_jax.core.cache import directory, keep_programs
+from iblf_jax.core.cache import directory, keep_programs, processor
 from iblf_jax.engine import execute, native
 from iblf_jax.lowering import nvrtc, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
@@ -181,7 +181,8 @@ def chosen_cache(monkeypatch):
 def test_programs_of_jax_get_the_check_of_the_kernels(cache, tmp_path, monkeypatch):
     cache.mkdir(parents=True)
     cache.chmod(0o777)
-    assert chosen_cache(monkeypatch) == (str(cache), [])
+    found, said = chosen_cache(monkeypatch)
+    assert (Path(found).parent, said) == (cache, [])
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     (cache / "jit_run-cache").symlink_to(tmp_path)
     found, (said,) = chosen_cache(monkeypatch)
@@ -211,15 +212,30 @@ def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
     """A file that is no program of ours or JAX's stays, and so does what another process may be about to load."""
     cache.mkdir(parents=True)
     now, days = time.time(), 24 * 3600.0
-    for name, age in (("a.so", 9 * days), ("jit_b-cache", 7 * days), ("c.so", 5 * days), ("d.so", 60.0), ("notes.txt", 99 * days)):
+    (cache / "xla-abc").mkdir()
+    for name, age in (("a.so", 9 * days), ("xla-abc/b-cache", 7 * days), ("c.so", 5 * days), ("d.so", 60.0), ("notes.txt", 99 * days)):
         (cache / name).write_bytes(bytes(1000))
         os.utime(cache / name, (now - age, now - age))
     monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 2500)
     chosen_cache(monkeypatch)
-    assert sorted(path.name for path in cache.iterdir()) == ["c.so", "d.so", "notes.txt"]
+    assert sorted(path.name for path in cache.rglob("*.*")) == ["c.so", "d.so", "notes.txt"]
+    assert not (cache / "xla-abc" / "b-cache").exists()
     monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 0)
     chosen_cache(monkeypatch)
-    assert sorted(path.name for path in cache.iterdir()) == ["d.so", "notes.txt"]
+    assert sorted(path.name for path in cache.rglob("*.*")) == ["d.so", "notes.txt"]
+
+
+def test_programs_of_another_processor_are_apart(cache, monkeypatch):
+    """A home that machines share must give no machine another's instructions; where XLA refuses its own, nothing is kept."""
+    folders = set()
+    for flags in ("sse avx", "sse avx avx512f"):
+        monkeypatch.setattr("iblf_jax.core.cache._cpuinfo", lambda flags=flags: ["model name : Same 9000", f"flags : {flags}"])
+        processor.cache_clear()
+        folders.add(chosen_cache(monkeypatch)[0])
+    assert len(folders - {None}) == 2
+    monkeypatch.setattr("iblf_jax.core.cache._cpuinfo", lambda: ["model name : Same 9000", "bugs : spectre_v2 gds mds"])
+    assert chosen_cache(monkeypatch) == (None, [])
+    processor.cache_clear()
 
 
 @needs_compiler
@@ -278,10 +294,10 @@ def fresh(tmp_path, **more: str) -> list[str]:
 @pytest.mark.slow
 def test_a_script_keeps_its_programs_without_being_told(tmp_path):
     """Not at the import, but from the first run on; a second process compiles nothing of it."""
-    folder = repr(str(tmp_path / "iblf_jax"))
     for again in (False, True):
         before, after, counts = fresh(tmp_path)
-        assert (before, after) == ("None", folder)
+        assert before == "None"
+        assert Path(after.strip("'")).parent == tmp_path / "iblf_jax"
         hits, misses = json.loads(counts)
         assert (misses == 0 < hits) if again else (misses > hits)
 

@@ -1,14 +1,16 @@
 """The folder of the user's in which compiled programs are kept between processes, XLA's and our own kernels.
 
-It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax.  It is used from the first run of a process on, unless JAX has been given a folder of
-its own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used longest ago is removed once all takes more than LIMIT;
-removing the folder loses nothing but time.
+It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of processor.  It is used from the first run
+of a process on, unless JAX has been given a folder of its own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used
+longest ago is removed once all takes more than LIMIT; removing the folder loses nothing but time.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import platform
 import stat
 import time
 import warnings
@@ -55,19 +57,46 @@ def keep_programs() -> None:
     config: Any = jax.config  # its fields are made when JAX starts
     if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
         return
+    if _reloads_badly():
+        return
     try:
-        folder = directory()
-        stranger = _not_ours(folder)
-        _trim(folder)
+        top = directory()
+        # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are shared by machines.
+        folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        stranger = _not_ours(top) or _not_ours(folder)
+        _trim(top)
     except OSError:
         return
     if stranger is not None:
-        warnings.warn(f"compiled programs are not kept: {folder} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
+        warnings.warn(f"compiled programs are not kept: {top} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
     elif os.access(folder, os.W_OK | os.X_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         reset_cache()  # what JAX has compiled before this has made it decide that it keeps nothing
+
+
+@cache
+def processor() -> str:
+    """What a compiled program is tied to: the processor's model and features."""
+    names = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(sorted({line for line in _cpuinfo() if line.startswith(names)})) or platform.processor() + platform.machine()
+
+
+def _cpuinfo() -> list[str]:
+    try:
+        return Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return []
+
+
+def _reloads_badly() -> bool:
+    """Whether XLA refuses its own programs here, with a line of complaint each (github.com/jax-ml/jax/issues/38445).
+
+    It takes "prefer no gather", with which LLVM tunes for the processors that have the bug GDS, for a feature that they lack.
+    """
+    return any(line.startswith("bugs") and "gds" in line.split() for line in _cpuinfo())
 
 
 def _not_ours(folder: Path) -> str | None:
@@ -79,12 +108,11 @@ def _not_ours(folder: Path) -> str | None:
 
 def _trim(folder: Path) -> None:
     """Removes what was used longest ago, until the rest is small enough."""
-    with os.scandir(folder) as entries:
-        kept = [(x.stat(follow_symlinks=False), x.path) for x in entries if x.name.endswith(SUFFIXES)]
+    kept = [(path.stat(), path) for path in (*folder.glob("*"), *folder.glob("xla-*/*")) if path.name.endswith(SUFFIXES)]
     size = sum(status.st_size for status, _ in kept)
     for status, path in sorted(kept, key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime)):
         if size <= LIMIT or max(status.st_atime, status.st_mtime) > time.time() - IN_USE:
             break
         with contextlib.suppress(OSError):
-            os.unlink(path)
+            path.unlink()
             size -= status.st_size

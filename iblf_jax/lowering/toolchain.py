@@ -27,7 +27,7 @@ from pathlib import Path
 
 import jax
 
-from iblf_jax.core.cache import directory
+from iblf_jax.core.cache import directory, processor
 from iblf_jax.core.drafts import draft, remove_abandoned
 
 FLAGS = (
@@ -84,18 +84,9 @@ def _version_of(path: str, changed: int) -> str | ToolchainError:
     return next((line.strip() for line in lines if line.strip()), None) or ToolchainError(f"{Path(path).name} --version prints nothing")
 
 
-@cache
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))}))
-    except OSError:
-        return platform.processor() + platform.machine()
-
-
 def built_for() -> dict[str, str]:
     """What a kernel is tied to, in words; ToolchainError if there is no compiler."""
-    found, path = _processor(), compiler()
+    found, path = processor(), compiler()
     names = [line.partition(":")[2].strip() for line in found.splitlines() if line.startswith(("model name", "CPU part"))]
     features = hashlib.sha256(found.encode()).hexdigest()[:8]
     return {"processor": f"{', '.join(names) or platform.machine()}, features {features}", "compiler": f"{_version(path)}, {path}"}
@@ -165,7 +156,7 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     path = compiler()
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     flags = [*FLAGS, *extra]
-    content = [source, *flags, path, _version(path), _processor(), header.read_text()]
+    content = [source, *flags, path, _version(path), processor(), header.read_text()]
 
     def compile_to(result: Path) -> None:
         text = result.with_suffix(".cc")
