@@ -9,9 +9,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
 
 INTERRUPTED = 130
 """Exit code of a process that was interrupted."""
+AT_END: list[Callable[[], None]] = []
+"""What an interrupted process still does: it stops what it has started."""
 
 
 def end_process(number: int, frame: object) -> None:
@@ -22,6 +25,8 @@ def end_process(number: int, frame: object) -> None:
     sys.stdout.flush()
     sys.stderr.write("iblf-jax: error: interrupted\n")
     sys.stderr.flush()
+    for last in AT_END:
+        last()
     os._exit(INTERRUPTED)
 
 

@@ -40,6 +40,7 @@ BAD_NUMBERS = {
     "complex": (1.0 + 2.0j, "real numbers"),
     "complex-array": (np.ones(2, complex), "real numbers"),
     "dict": ({"a": 1.0}, "number"),
+    "masked": (np.ma.array([1.0, 2.0], mask=[False, True]), "number"),
     "set": ({1.0}, "number"),
     "ragged": ([[1.0], [1.0, 2.0]], "rectangular"),
     "list-with-none": ([1.0, None], "number"),

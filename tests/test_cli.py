@@ -291,6 +291,7 @@ def test_the_cache_is_only_a_help(cache, tmp_path, monkeypatch):
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
+    monkeypatch.setattr("iblf_jax.core.cache._reloads_badly", lambda: False)
     keep_programs.cache_clear()
     cli.prepare_jax()
     assert seen["jax_enable_x64"] is True

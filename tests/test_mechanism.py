@@ -23,8 +23,9 @@ from iblf_jax.lowering.program import LANE, TIME
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
 
-QUARTER = (0.7071067811865476, 0.7071067811865475, 0.0, 0.0)
-"""A turn about x by a right angle."""
+HALF = 0.5**0.5
+QUARTER, BACK = (HALF, HALF, 0.0, 0.0), (HALF, -HALF, 0.0, 0.0)
+"""Turns about x by a right angle."""
 STEP = TimeStep("euler")
 
 
@@ -36,7 +37,7 @@ def square_arm() -> ij.Scenario:
         centre=[[0.1, 0.0, 0.0], [0.0, 0.2, 0.05]],
         inertia=[[0.02, 0.03, 0.03, 0.0, 0.0, 0.0], [0.01, 0.01, 0.02, 0.0, 0.001, 0.0]],
         position=[[0.0, 0.0, 0.3], [0.4, 0.0, 0.0]],
-        rotation=[[1.0, 0.0, 0.0, 0.0], QUARTER],
+        rotation=[BACK, QUARTER],
         tip_position=[0.0, 0.0, 0.25],
         tip_rotation=QUARTER,
         payload=0.5,
@@ -128,6 +129,41 @@ def test_another_number_that_is_none_of_these_compiles_nothing():
     longer = {f"{robot}.position[1]": jnp.asarray([0.5, 0.0, 0.0]) for robot in ("plant", "model")}
     assert mechanism_of(with_parameters(scenario, longer)) == mechanism_of(scenario)
     assert mechanism_of(with_parameters(scenario, {"plant.position[1]": jnp.asarray([0.5, 0.0, 0.0])})) != mechanism_of(scenario)
+
+
+def test_a_right_angle_costs_no_more_in_the_model_than_in_the_plant():
+    """Equal numbers of a row, of either sign, are one input, and the model's are the plant's."""
+    known = mechanism_of(square_arm()).numbers
+    rows = [x for x in known if x is not None and x.sign < 0]
+    assert rows and all(known[x.same].same is None for x in known if x is not None and x.same is not None)
+
+
+def test_a_robot_of_a_user_may_have_a_field_of_that_name():
+    @ij.component
+    class Mine(ij.robots.Arm):
+        geometry: jax.Array = ij.leaf("m", shape="any", default=(1.0, 2.0))
+        geometry_fields: jax.Array = ij.leaf("m", shape="any", default=(1.0, 2.0))
+
+    arm = square_arm().plant
+    fields = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
+    assert mechanism_of(dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))) is None
+
+
+def test_derivatives_by_the_geometry():
+    """A direction moves numbers that are compiled in as zeros: their derivatives are there all the same."""
+    scenario = square_arm()
+    start, along = {"initial.q": scenario.initial.q[None]}, {"plant.centre": np.eye(6).reshape(6, 2, 3)}
+    dt = jnp.asarray(DT)
+
+    def by(backend, mechanism):
+        run = Run(5, "euler", mechanism=mechanism)
+        return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, along, STANDARD, dt, run, backend=backend).tangents)(scenario, start)
+
+    known, plain = by("native", mechanism_of(scenario)), by("vmap", None)
+    for name, expected in plain.items():
+        np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
+    counts = np.abs(plain["rmse"]).max(axis=(0, 2)) > 0
+    assert counts.tolist() == [True, True, False, True, True, True], "a height on the vertical axis is no lever"
 
 
 def test_robots_without_a_geometry_and_tracers_have_none():

@@ -20,7 +20,7 @@ from conftest import ROOT
 
 from iblf_jax import cli
 from iblf_jax.core import drafts
-from iblf_jax.core.cache import directory, keep_programs, processor
+from iblf_jax.core.cache import _reloads_badly, directory, keep_programs, processor
 from iblf_jax.engine import execute, native
 from iblf_jax.lowering import nvrtc, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
@@ -167,12 +167,13 @@ def test_a_compiler_that_leaves_a_link(cache, tmp_path, monkeypatch, link):
     assert target.is_dir() or target.read_text() == "precious"
 
 
-def chosen_cache(monkeypatch):
+def chosen_cache(monkeypatch, badly=False):
     """Where the command line keeps JAX's compiled programs, and what it says."""
     seen, said = {}, []
     monkeypatch.setattr(jax.config, "update", seen.__setitem__)
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
     monkeypatch.setattr(warnings, "warn", lambda text, *_, **__: said.append(text))
+    monkeypatch.setattr("iblf_jax.core.cache._reloads_badly", lambda: badly)
     keep_programs.cache_clear()
     cli.prepare_jax()
     return seen.get("jax_compilation_cache_dir"), said
@@ -232,24 +233,50 @@ def test_programs_of_another_processor_are_apart(cache, monkeypatch):
         monkeypatch.setattr("iblf_jax.core.cache._cpuinfo", lambda flags=flags: ["model name : Same 9000", f"flags : {flags}"])
         processor.cache_clear()
         folders.add(chosen_cache(monkeypatch)[0])
+    processor.cache_clear()
     assert len(folders - {None}) == 2
     monkeypatch.setattr("iblf_jax.core.cache._cpuinfo", lambda: ["model name : Same 9000", "bugs : spectre_v2 gds mds"])
-    assert chosen_cache(monkeypatch) == (None, [])
-    processor.cache_clear()
+    assert chosen_cache(monkeypatch, badly=_reloads_badly()) == (None, [])
+
+
+def test_nothing_is_removed_through_a_link(cache, tmp_path, monkeypatch):
+    cache.mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    precious = tmp_path / "elsewhere" / "precious.so"
+    precious.write_bytes(bytes(1000))
+    os.utime(precious, (0, 0))
+    monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 0)
+    (cache / "xla-old").symlink_to(tmp_path / "elsewhere")
+    assert chosen_cache(monkeypatch)[0] is None
+    assert precious.exists()
+
+
+def wait_for(path):
+    """Until a file has something in it, for some seconds at most."""
+    for _ in range(2000):
+        if path.exists() and path.read_text().strip():
+            return
+        time.sleep(0.01)
+    pytest.fail(f"{path.name} was never written")
 
 
 @needs_compiler
 def test_what_is_built_ahead_is_built_once(cache, tmp_path, monkeypatch):
-    """Who wants it meanwhile waits for it; what failed is tried again by who wants it, and told to him."""
+    """Who wants it meanwhile waits for it, and is told once what went wrong."""
     calls = tmp_path / "calls"
     fake(tmp_path, monkeypatch, compiles(f'echo once >> {calls}; sleep 0.5; exec "$REAL" "$@"'))
     toolchain.build_ahead(SOURCE)
+    wait_for(calls)
     assert value() == 41
     assert calls.read_text().split() == ["once"]
-    fake(tmp_path, monkeypatch, compiles("sleep 0.2; echo error: no >&2; exit 1"))
+    calls.unlink()
+    fake(tmp_path, monkeypatch, compiles(f"echo once >> {calls}; sleep 0.2; echo error: no >&2; exit 1"))
     toolchain.build_ahead(OTHER)
-    with pytest.raises(ToolchainError, match="error: no"):
-        toolchain.built(OTHER)
+    wait_for(calls)
+    for tries in (1, 2):
+        with pytest.raises(ToolchainError, match="error: no"):
+            toolchain.built(OTHER)
+        assert len(calls.read_text().split()) == tries
 
 
 def test_who_stops_waiting_stops_the_compiler(cache, tmp_path, monkeypatch):
@@ -257,8 +284,7 @@ def test_who_stops_waiting_stops_the_compiler(cache, tmp_path, monkeypatch):
     pid = tmp_path / "pid"
     fake(tmp_path, monkeypatch, compiles(f"echo $$ > {pid}; exec sleep 60"))
     toolchain.build_ahead(SOURCE)
-    while not (pid.exists() and pid.read_text().strip()):
-        time.sleep(0.01)
+    wait_for(pid)
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     signal.setitimer(signal.ITIMER_REAL, 0.2)
     with pytest.raises(KeyboardInterrupt):
@@ -292,6 +318,7 @@ def fresh(tmp_path, **more: str) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
 def test_a_script_keeps_its_programs_without_being_told(tmp_path):
     """Not at the import, but from the first run on; a second process compiles nothing of it."""
     for again in (False, True):

@@ -53,27 +53,28 @@ def directory() -> Path:
 
 @cache
 def keep_programs() -> None:
-    """Has JAX keep what it compiles, unless the user has told it where, or not to, or no folder is safe to write to; once a process."""
-    config: Any = jax.config  # its fields are made when JAX starts
-    if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
-        return
-    if _reloads_badly():
-        return
+    """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to, or no folder is safe; once a process."""
     try:
         top = directory()
+        stranger = _not_ours(top)
+        if stranger is None:
+            _trim(top)  # kernels are here whatever JAX does
+        config: Any = jax.config  # its fields are made when JAX starts
+        if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache or _reloads_badly():
+            return
         # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are shared by machines.
         folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        stranger = _not_ours(top) or _not_ours(folder)
-        _trim(top)
+        if stranger is None:
+            folder.mkdir(mode=0o700, exist_ok=True)
+            stranger = _not_ours(folder)
     except OSError:
         return
     if stranger is not None:
         warnings.warn(f"compiled programs are not kept: {top} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
     elif os.access(folder, os.W_OK | os.X_OK):
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        config.update("jax_compilation_cache_dir", str(folder))
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         reset_cache()  # what JAX has compiled before this has made it decide that it keeps nothing
 
 
@@ -99,20 +100,30 @@ def _reloads_badly() -> bool:
     return any(line.startswith("bugs") and "gds" in line.split() for line in _cpuinfo())
 
 
+def _entries(folder: Path) -> list[tuple[os.DirEntry, os.stat_result]]:
+    """What a folder holds and what each is, links themselves; another process may remove some meanwhile."""
+    found = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            with contextlib.suppress(FileNotFoundError):
+                found.append((entry, entry.stat(follow_symlinks=False)))
+    return found
+
+
 def _not_ours(folder: Path) -> str | None:
     """The name of something in a folder that another user owns, or that is a link; None if there is none."""
-    with os.scandir(folder) as entries:
-        found = (x.name for x in entries if x.is_symlink() or x.stat(follow_symlinks=False).st_uid != os.getuid())
-        return next(found, None)
+    return next((x.name for x, status in _entries(folder) if x.is_symlink() or status.st_uid != os.getuid()), None)
 
 
 def _trim(folder: Path) -> None:
     """Removes what was used longest ago, until the rest is small enough."""
-    kept = [(path.stat(), path) for path in (*folder.glob("*"), *folder.glob("xla-*/*")) if path.name.endswith(SUFFIXES)]
+    top = _entries(folder)
+    inner = [Path(x.path) for x, _ in top if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False)]
+    kept = [(status, x.path) for x, status in [*top, *(y for part in inner for y in _entries(part))] if x.name.endswith(SUFFIXES)]
     size = sum(status.st_size for status, _ in kept)
     for status, path in sorted(kept, key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime)):
         if size <= LIMIT or max(status.st_atime, status.st_mtime) > time.time() - IN_USE:
             break
         with contextlib.suppress(OSError):
-            path.unlink()
+            os.unlink(path)
             size -= status.st_size

@@ -170,7 +170,7 @@ def _is_plain(value: Any) -> bool:
     """Whether a value is a number, an array or a list of numbers that JAX has nothing to do with."""
     if isinstance(value, list | tuple):
         return all(isinstance(x, int | float) for x in jax.tree.leaves(value))
-    return isinstance(value, int | float | np.ndarray | np.generic)
+    return isinstance(value, int | float | np.ndarray | np.generic) and not isinstance(value, np.ma.MaskedArray)  # JAX refuses a mask
 
 
 def _from_host(value: Any) -> jax.Array:

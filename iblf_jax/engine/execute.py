@@ -30,7 +30,7 @@ from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
 from iblf_jax.lowering.packed import Shapes
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import Program, UnsupportedError
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.lowering.toolchain import ToolchainError, stop_compilers
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 
@@ -110,7 +110,11 @@ def _run_lowered(name: str, batch: Batch, run: Run) -> Outcome:
     if name == "native":
         program, _ = program_of(TimeStep(run.method, run.record_every is not None), batch, carry_shapes(batch, run.method))
         native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
-    return run_all(_executor(name), batch, run)
+    try:
+        return run_all(_executor(name), batch, run)
+    except BaseException:
+        stop_compilers()
+        raise
 
 
 def _operations(inputs: Inputs) -> int:
@@ -228,7 +232,7 @@ def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps:
     Returns:
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
-    return _run_from(scenario, dt, carry, step=step, run=Run(steps, mechanism=mechanism_of(scenario)))
+    return _run_from(scenario, dt, carry, step=step, run=Run(steps, mechanism=mechanism_of(scenario) if automatic()[0] != "xla" else None))
 
 
 @partial(jax.jit, static_argnames=("step", "run"))

@@ -2,13 +2,13 @@
 
 Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree.  A scalar program that knows it needs fewer
 operations.  Numbers themselves are never compiled in, nor anything of masses, gains and loads, so new ones compile nothing: a robot says
-which of its fields are its `geometry`.  What differs between runs is not shared, and nothing is known of it.
+which these are (`geometry_fields`).  What differs between runs is not shared, and nothing is known of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -38,13 +38,19 @@ class Mechanism(NamedTuple):
         for i, known in enumerate(self.numbers):
             if known is not None and i in place:
                 same = known.same if known.same is None else place.get(known.same)
-                found[place[i]] = known._replace(same=same)
+                found[place[i]] = known._replace(same=same, sign=known.sign if same is not None else 1)
         return tuple(found)
+
+
+def _geometry(robot: Any) -> tuple[str, ...]:
+    """The fields that a class of robots says may be compiled in."""
+    names = getattr(type(robot), "geometry_fields", ())
+    return names if isinstance(names, tuple) and all(isinstance(name, str) for name in names) else ()
 
 
 def mechanism_of(scenario: Scenario) -> Mechanism | None:
     """What is known of a scenario's numbers; None where they are tracers, or no robot has a geometry."""
-    robots = {name: getattr(getattr(scenario, name), "geometry", ()) for name in ("plant", "model")}
+    robots = {name: _geometry(getattr(scenario, name)) for name in ("plant", "model")}
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
     numbers: list[Known | None] = []
@@ -58,7 +64,10 @@ def mechanism_of(scenario: Scenario) -> Mechanism | None:
             row = values.shape[-1] if names[1] in QUATERNIONS else 1
             flat = values.ravel()
             for i, x in enumerate(flat):
-                numbers.append(_known(x, flat[i - i % row : i], len(numbers) - i % row))
+                known = _known(x, flat[i - i % row : i], len(numbers) - i % row)
+                first = numbers[known.same] if known and known.same is not None else None
+                # The model's numbers are the plant's, so what is equal to one of them is equal to that of the plant.
+                numbers.append(known._replace(same=first.same) if known and first and first.same is not None else known)
                 if twin and numbers[-1] == Known() and twin[1].shape == values.shape and twin[1].flat[i] == x:
                     numbers[-1] = Known(same=twin[0] + i)
         else:

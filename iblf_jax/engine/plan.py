@@ -53,10 +53,11 @@ XLA_STRETCH = 4096
 """Steps whose signals are tabulated at once, at most."""
 XLA_SEGMENT = 2000
 """Nodes in one XLA computation on CPU: its passes take more than linear time."""
-NATIVE_LONG, NATIVE_SEGMENT, NATIVE_FLAGS = 10_000, 2000, ("-O1",)
+NATIVE_LONG, NATIVE_SEGMENT, NATIVE_FLAGS = 10_000, 2000, ("-O1", "-fexpensive-optimizations")
 """Nodes above which the C of a step is cut into functions, of how many each, and how it is built then: one of `presets.ur5` builds in 6 s
 instead of 27 and runs as fast (cut it takes 5 % longer, with less optimisation 20 % shorter).  A short step would take 1.6 times as long,
-one of 8,000 nodes 1.1 times."""
+one of 8,000 nodes 1.1 times.  The second flag makes products with sums one operation, as -O3 does: -O1 alone does not, and a large angle's
+sine would lose digits."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
 GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100

@@ -42,7 +42,7 @@ class Run(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a run is made from: its leaves are inputs of what is compiled, never constants."""
+    """What a run is made from: its leaves are inputs of what is compiled, never constants (but see `engine.mechanism`)."""
 
     scenario: Scenario
     folds: Any
@@ -282,7 +282,7 @@ def probed(time: jax.Array, state: LoopState) -> Probed:
 
 @dataclasses.dataclass(frozen=True)
 class Kick:
-    """What the torque that the stages did not see accelerates, in one step: the only thing at the end of a run that needs its robot."""
+    """What the torque that the stages did not see accelerates, in one step, as it takes the robot's mass matrix."""
 
     def __call__(self, inputs: Inputs, carry: accuracy.Unseen, index: jax.Array, form: Form):
         """The carry with accelerations; nothing is recorded."""

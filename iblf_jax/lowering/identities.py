@@ -1,7 +1,8 @@
 """Constant folding, and identities that hold for every floating-point number, NaN and infinities included.
 
 x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN, and a run that is not finite must
-be seen to be so.  (Programs of derivatives, `Builder.sparse`, are the exception: their values are those of a program without derivatives.)
+be seen to be so.  There are two exceptions: programs of derivatives (`Builder.sparse`), whose values are those of a program without
+derivatives, and zeros of a mechanism (`Builder.absent`): what has no lever moves nothing.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ class Builder:
         if simpler is not None:
             return simpler
         new = self._add(Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None)
-        if self.known_finite and all(a in self.known_finite or self.nodes[a].op == "const" for a in args):
+        if self.known_finite and kind == "f" and all(a in self.known_finite or self._is_finite_constant(a) for a in args):
             self.known_finite.add(new)
         return new
 
@@ -183,6 +183,9 @@ class Builder:
         """Whether a node is of class LANE|TIME."""
         extend_classes(self._classes, self.nodes, self.still)
         return self._classes[node] == LANE | TIME
+
+    def _is_finite_constant(self, node: int) -> bool:
+        return self.nodes[node].op == "const" and math.isfinite(self.nodes[node].value)
 
     def value(self, node: int):
         """The value of a constant node, else None."""

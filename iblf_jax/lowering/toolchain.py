@@ -8,6 +8,7 @@ is a copy of what was checked.  Nothing here follows a symbolic link that it fin
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import hashlib
@@ -27,6 +28,7 @@ from pathlib import Path
 
 import jax
 
+from iblf_jax._start import AT_END
 from iblf_jax.core.cache import directory, processor
 from iblf_jax.core.drafts import draft, remove_abandoned
 
@@ -96,6 +98,9 @@ _running: set[int] = set()
 """Compilers that run now."""
 _making: dict[str, threading.Lock] = {}
 """Key -> the lock of who makes it."""
+_failures: dict[str, ToolchainError] = {}
+"""Key -> why a thread that built it ahead could not."""
+_this_thread = threading.local()
 
 
 def stop_compilers() -> None:
@@ -105,10 +110,15 @@ def stop_compilers() -> None:
             os.killpg(pid, signal.SIGKILL)
 
 
+AT_END.append(stop_compilers)
+atexit.register(stop_compilers)
+
+
 def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
     """Starts `built` beside what this process does meanwhile; whoever wants the result waits for it, and is told what went wrong."""
 
     def build() -> None:
+        _this_thread.is_ahead = True
         with contextlib.suppress(ToolchainError):
             built(source, extra)
 
@@ -185,17 +195,27 @@ def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) ->
 
 @contextlib.contextmanager
 def _made_once(key: str) -> Iterator[None]:
-    """Waits while another thread makes the same; who stops waiting stops the compilers."""
-    lock = _making.setdefault(key, threading.Lock())
+    """Waits while another thread makes the same; who stops waiting stops the compilers.
+
+    Raises:
+      ToolchainError: what kept `build_ahead` from making it, once.
+    """
+    waiting = True
     try:
-        lock.acquire()
+        with _making.setdefault(key, threading.Lock()):
+            waiting = False
+            if key in _failures:
+                raise _failures.pop(key)
+            try:
+                yield
+            except ToolchainError as error:
+                if getattr(_this_thread, "is_ahead", False):
+                    _failures[key] = error
+                raise
     except BaseException:
-        stop_compilers()
+        if waiting:
+            stop_compilers()
         raise
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _keep(folder: Path, path: Path, make: Callable[[Path], object]) -> None:

@@ -30,6 +30,7 @@ from iblf_jax.bounds import Bounds
 from iblf_jax.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.core import checks
+from iblf_jax.core.cache import keep_programs
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import Momentum, Printed
 from iblf_jax.references import Reference
@@ -59,6 +60,11 @@ def arm(name: str) -> Arm:
     text = resources.files("iblf_jax.presets").joinpath("data", f"{name}.toml").read_text(encoding="utf-8")
     fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in tomllib.loads(text).items()}
     return Arm(**fields)
+
+
+@jax.jit
+def _start_of(reference: Reference) -> jax.Array:
+    return reference.position(jnp.zeros(()))
 
 
 def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST_K2) -> jax.Array:
@@ -116,7 +122,8 @@ def arm_scenario(
     checks.one_of("reading", reading, ("printed", "corrected"))
     checks.conforms("robot", robot, Robot)
     checks.conforms("reference", reference, Reference)
-    start = jax.jit(lambda reference: reference.position(jnp.zeros(())))(reference)
+    keep_programs()
+    start = _start_of(reference)
     K2 = inertial_gain(robot if model is None else model, jnp.broadcast_to(start, (robot.n,)) if jnp.ndim(start) == 0 else start)
     if law == "pd":  # its gains by name are for one size of joint
         controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)

@@ -120,7 +120,7 @@ class Arm:
     joints: tuple[str, ...] = static(default=())
     repaired: tuple[str, ...] = static(default=())
 
-    geometry: ClassVar[tuple[str, ...]] = ("centre", "inertia", "position", "rotation", "axis", "tip_position", "tip_rotation", "g")
+    geometry_fields: ClassVar[tuple[str, ...]] = ("centre", "inertia", "position", "rotation", "axis", "tip_position", "tip_rotation", "g")
     """Fields of which it may be compiled in which numbers are 0, 1 or -1, and which are equal (`engine.mechanism`)."""
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),

@@ -311,7 +311,7 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
       values: path -> number or array; a scalar fills every entry of its leaf.  Traced values are fine: differentiate by them.
 
     Returns:
-      A new Scenario of the same structure, so that nothing recompiles.
+      A new Scenario of the same structure: nothing recompiles, unless a zero, one or equality of an arm's geometry comes or goes.
 
     Raises:
       ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the remedy.

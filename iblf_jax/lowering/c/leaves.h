@@ -51,7 +51,8 @@ static XLA_FFI_Error *all_turned(XLA_FFI_CallFrame *frame, bool packing) {
   int64_t ins = frame->args.size, outs = frame->rets.size, used[2] = {0, 0};
   if ((packing ? outs : ins) != 2) return failure(frame, "iblf_jax leaves: wrong number of operands");
   XLA_FFI_Buffer **rows = packing ? out : in, **arrays = packing ? in : out;
-  if (rows[0]->rank != 2 || rows[1]->rank != 2 || rows[1]->dtype != XLA_FFI_DataType_S32) return failure(frame, "iblf_jax leaves: wrong rows");
+  if (rows[0]->rank != 2 || rows[1]->rank != 2 || rows[1]->dtype != XLA_FFI_DataType_S32 || rows[1]->dims[1] != rows[0]->dims[1])
+    return failure(frame, "iblf_jax leaves: wrong rows");
   for (int64_t i = 0; i < (packing ? ins : outs); i++)
     if (!turned(arrays[i], rows, used, rows[0]->dims[1], packing)) return failure(frame, "iblf_jax leaves: an array does not fit its rows");
   if (used[0] != rows[0]->dims[0] || used[1] != rows[1]->dims[0]) return failure(frame, "iblf_jax leaves: rows without an array");
