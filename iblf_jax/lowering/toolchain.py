@@ -53,6 +53,10 @@ class ToolchainError(Exception):
     """No compiler, or it failed, or there is no safe place for its result; the message is one line for the user."""
 
 
+class StoppedError(ToolchainError):
+    """Stopped by this process itself: another try may do."""
+
+
 def compiler() -> str:
     """The path of a C++ compiler: $CXX if it is set, else c++, g++ or clang++; ToolchainError if there is none."""
     wanted = os.environ.get("CXX")
@@ -106,6 +110,7 @@ _this_thread = threading.local()
 def stop_compilers() -> None:
     """Kills every compiler that this process has started."""
     for pid in tuple(_running):
+        _running.discard(pid)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(pid, signal.SIGKILL)
 
@@ -152,7 +157,10 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
             raise ToolchainError(f"{name} took longer than {seconds:g} s and was stopped") from None
         raise
     finally:
+        stopped = process.pid not in _running
         _running.discard(process.pid)
+    if stopped:
+        raise StoppedError(f"{name} was stopped")
     text = said[0] if said else b""
     if code:
         lines = text.decode(errors="replace").splitlines()
@@ -209,7 +217,7 @@ def _made_once(key: str) -> Iterator[None]:
             try:
                 yield
             except ToolchainError as error:
-                if getattr(_this_thread, "is_ahead", False):
+                if getattr(_this_thread, "is_ahead", False) and not isinstance(error, StoppedError):
                     _failures[key] = error
                 raise
     except BaseException:
