@@ -9,7 +9,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, machine_function, plan, simulate
+from iblf_jax.engine import execute, machine_function, plan, transformable
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
 from iblf_jax.engine.step import Inputs, Run
@@ -83,18 +83,18 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
     """By their length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)
     monkeypatch.setattr(plan, "LONG_EVALUATION", 0)
-    simulate._run_one.clear_cache()
+    transformable.run_now.clear_cache()
     try:
 
         def ise(K2):
-            return ij.simulate(ij.with_parameters(paper, {"controller.K2": K2}), duration=0.011, dt=1e-3).metrics.ise.sum()
+            return ij.simulate(ij.with_parameters(paper, {"controller.K2": K2}), duration=0.011, dt=1e-3, backend="xla").metrics.ise.sum()
 
         compact = ij.simulate(paper, duration=0.011, dt=1e-3)
         K2 = jnp.array([20.0, 30.0])
         slope = jax.grad(ise)(K2)
         values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
     finally:
-        simulate._run_one.clear_cache()
+        transformable.run_now.clear_cache()
     np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
     step = 1e-3
     for i in range(2):

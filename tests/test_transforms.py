@@ -12,7 +12,9 @@ from conftest import PAPER, SHORT
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, simulate, step
+from iblf_jax.engine import execute, plan, step, transformable
+from iblf_jax.lowering.program import UnsupportedError
+from iblf_jax.simulation.scenario import canonical
 
 PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")
 NOMINAL = (2.0, 20.0, 0.1, 20.0, 1.5, 0.8, 0.0, 0.0)
@@ -147,13 +149,107 @@ def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
     np.testing.assert_allclose(runs[1].q, alone.q, rtol=1e-7, atol=1e-9)
 
 
+LEAVES = ("controller.K2", "observer.kf", "plant.mass", "plant.g", "initial.q", "disturbance.phase", "bounds.upper")
+"""Gains, the robot, the start, the world: one of every kind of leaf."""
+LIGHT = {"duration": 0.03, "dt": 1e-3, "method": "euler", "metrics": [ij.metrics.Tracking(), ij.metrics.Torque()]}
+"""A run whose derivatives by the scan compile soon."""
+
+
+def everything(scenario, **options):
+    """Records and metrics of a run, the floats of them, as a function of the leaves LEAVES."""
+    start = {path: x for path, _, _, x in ij.parameters(scenario, named=False) if path.startswith(LEAVES)}
+
+    def run(values):
+        made = ij.simulate(ij.with_parameters(scenario, values), **LIGHT, **options)
+        return {name: x for name, x in {**vars(made), **made.metrics}.items() if name in step.SIGNALS or name in made.metrics}
+
+    def floats(values):
+        return {name: x for name, x in run(values).items() if jnp.issubdtype(x.dtype, jnp.floating)}
+
+    return floats, start
+
+
+def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeypatch):
+    """Of all that is recorded and measured, by leaves of every kind, in both modes, in a batch and inside jit."""
+    plain, start = everything(paper, backend="xla")
+    expected, value = jax.jacfwd(plain)(start), plain(start)
+    assert len(start) >= 10 and len(expected) > 20
+    calls = []
+    monkeypatch.setattr(transformable, "_plain", lambda *args: calls.append(1) or (_ for _ in ()).throw(AssertionError("the scan")))
+    run, _ = everything(paper)
+
+    def all_close(found, wanted, rtol=1e-9):
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_allclose(a, b, rtol=rtol, atol=1e-9 * max(1.0, float(np.max(np.abs(b), initial=0.0))))
+
+    all_close(jax.jacfwd(run)(start), expected)
+    found, pulled = jax.vjp(run, start)
+    all_close(found, value)
+    ones = jax.tree.map(jnp.ones_like, value)
+    along = jax.tree.map(jnp.ones_like, start)
+    pushed = jax.jvp(run, (start,), (along,))[1]
+    together = sum(float(jnp.sum(x)) for x in jax.tree.leaves(pushed))
+    transposed = sum(float(jnp.sum(x)) for x in jax.tree.leaves(pulled(ones)[0]))
+    np.testing.assert_allclose(together, transposed, rtol=1e-9)
+    two = jax.tree.map(lambda x: jnp.stack([x, x * (1 + 1e-3)]), start)
+    batched = jax.jit(jax.vmap(lambda values: jax.jvp(run, (values,), (along,))[1]))(two)
+    all_close(jax.tree.map(lambda x: x[0], batched), pushed)
+    all_close(jax.tree.map(lambda x: x[1], batched), jax.jvp(run, (jax.tree.map(lambda x: x[1], two),), (along,))[1])
+    assert calls == []
+
+
+def test_second_derivatives_are_the_kernels(paper, monkeypatch):
+    monkeypatch.setattr(transformable, "_plain", lambda *args: (_ for _ in ()).throw(AssertionError("the scan")))
+
+    def ise(values):
+        return ij.simulate(ij.with_parameters(paper, {"controller.K2": values[:2], "plant.mass": values[2:]}), **LIGHT).metrics.ise.sum()
+
+    at, width = jnp.asarray([20.0, 15.0, 1.5, 1.2]), 1e-4
+    hessian = jax.hessian(ise)(at)
+    moved = [at + sign * width * unit for unit in np.eye(4) for sign in (1, -1)]
+    slopes = np.asarray([jax.grad(ise)(x) for x in moved]).reshape(4, 2, 4)
+    np.testing.assert_allclose(hessian, (slopes[:, 0] - slopes[:, 1]) / (2 * width), rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(jax.jacrev(jax.grad(ise))(at), hessian, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
+    """And says the same: by the step, where records would be too large, without a compiler, and where a step does not lower."""
+
+    def last(K2, dt):
+        scenario = canonical(ij.with_parameters(paper, {"controller.K2": K2}))
+        return jnp.sum(transformable.run_transformable(scenario, (), dt, step.Run(30, "euler", 1)).records[0]["q"][-1])
+
+    K2, dt, calls = jnp.asarray([20.0, 15.0]), jnp.asarray(1e-3), []
+    expected, original = jax.grad(last)(K2, dt), transformable._plain
+    monkeypatch.setattr(transformable, "_plain", lambda *args: calls.append(1) or original(*args))
+    np.testing.assert_array_equal(jax.grad(last)(K2, dt), expected)
+    assert calls == []
+    slope = jax.grad(last, 1)(K2, dt)
+    np.testing.assert_allclose(slope, (last(K2, dt * 1.001) - last(K2, dt * 0.999)) / (2e-3 * dt), rtol=1e-5)
+
+    def no_kernel(*args):
+        raise UnsupportedError("made up")
+
+    for place, name, value in (
+        (plan, "COLUMNS_KEPT", 10),
+        (execute, "automatic", lambda: ("xla", "there is no C++ compiler")),
+        (transformable, "_columns", no_kernel),
+    ):
+        calls.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(place, name, value)
+            np.testing.assert_allclose(jax.grad(last)(K2, dt), expected, rtol=1e-9)
+        assert calls, name
+
+
 def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     """Once a structure, a length and a method are compiled, every other value runs the same program."""
     ij.simulate(paper, **PAPER)
     traces = []
     original = step.advance
     monkeypatch.setattr(step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
-    before = simulate._run_one._cache_size()
+    before = transformable.run_now._cache_size()
     for changes in (
         {"controller.K2": 30.0},
         {"plant.mass[1]": 1},
@@ -166,7 +262,7 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     ij.simulate(fresh, **PAPER)
     ij.simulate(fresh, **PAPER, throw=True)
     assert traces == []
-    assert simulate._run_one._cache_size() == before
+    assert transformable.run_now._cache_size() == before
 
 
 def test_a_new_structure_does_recompile(paper, monkeypatch):

@@ -14,8 +14,8 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.execute import run_transformable
 from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import _tune, problem

@@ -90,7 +90,7 @@ class Differentiated(NamedTuple):
     """Upper triangles, row by row, (P (P + 1) / 2,) each."""
 
 
-def _floats(carry: Carry) -> tuple[list[jax.Array], Callable]:
+def floats_of_carry(carry: Carry) -> tuple[list[jax.Array], Callable]:
     """The numbers of a carry that have tangents, and the function that puts others in their place."""
     leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
     places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
@@ -115,7 +115,7 @@ def pushed(function: Callable, directions: Directions, scenario, before: Differe
       before: carry and tangents, or None where the function takes no carry.
       dtype: of the tangents.
     """
-    floats, replaced = _floats(before.carry) if before else ([], lambda _: None)
+    floats, replaced = floats_of_carry(before.carry) if before else ([], lambda _: None)
 
     def of(eps, floats):
         return function(directions.moved(scenario, eps), replaced(floats), eps)
@@ -194,7 +194,7 @@ class DerivativeStep:
             loop = evaluate if not form.scalar else preaccumulated(inputs.scenario, self.directions, eps, before.state)
             after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
             outer = _outer_of(inputs.folds, begun, sample)
-            return (_floats(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
+            return (floats_of_carry(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
 
         _, (tangents, vectors), (after, factors) = pushed(one, self.directions, inputs.scenario, carry, inputs.dt.dtype)
         terms = zip(carry.products, vectors, factors, strict=True)
@@ -208,7 +208,7 @@ def run_with_tangents(executor: Executor, batch: Batch, directions: Directions, 
 
     def at_start(inputs, carry):
         def state(scenario, _, eps):
-            return _floats(carry._replace(state=initial_state(scenario)))[0], ()
+            return floats_of_carry(carry._replace(state=initial_state(scenario)))[0], ()
 
         count = sum(getattr(fold, "curvatures", 0) for fold in inputs.folds)
         _, tangents, _ = pushed(state, directions, inputs.scenario, None, inputs.dt.dtype)

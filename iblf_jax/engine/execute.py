@@ -87,11 +87,13 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
     return on_scan()
 
 
-def _inputs(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
+def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
+    """What a run is made from."""
     return Inputs(scenario, folds, dt, jnp.asarray(run.steps, dt.dtype))
 
 
-def _executor(name: str) -> Executor:
+def executor_named(name: str) -> Executor:
+    """The executor of scalar programs with this name."""
     return lowered_on(native.run, native.pack, native.unpack) if name == "native" else lowered_on(EXECUTORS[name].run)
 
 
@@ -101,23 +103,23 @@ def _nodes(name: str, program: Program) -> int:
 
 
 def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, nested: bool = False) -> Batch:
-    shape = plan.lowered_shape(jax.default_backend(), _operations(inputs), len(next(iter(varied.values()))), nested)
+    shape = plan.lowered_shape(jax.default_backend(), operations(inputs), len(next(iter(varied.values()))), nested)
     return Batch.of(inputs, varied, shape, run.mechanism)
 
 
-def _run_lowered(name: str, batch: Batch, run: Run) -> Outcome:
+def run_lowered(name: str, batch: Batch, run: Run) -> Outcome:
     """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core."""
     if name == "native":
         program, _ = program_of(TimeStep(run.method, run.record_every is not None), batch, carry_shapes(batch, run.method))
         native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
     try:
-        return run_all(_executor(name), batch, run)
+        return run_all(executor_named(name), batch, run)
     except BaseException:
         stop_compilers()
         raise
 
 
-def _operations(inputs: Inputs) -> int:
+def operations(inputs: Inputs) -> int:
     """Of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
     return length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
@@ -125,7 +127,7 @@ def _operations(inputs: Inputs) -> int:
 
 def _shape(inputs: Inputs, runs: int | None, nested: bool) -> plan.Shape:
     """How the scan executor runs them."""
-    return plan.scan_shape(jax.default_backend(), _operations(inputs), runs, nested)
+    return plan.scan_shape(jax.default_backend(), operations(inputs), runs, nested)
 
 
 def _scanned(inputs: Inputs, varied: Mapping[str, jax.Array] | None, nested: bool, run: Callable) -> Any:
@@ -165,10 +167,10 @@ def run_batch(
     Raises:
       ValueError: an unknown backend.
     """
-    inputs = _inputs(scenario, folds, dt, run)
+    inputs = inputs_of(scenario, folds, dt, run)
 
     def run_on(name):
-        return _run_lowered(name, _lowered_batch(inputs, varied, run, nested), run)
+        return run_lowered(name, _lowered_batch(inputs, varied, run, nested), run)
 
     def on_scan():
         return _scanned(inputs, varied, nested, lambda batch: run_all(scan, batch, run))
@@ -184,11 +186,11 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
       backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native where there is a compiler.  What
         is long or does not lower is, on "auto" and "xla", on scan, without a warning.
     """
-    inputs = _inputs(scenario, folds, dt, run)
+    inputs = inputs_of(scenario, folds, dt, run)
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)
 
     def run_on(name):
-        return jax.tree.map(lambda x: x[0], _run_lowered(name, batch, run))
+        return jax.tree.map(lambda x: x[0], run_lowered(name, batch, run))
 
     def on_scan():
         return _scanned(inputs, None, False, lambda batch: run_all(scan, batch, run))
@@ -196,7 +198,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
     if backend in plan.COMPILED.values():
         return with_fallback(backend, run_on, on_scan)
     compiled = backend == "auto" and not native.unavailable()
-    name = plan.executor_of_one_run(compiled, jax.default_backend(), _operations(inputs))
+    name = plan.executor_of_one_run(compiled, jax.default_backend(), operations(inputs))
     if name is None:
         return on_scan()
     try:
@@ -207,15 +209,9 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
         return on_scan()
 
 
-def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
-    """One run that may be batched and differentiated from outside; arguments as `run_one`."""
-    inputs = _inputs(scenario, folds, dt, run)
-    return run_all(scan, Batch.of(inputs, None, _shape(inputs, None, True)), run)
-
-
 def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
-    """As `run_transformable`, for reverse mode: few states are in memory at a time; `run` records nothing."""
-    inputs = _inputs(scenario, folds, dt, run)
+    """One run for reverse mode: few states are in memory at a time; `run` records nothing."""
+    inputs = inputs_of(scenario, folds, dt, run)
     return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 
@@ -237,12 +233,12 @@ def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps:
 
 @partial(jax.jit, static_argnames=("step", "run"))
 def _run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, run: Run) -> tuple[Any, Any]:
-    inputs, steps = _inputs(scenario, (), dt, run), run.steps
+    inputs, steps = inputs_of(scenario, (), dt, run), run.steps
     batch = Batch.of(inputs, None, plan.STATES, run.mechanism)._replace(runs=jax.tree.leaves(carry)[0].shape[0])
     name = automatic()[0]
-    if name != "xla" and _operations(inputs) <= plan.LONG_EVALUATION:
+    if name != "xla" and operations(inputs) <= plan.LONG_EVALUATION:
         try:
-            return _executor(name)(step, batch, carry, steps, 1)
+            return executor_named(name)(step, batch, carry, steps, 1)
         except (UnsupportedError, ToolchainError):
             pass
     return scan(step, batch, carry, steps, 1)
@@ -274,7 +270,7 @@ def run_batch_jvp(
     Raises:
       ValueError: an unknown backend or path.
     """
-    inputs, along = _inputs(scenario, folds, dt, run), Directions.of(directions)
+    inputs, along = inputs_of(scenario, folds, dt, run), Directions.of(directions)
 
     def run_on(name):
         batch = _lowered_batch(inputs, varied, run, nested)
@@ -282,7 +278,7 @@ def run_batch_jvp(
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
             if not plan.lowers_derivatives(name, _nodes(name, program), along.tangents):
                 return on_scan()
-        return run_with_tangents(_executor(name), batch, along, run)
+        return run_with_tangents(executor_named(name), batch, along, run)
 
     def on_scan():
         return _scanned(inputs, varied, nested, lambda batch: run_with_tangents(scan, batch, along, run))
@@ -325,7 +321,7 @@ def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], s
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
 
         def run_on(name):
-            _run_lowered(name, _lowered_batch(_inputs(scenario, folds, dt, run), varied, run), run)
+            run_lowered(name, _lowered_batch(inputs_of(scenario, folds, dt, run), varied, run), run)
             return name
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))

@@ -68,6 +68,9 @@ native one, which cuts a step into segments, half a minute.  Equal numbers are c
 
 FORWARD_MOST = 32
 """Numbers that are differentiated by up to which forward mode is taken, above it reverse mode."""
+COLUMNS_ORDER, COLUMNS_KEPT = 2, 1 << 27
+"""Derivatives that are made column by column, and numbers of such a derivative of one run's records that are kept, 1 GiB: others are the
+scan's, in the mode that the caller takes."""
 
 # Studies: runs are made in blocks of one compiled shape.
 STUDY_BLOCK, STUDY_BLOCK_ELSEWHERE = {"cpu": 256}, 16_384
@@ -198,6 +201,11 @@ def blocks_in_flight(chunk: int | None, memory: float, block_bytes: int, block: 
     """Blocks of a study that may be in flight: `chunk` runs if the caller says so, else what `memory` holds."""
     allowed = memory // max(block_bytes, 1) if chunk is None else chunk // block
     return int(min(max(allowed, 1), STUDY_IN_FLIGHT * devices))
+
+
+def keeps_columns(order: int, numbers: int) -> bool:
+    """Whether a derivative of this order, of so many numbers, is made column by column and kept."""
+    return order <= COLUMNS_ORDER and numbers <= COLUMNS_KEPT
 
 
 def differentiates_forward(numbers: int) -> bool:

@@ -13,11 +13,11 @@ import numpy as np
 from iblf_jax.bounds import tube_at
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status, describe
-from iblf_jax.engine import execute
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
+from iblf_jax.engine.transformable import run_now, run_transformable
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
@@ -35,10 +35,6 @@ class SimulationError(RuntimeError):
 
 class SimulationWarning(UserWarning):
     """A run whose result needs a second look."""
-
-
-_run_one = jax.jit(execute.run_one, static_argnames=("run", "backend"))
-_run_transformable = jax.jit(execute.run_transformable, static_argnames="run")
 
 
 def simulate(
@@ -102,10 +98,10 @@ def simulate(
 def simulate_unchecked(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "auto") -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
-    if checks.is_concrete((scenario, folds)):
-        outcome = _run_one(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend)
+    if checks.is_concrete((scenario, folds, dt)):
+        outcome = run_now(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend)
     else:
-        outcome = _run_transformable(scenario, folds, dt, run)
+        outcome = run_transformable(scenario, folds, dt, run, backend=backend)
     arrays, controller_state, observer_state = outcome.records
     return Rollout(
         scenario=scenario,

@@ -49,6 +49,8 @@ class Inputs(NamedTuple):
     dt: jax.Array
     steps: jax.Array
     """(), a float: whole numbers are no leaves of a scalar program."""
+    direction: Any = ()
+    """Tangents of leaves, where a step takes them as data."""
 
 
 class Nearest(NamedTuple):
@@ -178,7 +180,7 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
       form: how it is written.
       loop: stands for `closed_loop.evaluate`.
     """
-    scenario, _, dt, steps = inputs
+    scenario, dt, steps = inputs.scenario, inputs.dt, inputs.steps
     t, moving = index.astype(dt.dtype) * dt, index.astype(dt.dtype) < steps
     covered = jnp.where(moving, dt, jnp.zeros_like(dt))
     at = form.piece(loop)

@@ -31,6 +31,7 @@ import jax
 from iblf_jax._start import AT_END
 from iblf_jax.core.cache import directory, processor
 from iblf_jax.core.drafts import draft, remove_abandoned
+from iblf_jax.core.progress import told
 
 FLAGS = (
     "-x", "c++", "-std=gnu++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math",
@@ -179,7 +180,8 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     def compile_to(result: Path) -> None:
         text = result.with_suffix(".cc")
         text.write_text(source)
-        _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"], "stderr", TIMEOUT)
+        with told(f"{Path(path).name} is compiling a step of {source.count(chr(10)):,} lines: once, the result is kept"):
+            _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"], "stderr", TIMEOUT)
 
     return kept(content, ".so", compile_to)
 

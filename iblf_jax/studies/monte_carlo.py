@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.progress import bar
 from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold
@@ -24,7 +25,6 @@ from iblf_jax.studies import distributed
 from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.progress import bar
 from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.setup import prepare
 from iblf_jax.studies.study import Study

@@ -22,6 +22,7 @@ import numpy as np
 from scipy import stats
 
 from iblf_jax.core import checks, tables
+from iblf_jax.core.progress import bar
 from iblf_jax.core.status import FAILED
 from iblf_jax.engine import plan
 from iblf_jax.simulation.metrics import Fold, metric_units
@@ -32,7 +33,6 @@ from iblf_jax.studies.blocks import block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_SOBOL, check_seed, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
-from iblf_jax.studies.progress import bar
 from iblf_jax.studies.setup import Setup, prepare
 
 if TYPE_CHECKING:

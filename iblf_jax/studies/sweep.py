@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.progress import bar
 from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
@@ -29,7 +30,6 @@ from iblf_jax.studies.designs import MOST_RUNS, check_sampler, check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
-from iblf_jax.studies.progress import bar
 from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.setup import Setup, prepare
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.progress import bar
 from iblf_jax.core.status import Status, describe
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS
@@ -38,7 +39,6 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.progress import bar
 from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.tangents import by_coordinates

@@ -21,12 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.progress import bar
 from iblf_jax.engine.plan import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.progress import bar
 from iblf_jax.tuning._tune import build, make_method, way_in
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.optimise import CountedProblem, Loop

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.progress import bar
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS, differentiates_forward
 from iblf_jax.simulation.integrators import tableau
@@ -21,7 +22,6 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, targets_of
-from iblf_jax.studies.progress import bar
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton

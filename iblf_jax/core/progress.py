@@ -1,15 +1,20 @@
-"""The progress bar of studies: runs done, runs a second, time left; in terminals and in notebooks."""
+"""What a waiting user sees: the bar of a study, and a line on what takes long; in terminals and in notebooks."""
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 from iblf_jax.core import checks
 
 DELAY = 1.0
 """Seconds before a bar appears that was not asked for."""
+PATIENCE = 2.0
+"""Seconds before a line says what takes long."""
 
 
 def _has_reader() -> bool:
@@ -37,3 +42,16 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
     shown = _has_reader() if progress is None else progress
     delay = DELAY if progress is None else 0.0
     return tqdm(total=total, initial=done, unit=f" {unit}", unit_scale=True, disable=not shown, delay=delay, dynamic_ncols=True)
+
+
+@contextlib.contextmanager
+def told(what: str) -> Iterator[None]:
+    """Says what is being done, once it has taken PATIENCE seconds and if somebody watches."""
+    line = threading.Timer(PATIENCE, lambda: sys.stderr.write(f"iblf_jax: {what}\n"))
+    line.daemon = True
+    if _has_reader():
+        line.start()
+    try:
+        yield
+    finally:
+        line.cancel()
