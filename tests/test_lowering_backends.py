@@ -257,13 +257,18 @@ def test_forward_sensitivities(monkeypatch, written_out):
     def pushed(backend):
         return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, Run(60, "euler"), backend=backend))(scenario, varied)
 
-    outcome, tangents, products = pushed("native")
     reference, expected, exact = pushed("vmap")
-    assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
-    assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
-    assert tangents["rmse"].shape == (3, 3, 2)
-    assert_same(products, exact, 1e-10)
-    assert [x.shape for x in products] == [(3, 3, 3)] * 2
+    for by_columns in (False, True):
+        with monkeypatch.context() as patch:
+            if by_columns:
+                patch.setattr(plan, "JVP_LARGEST_IN_SEGMENTS", 0)
+                patch.setattr(execute, "run_with_tangents", None)
+            outcome, tangents, products = pushed("auto" if by_columns else "native")
+        assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
+        assert_same(jax.tree.map(np.asarray, outcome), jax.tree.map(np.asarray, reference), 1e-10)
+        assert tangents["rmse"].shape == (3, 3, 2)
+        assert_same(products, exact, 1e-10)
+        assert [x.shape for x in products] == [(3, 3, 3)] * 2
 
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):

@@ -201,9 +201,11 @@ def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
 
 @needs_compiler
 def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
-    assert repr(ij.explain(paper)).endswith("a batch runs on native")
+    told = repr(ij.explain(paper))
+    assert "a batch runs on native\n" in told and told.endswith("first and second on native, one run a number; further ones by plain JAX")
     monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
-    assert repr(ij.explain(paper)).endswith("a batch runs on xla: it needs an NVIDIA GPU, not cpu")
+    told = repr(ij.explain(paper))
+    assert "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told and "derivatives of simulate: by plain JAX: it needs" in told
 
 
 def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):

@@ -13,7 +13,7 @@ from test_lowering import DT, PRESET, STANDARD, evaluate, numbers
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute
+from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch, begin
 from iblf_jax.engine.executors import program_of, scan
 from iblf_jax.engine.mechanism import mechanism_of
@@ -149,7 +149,7 @@ def test_a_robot_of_a_user_may_have_a_field_of_that_name():
     assert mechanism_of(dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))) is None
 
 
-def test_derivatives_by_the_geometry():
+def test_derivatives_by_the_geometry(monkeypatch):
     """A direction moves numbers that are compiled in as zeros: their derivatives are there all the same."""
     scenario = square_arm()
     start, along = {"initial.q": scenario.initial.q[None]}, {"plant.centre": np.eye(6).reshape(6, 2, 3)}
@@ -160,8 +160,11 @@ def test_derivatives_by_the_geometry():
         return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, along, STANDARD, dt, run, backend=backend).tangents)(scenario, start)
 
     known, plain = by("native", mechanism_of(scenario)), by("vmap", None)
+    monkeypatch.setattr(plan, "JVP_LARGEST_IN_SEGMENTS", 0)
+    column_by_column = by("auto", mechanism_of(scenario))
     for name, expected in plain.items():
         np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(column_by_column[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
     counts = np.abs(plain["rmse"]).max(axis=(0, 2)) > 0
     assert counts.tolist() == [True, True, False, True, True, True], "a height on the vertical axis is no lever"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 import warnings
 
 import numpy as np
@@ -11,8 +12,9 @@ import study_cases as cases
 
 import iblf_jax as ij
 from iblf_jax import Status
+from iblf_jax.core import progress
 from iblf_jax.core.status import FAILED
-from iblf_jax.studies import monte_carlo, progress, sensitivity
+from iblf_jax.studies import monte_carlo, sensitivity
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +76,13 @@ def test_a_progress_bar_ends_where_it_should(monkeypatch, runs):
     cases.study(runs)
     ij.sensitivity(ij.presets.zhang_yan_2024(), cases.perturbations(0.01, 0.003), points=64, **cases.options())
     assert [(x.n, x.total) for x in shown] == [(runs, runs), (320, 320)]
+
+
+@pytest.mark.parametrize(("watched", "seconds", "line"), [(True, 0.3, "iblf_jax: g++ compiles\n"), (True, 0.0, ""), (False, 0.3, "")])
+def test_what_takes_long_is_told_to_who_watches(monkeypatch, capsys, watched, seconds, line):
+    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress, "_has_reader", lambda: watched)
+    with progress.told("g++ compiles"):
+        time.sleep(seconds)
+    time.sleep(0.2)
+    assert capsys.readouterr().err == line

@@ -12,7 +12,7 @@ from conftest import PAPER, SHORT
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, plan, step, transformable
+from iblf_jax.engine import execute, native, plan, step, transformable
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
@@ -149,6 +149,8 @@ def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
     np.testing.assert_allclose(runs[1].q, alone.q, rtol=1e-7, atol=1e-9)
 
 
+needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+
 LEAVES = ("controller.K2", "observer.kf", "plant.mass", "plant.g", "initial.q", "disturbance.phase", "bounds.upper")
 """Gains, the robot, the start, the world: one of every kind of leaf."""
 LIGHT = {"duration": 0.03, "dt": 1e-3, "method": "euler", "metrics": [ij.metrics.Tracking(), ij.metrics.Torque()]}
@@ -169,6 +171,7 @@ def everything(scenario, **options):
     return floats, start
 
 
+@needs_compiler
 def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeypatch):
     """Of all that is recorded and measured, by leaves of every kind, in both modes, in a batch and inside jit."""
     plain, start = everything(paper, backend="xla")
@@ -198,6 +201,7 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
     assert calls == []
 
 
+@needs_compiler
 def test_second_derivatives_are_the_kernels(paper, monkeypatch):
     monkeypatch.setattr(transformable, "_plain", lambda *args: (_ for _ in ()).throw(AssertionError("the scan")))
 
@@ -212,6 +216,7 @@ def test_second_derivatives_are_the_kernels(paper, monkeypatch):
     np.testing.assert_allclose(jax.jacrev(jax.grad(ise))(at), hessian, rtol=1e-9, atol=1e-14)
 
 
+@needs_compiler
 @pytest.mark.slow
 def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
     """And says the same: by the step, where records would be too large, without a compiler, and where a step does not lower."""

@@ -171,8 +171,12 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
 
 def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:
     """All runs, from the start to the outcome."""
-    carry, at_start = begin(executor, batch, run.method)
-    step = TimeStep(run.method, run.record_every is not None)
-    carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)
-    outcome = end(executor, batch, run, carry, at_start)
+    outcome, records = run_step(executor, batch, TimeStep.of(run), run)
     return outcome if run.record_every is None else outcome._replace(records=records)
+
+
+def run_step(executor: Executor, batch: Batch, step: TimeStep, run: Run) -> tuple[Outcome, Any]:
+    """All runs by a step that may record something else; the outcome, and the records apart."""
+    carry, at_start = begin(executor, batch, run.method)
+    carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)
+    return end(executor, batch, run, carry, at_start), records

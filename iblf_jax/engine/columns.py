@@ -16,12 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.batch import Batch, Executor, Leaves
-from iblf_jax.engine.derivatives import floats_of_carry
+from iblf_jax.engine.batch import Batch, Executor, Leaves, run_step
+from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of
 from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep, start
 from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
+ACCURACY = tuple(name for name, _ in accuracy.UNITS)
+"""Metrics whose derivatives are zero."""
 Places = tuple[tuple[int, ...], ...]
 """For each derivative, by which leaves of the scenario it is."""
 
@@ -53,6 +55,17 @@ def _moved(inputs: Inputs, places: Places, eps: jax.Array) -> Inputs:
 def floats_of(tree: Any) -> list[jax.Array]:
     """The leaves that are floats."""
     return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+
+def numbers_of(inputs: Inputs, record: Callable) -> int:
+    """How many floats a `TimeStep` records of an instant by this function."""
+
+    def one(inputs):
+        state = initial_state(inputs.scenario)
+        sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
+        return floats_of(record(inputs.folds, tuple(fold.init(sample) for fold in inputs.folds), sample, state))
+
+    return sum(math.prod(x.shape) for x in jax.eval_shape(one, inputs))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,25 +120,44 @@ def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict
     return jax.jvp(of, (zero, floats), (jnp.ones_like(zero), carry.tangent))[1]
 
 
-def _directed(batch: Batch, places: Places) -> tuple[Batch, list[int]]:
-    """A run for every column of every run of a batch; and how many columns each derivative has."""
-    leaves, runs = batch.leaves, batch.runs or 1
-    inputs = leaves.together(leaves.shared, [x[0] for x in leaves.lane])
-    scenario = jax.tree.leaves(inputs.scenario)
-    shapes = [[scenario[place].shape for place in level] for level in places]
-    sizes = [sum(math.prod(shape) for shape in level) for level in shapes]
+def _directed(batch: Batch, places: Places, directions: list[list[Any]]) -> tuple[Batch, list[int]]:
+    """A run for every column of every run of a batch; and how many columns each derivative has.
+
+    `directions`: for each derivative, of each of its leaves the tangents, (P, *shape of the leaf).
+    """
+    leaves, runs, sizes = batch.leaves, batch.runs or 1, [len(level[0]) for level in directions]
     lane = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.lane]
-    directions = []
-    for k, level in enumerate(shapes):
-        # One column of this level beside every column of the others, for every run.
-        units = np.repeat(np.eye(sizes[k], dtype=batch.dtype), math.prod(sizes[k + 1 :]), axis=0)
-        units = np.tile(units, (runs * math.prod(sizes[:k]), 1))
-        parts = np.split(units, np.cumsum([math.prod(shape) for shape in level])[:-1], axis=1)
-        directions.append([jnp.asarray(x.reshape(-1, *shape)) for x, shape in zip(parts, level, strict=True)])
-    treedef = jax.tree.structure(inputs._replace(direction=directions))
-    added = jax.tree.leaves(directions)
-    wide = Leaves(treedef, (*leaves.is_lane, *[True] * len(added)), leaves.shared, lane + added)
+    # One column of a derivative beside every column of the others, for every run.
+    added = [
+        [jnp.tile(jnp.repeat(x, math.prod(sizes[k + 1 :]), axis=0), (runs * math.prod(sizes[:k]), *[1] * (x.ndim - 1))) for x in level]
+        for k, level in enumerate(directions)
+    ]
+    inputs = leaves.together(leaves.shared, leaves.lane)._replace(direction=added)
+    is_lane = (*leaves.is_lane, *[True] * sum(map(len, places)))
+    wide = Leaves(jax.tree.structure(inputs), is_lane, leaves.shared, lane + jax.tree.leaves(added))
     return batch._replace(leaves=wide, runs=runs * math.prod(sizes)), sizes
+
+
+def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
+    """The tangents of leaves by each of their numbers in turn."""
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = np.split(np.eye(sum(sizes), dtype=dtype), np.cumsum(sizes)[:-1], axis=1)
+    return [jnp.asarray(x.reshape(-1, *shape)) for x, shape in zip(parts, shapes, strict=True)]
+
+
+def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
+    """Shapes of the leaves of one run's scenario."""
+    leaves = batch.leaves
+    return [jnp.shape(x) for x in jax.tree.leaves(leaves.together(leaves.shared, [x[0] for x in leaves.lane]).scenario)]
+
+
+def _stepped(executor: Executor, batch: Batch, step: TangentStep, directions: list[list[Any]], run: Run) -> tuple[list[jax.Array], Any]:
+    """The derivatives of what a step records and of the metrics, (R, P, ...)."""
+    wide, sizes = _directed(batch, step.places, directions)
+    before = wide.each(lambda inputs: _begun(inputs, run.method, step.places))
+    after, records = executor(step, wide, before, run.steps + 1, run.record_every)
+    metrics = wide.each(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
+    return jax.tree.map(lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics))
 
 
 def columns(executor: Executor, batch: Batch, places: Places, run: Run) -> tuple[list[jax.Array], dict[str, jax.Array]]:
@@ -140,9 +172,46 @@ def columns(executor: Executor, batch: Batch, places: Places, run: Run) -> tuple
     Returns:
       Of each float that is recorded (R, P, T, ...), or (R, P, Q, T, ...), and by name of each metric that is a float (R, P, ...).
     """
-    wide, sizes = _directed(batch, places)
-    before = wide.each(lambda inputs: _begun(inputs, run.method, places))
-    step = TangentStep(TimeStep(run.method, run.record_every is not None), places)
-    after, records = executor(step, wide, before, run.steps + 1, run.record_every)
-    metrics = wide.each(lambda inputs, carry: _metrics(inputs, carry, places), after)
-    return jax.tree.map(lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics))
+    shapes = _scenario_shapes(batch)
+    directions = [_units([shapes[place] for place in level], batch.dtype) for level in places]
+    return _stepped(executor, batch, TangentStep(TimeStep.of(run), places), directions, run)
+
+
+def vectors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Array]:
+    """Of the curvature matrices, what has tangents."""
+    return [outer.vector for outer in outers_of(folds, begun, sample)]
+
+
+def _factors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[tuple[jax.Array, jax.Array]]:
+    """And what they are summed up with."""
+    return [(jnp.broadcast_to(o.weight, o.vector.shape), jnp.asarray(o.decay, o.vector.dtype)) for o in outers_of(folds, begun, sample)]
+
+
+def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
+    """As `run_with_tangents`, one run a tangent."""
+    leaves = batch.leaves
+    inputs = leaves.together(leaves.shared, [x[0] for x in leaves.lane])
+    zero, units = jnp.zeros(directions.tangents, batch.dtype), np.eye(directions.tangents, dtype=batch.dtype)
+    before = jax.tree.leaves(inputs.scenario)
+    places = tuple(i for i, x in enumerate(jax.tree.leaves(directions.moved(inputs.scenario, zero))) if x is not before[i])
+
+    def leaves_at(eps):
+        moved = jax.tree.leaves(directions.moved(inputs.scenario, eps))
+        return [moved[i] for i in places]
+
+    along = jax.vmap(lambda unit: jax.jvp(leaves_at, (zero,), (unit,))[1])(units)
+    every = 1 if any(hasattr(fold, "curvatures") for fold in inputs.folds) else None
+    run = run._replace(record_every=every)
+    outcome, factors = run_step(executor, batch, TimeStep(run.method, _factors if every else None), run)
+    step = TangentStep(TimeStep(run.method, vectors if every else None), (places,))
+    found, tangents = _stepped(executor, batch, step, [along], run)
+    still = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
+    nothing = {name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype) for name, x in still.items()}
+    return Tangents(outcome, nothing | tangents, tuple(_product(y, *f) for y, f in zip(found, factors, strict=True)))
+
+
+def _product(y: jax.Array, weight: jax.Array, decay: jax.Array) -> jax.Array:
+    """sum_k weight_k prod_{j > k} decay_j y_k y_k^T, (R, P, P), from tangents (R, P, T, m), weights (R, T, m) and decays (R, T)."""
+    later = jnp.cumprod(decay[:, ::-1], axis=1)[:, ::-1]
+    later = jnp.concatenate([later[:, 1:], jnp.ones_like(later[:, :1])], axis=1)
+    return jnp.einsum("rptm,rtm,rqtm->rpq", y, weight * later[..., None], y)

@@ -168,7 +168,7 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
     return loop
 
 
-def _outer_of(folds, accumulators, sample) -> tuple[Outer, ...]:
+def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     """What a sample adds to the curvature matrices of the folds that have them."""
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
@@ -193,7 +193,7 @@ class DerivativeStep:
             # On arrays a Jacobian for a few tangents would cost more than the tangents.
             loop = evaluate if not form.scalar else preaccumulated(inputs.scenario, self.directions, eps, before.state)
             after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
-            outer = _outer_of(inputs.folds, begun, sample)
+            outer = outers_of(inputs.folds, begun, sample)
             return (floats_of_carry(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
 
         _, (tangents, vectors), (after, factors) = pushed(one, self.directions, inputs.scenario, carry, inputs.dt.dtype)

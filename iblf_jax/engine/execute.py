@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
 from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
+from iblf_jax.engine.columns import numbers_of, run_by_columns, vectors
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
@@ -110,7 +111,7 @@ def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, ne
 def run_lowered(name: str, batch: Batch, run: Run) -> Outcome:
     """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core."""
     if name == "native":
-        program, _ = program_of(TimeStep(run.method, run.record_every is not None), batch, carry_shapes(batch, run.method))
+        program, _ = program_of(TimeStep.of(run), batch, carry_shapes(batch, run.method))
         native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
     try:
         return run_all(executor_named(name), batch, run)
@@ -202,7 +203,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
     if name is None:
         return on_scan()
     try:
-        step = TimeStep(run.method, run.record_every is not None)
+        step = TimeStep.of(run)
         program, _ = program_of(step, batch, carry_shapes(batch, run.method))
         return run_on(name) if plan.lowers_one_run(name, _nodes(name, program)) else on_scan()
     except (UnsupportedError, ToolchainError):
@@ -259,7 +260,8 @@ def run_batch_jvp(
 
     Args:
       scenario, varied, folds, dt, run, nested: as `run_batch`.
-      backend: as `run_batch`; "auto" runs long programs (many joints and directions), which take minutes to compile, on scan.
+      backend: as `run_batch`; "auto" makes those of long programs (many joints and directions), which take minutes to compile, one run a
+        direction.
       directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run: direction p moves each of these
         leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
 
@@ -277,7 +279,9 @@ def run_batch_jvp(
         if backend == "auto":
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
             if not plan.lowers_derivatives(name, _nodes(name, program), along.tangents):
-                return on_scan()
+                kept = numbers_of(inputs, vectors) * along.tangents * (run.steps + 1) * (batch.runs or 1)
+                by_columns = name in plan.COMPILED.values() and plan.keeps_columns(1, kept)
+                return run_by_columns(executor_named(name), batch, along, run) if by_columns else on_scan()
         return run_with_tangents(executor_named(name), batch, along, run)
 
     def on_scan():

@@ -44,6 +44,8 @@ class Explanation:
     """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on every core."""
     backend: str = ""
     """What a batch runs on here when nobody says otherwise, and why that is not compiled code if it is not."""
+    derivatives: str = ""
+    """What makes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and why that is not compiled code if it is not."""
 
     def __repr__(self) -> str:
         lines = ["operations done        number  which"]
@@ -53,6 +55,7 @@ class Explanation:
         lines.append(f"about {self.slots:.0f} vector instructions a step for {self.width} runs")
         lines.append(f"two a cycle on every core would be {self.limit:.3g} steps/s")
         lines.append(f"a batch runs on {self.backend}")
+        lines.append(f"derivatives of simulate: {self.derivatives}")
         return "\n".join(lines)
 
 
@@ -86,7 +89,9 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = automatic()
     backend = f"{name}: {reason}" if reason else name
-    return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots, backend)
+    columns = f"first and second on {name}, one run a number; further ones by plain JAX"
+    derivatives = f"by plain JAX: {reason}" if reason else columns
+    return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives)
 
 
 def instructions(program: Program, width: int) -> float:

@@ -66,8 +66,8 @@ def simulate(
       throw: raise instead of warn when the run failed.
       backend: "native": generated code, built by the system's compiler once for a structure and kept on disk; "xla": the same program
         without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native where there is a
-        compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside your own `jit`, `vmap` or `grad` a run
-        is always plain JAX.
+        compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside your own `jit` or `vmap` a run
+        is plain JAX; its first and second derivatives are the kernel's, where there is one, but for "xla".
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.

@@ -204,8 +204,8 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
     return form.piece(folded_in)(inputs, carry, index, moving, stepped)
 
 
-def record_of(sample: Sample, state: LoopState):
-    """What is kept of a sample, and the states of law and observer."""
+def recorded(folds: Any, begun: tuple, sample: Sample, state: LoopState):
+    """What a run keeps of an instant: the sample, and the states of law and observer."""
     return {name: getattr(sample, name) for name in SIGNALS}, state.controller, state.observer
 
 
@@ -214,12 +214,18 @@ class TimeStep:
     """One step of a run."""
 
     method: str
-    recorded: bool = False
+    record: Callable | None = None
+    """Function (folds, their accumulators before the sample, sample, state) of an instant."""
+
+    @staticmethod
+    def of(run: Run) -> TimeStep:
+        """The step of a run."""
+        return TimeStep(run.method, None if run.record_every is None else recorded)
 
     def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, form: Form):
         """The carry after the step, and what is recorded."""
         found = advance(inputs, carry, index, self.method, form)
-        return found.carry, record_of(found.sample, carry.state) if self.recorded else ()
+        return found.carry, self.record(inputs.folds, found.accumulators, found.sample, carry.state) if self.record else ()
 
 
 class Probed(NamedTuple):

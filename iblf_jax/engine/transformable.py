@@ -24,14 +24,12 @@ from jax.custom_derivatives import SymbolicZero
 from iblf_jax.core import checks
 from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch, Leaves, run_all
-from iblf_jax.engine.columns import Places, columns, floats_of
+from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.executors import scan
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Outcome, Run, record_of
+from iblf_jax.engine.step import Outcome, Run, recorded
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
-from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -145,7 +143,7 @@ def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
     """As `_by_kernel`, by the scan."""
     if not places:
         found = _plain(runs, *leaves)
-        folded = {name: x for name, x in found.metrics.items() if name not in dict(accuracy.UNITS) and name != accuracy.ERROR}
+        folded = {name: x for name, x in found.metrics.items() if name not in ACCURACY}
         return floats_of(found.records), {name: x for name, x in folded.items() if jnp.issubdtype(x.dtype, jnp.floating)}
     level, shapes = places[-1], [jnp.shape(leaves[i]) for i in places[-1]]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
@@ -159,15 +157,9 @@ def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
 
 def _size(runs: Runs, places: Places, leaves: tuple) -> int:
     """Numbers of a derivative of one run's records."""
-    every = runs.run.record_every
-
-    def record(leaves):
-        inputs = jax.tree.unflatten(runs.treedef, leaves)
-        state = initial_state(inputs.scenario)
-        return floats_of(record_of(evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1], state))
-
-    recorded = 0 if every is None else sum(math.prod(x.shape) for x in jax.eval_shape(record, leaves)) * (runs.run.steps // every + 1)
-    return recorded * math.prod(sum(jnp.size(leaves[i]) for i in level) for level in places)
+    every, inputs = runs.run.record_every, jax.tree.unflatten(runs.treedef, leaves)
+    numbers = 0 if every is None else numbers_of(inputs, recorded) * (runs.run.steps // every + 1)
+    return numbers * math.prod(sum(jnp.size(leaves[i]) for i in level) for level in places)
 
 
 def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
