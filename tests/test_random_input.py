@@ -122,7 +122,7 @@ def test_parse_and_get(paper, path):
     tokens = accepts_or_value_error(lambda: paths.parse(path))
     if tokens is not None:
         assert all(isinstance(t, str | int) for t in tokens)
-        spelled = [f"[{t}]" if isinstance(t, int) else f"[{json.dumps(t)}]" if isinstance(t, paths.Row) else f".{t}" for t in tokens]
+        spelled = [f"[{t}]" if isinstance(t, int) else f"[{json.dumps(t)}]" if isinstance(t, paths.RowName) else f".{t}" for t in tokens]
         assert paths.parse("".join(spelled).removeprefix(".")) == tokens
     value = accepts_or_value_error(lambda: paths.get(paper, path))
     assert value is None or np.all(np.isfinite(value))

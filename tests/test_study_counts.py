@@ -80,7 +80,7 @@ def test_a_progress_bar_ends_where_it_should(monkeypatch, runs):
 
 @pytest.mark.parametrize(("watched", "seconds", "line"), [(True, 0.3, "iblf_jax: g++ compiles\n"), (True, 0.0, ""), (False, 0.3, "")])
 def test_what_takes_long_is_told_to_who_watches(monkeypatch, capsys, watched, seconds, line):
-    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress, "SLOW", 0.1)
     monkeypatch.setattr(progress, "_has_reader", lambda: watched)
     with progress.told("g++ compiles"):
         time.sleep(seconds)

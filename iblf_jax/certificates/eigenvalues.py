@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.engine.plan import CERTIFY_TOGETHER
 from iblf_jax.robots import Robot
 
 GRID = {1: 257, 2: 65, 3: 21}
@@ -45,7 +46,7 @@ def _with_gradient(robot: Robot, q: jax.Array, sign: int) -> jax.Array:
 
 @jax.jit
 def _both_ends(robot: Robot, points: jax.Array) -> jax.Array:
-    return jax.lax.map(lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=512)
+    return jax.lax.map(lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=CERTIFY_TOGETHER)
 
 
 def maximise(value_and_gradient, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, np.ndarray]:

@@ -28,7 +28,7 @@ MOST_STEPS = 2**31 - 1
 LIMITS = ("limit", "positive limit")
 """Signs of leaves that may be infinite."""
 
-LONGEST = {"field": 200, "value": 160, "words": 800, "message": 1400}
+LONGEST_TEXT = {"field": 200, "value": 160, "words": 800, "message": 1400}
 """Characters of an error message's parts, and of all that the command line prints of one: what a user typed may be of any length."""
 
 MOST_JOINTS = 10_000
@@ -71,7 +71,7 @@ def flat_enough(name: str, value: Any) -> None:
 
 def line(text: str, part: str = "words") -> str:
     """Text as one line of a message: cut, and without characters that would break the line or cannot be printed."""
-    most = LONGEST[part]
+    most = LONGEST_TEXT[part]
     text = re.sub(r"\s*\n\s*", " ", text[: 4 * most])
     text = "".join(x if x.isprintable() else ascii(x)[1:-1] for x in text)
     return text if len(text) <= most else text[: most - 3] + "..."

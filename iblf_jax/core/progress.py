@@ -13,7 +13,7 @@ from iblf_jax.core import checks
 
 DELAY = 1.0
 """Seconds before a bar appears that was not asked for."""
-PATIENCE = 2.0
+SLOW = 2.0
 """Seconds before a line says what takes long."""
 
 
@@ -46,8 +46,8 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
 
 @contextlib.contextmanager
 def told(what: str) -> Iterator[None]:
-    """Says what is being done, once it has taken PATIENCE seconds and if somebody watches."""
-    line = threading.Timer(PATIENCE, lambda: sys.stderr.write(f"iblf_jax: {what}\n"))
+    """Says what is being done, once it has taken SLOW seconds and if somebody watches."""
+    line = threading.Timer(SLOW, lambda: sys.stderr.write(f"iblf_jax: {what}\n"))
     line.daemon = True
     if _has_reader():
         line.start()

@@ -177,7 +177,7 @@ def columns(executor: Executor, batch: Batch, places: Places, run: Run) -> tuple
     return _stepped(executor, batch, TangentStep(TimeStep.of(run), places), directions, run)
 
 
-def vectors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Array]:
+def outer_vectors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Array]:
     """Of the curvature matrices, what has tangents."""
     return [outer.vector for outer in outers_of(folds, begun, sample)]
 
@@ -203,7 +203,7 @@ def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run
     every = 1 if any(hasattr(fold, "curvatures") for fold in inputs.folds) else None
     run = run._replace(record_every=every)
     outcome, factors = run_step(executor, batch, TimeStep(run.method, _factors if every else None), run)
-    step = TangentStep(TimeStep(run.method, vectors if every else None), (places,))
+    step = TangentStep(TimeStep(run.method, outer_vectors if every else None), (places,))
     found, tangents = _stepped(executor, batch, step, [along], run)
     still = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
     nothing = {name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype) for name, x in still.items()}

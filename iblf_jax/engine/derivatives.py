@@ -30,7 +30,7 @@ from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.signals import Sample
 
-FLAGS = ("guard_active", "saturated")
+FLAG_FIELDS = ("guard_active", "saturated")
 """Fields of a sample that are no numbers."""
 
 
@@ -130,7 +130,7 @@ def pushed(function: Callable, directions: Directions, scenario, before: Differe
 
 def without_flags(sample: Sample) -> Any:
     """The numbers of a sample; its flags have no derivative."""
-    return {name: x for name, x in sample._asdict().items() if name not in FLAGS}
+    return {name: x for name, x in sample._asdict().items() if name not in FLAG_FIELDS}
 
 
 def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopState) -> Callable:
@@ -144,7 +144,7 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopS
 
     def numbers(flat, eps, t, dt):
         slope, sample = evaluate(directions.moved(scenario, eps), t, unravel(flat), dt)
-        return (slope, without_flags(sample)), {name: getattr(sample, name) for name in FLAGS}
+        return (slope, without_flags(sample)), {name: getattr(sample, name) for name in FLAG_FIELDS}
 
     @jax.custom_jvp
     def floats(flat, eps, t, dt):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
 from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
-from iblf_jax.engine.columns import numbers_of, run_by_columns, vectors
+from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
@@ -279,7 +279,7 @@ def run_batch_jvp(
         if backend == "auto":
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
             if not plan.lowers_derivatives(name, _nodes(name, program), along.tangents):
-                kept = numbers_of(inputs, vectors) * along.tangents * (run.steps + 1) * (batch.runs or 1)
+                kept = numbers_of(inputs, outer_vectors) * along.tangents * (run.steps + 1) * (batch.runs or 1)
                 by_columns = name in plan.COMPILED.values() and plan.keeps_columns(1, kept)
                 return run_by_columns(executor_named(name), batch, along, run) if by_columns else on_scan()
         return run_with_tangents(executor_named(name), batch, along, run)

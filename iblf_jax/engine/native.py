@@ -35,12 +35,12 @@ def unavailable() -> str | None:
 @lru_cache(maxsize=8)
 def _text(program: Program, shared: int, lane: int, narrow: bool, once: bool) -> tuple[str, tuple[str, ...]]:
     """The C of a program's kernel, and the compiler's flags for it."""
-    segment, flags = plan.native_build(program.size, once)
-    return source(program, shared, lane, segment=segment), (*flags, *(("-DVECTOR_BYTES=16",) if narrow else ()))
+    segment, flags = plan.native_build(program.size, once, narrow)
+    return source(program, shared, lane, segment=segment), flags
 
 
 def _is_narrow(program: Program, runs: int) -> bool:
-    return runs * program.dtype.itemsize <= 16
+    return runs * program.dtype.itemsize <= plan.NATIVE_NARROW
 
 
 def ahead(program: Program, shared: int, lane: int, runs: int) -> None:
@@ -55,7 +55,7 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool, once: bool) -
     Args:
       program: what a step does.
       shared, lane: how many numbers of each kind of leaf go in.
-      narrow: for one or two runs, vectors of 16 bytes.
+      narrow: for one or two runs, in short vectors.
       once: it makes one step.
 
     Raises:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iblf_jax.lowering.program import Limits
+from iblf_jax.lowering.program import LoweringLimits
 
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a user may ask for a batch to be executed; "vmap" is the scan executor."""
@@ -34,7 +34,7 @@ LONGEST_ONE_RUN = {"native": 60_000, "xla": 2500}
 """Nodes up to which one run is lowered unasked, by executor: a longer one gains less by it than it takes to compile.  A run of
 `presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 on scan; its first result takes 11 s of a busy processor there, 30 where
 the kernel has to be built, and 24 on scan."""
-LIMITS = Limits(choices=64, table=4096, tables=50_000, scan=64, written_out=1000)
+LIMITS = LoweringLimits(choices=64, table=4096, tables=50_000, scan=64, written_out=1000, power=64)
 """What is lowered at all, on native, where a step of the paper's scenario takes 90 ns: a choice among 64 entries takes 9 ns, one among 256
 entries 70; twelve tables of 4096 numbers take 18 ns and 2 s to lower and build, 48 of them 100 ns and 7 s; a scan of 64 rounds with a sine
 in each takes 140 ns, and one of 256 takes 6 s to build.  To call the loop of three joints, 1,000 nodes, takes 4 % of a step's time; of
@@ -58,6 +58,11 @@ NATIVE_LONG, NATIVE_SEGMENT, NATIVE_FLAGS = 10_000, 2000, ("-O1", "-fexpensive-o
 instead of 27 and runs as fast (cut it takes 5 % longer, with less optimisation 20 % shorter).  A short step would take 1.6 times as long,
 one of 8,000 nodes 1.1 times.  The second flag makes products with sums one operation, as -O3 does: -O1 alone does not, and a large angle's
 sine would lose digits."""
+NATIVE_STRETCH, NATIVE_GROUP = 128, 32
+"""Steps and blocks of runs that a thread goes through together, so that states and the table of signals stay in its cache: 32 to
+512 steps and 8 to 128 blocks take the same time within 5 % (the paper's loop)."""
+NATIVE_NARROW = 16
+"""Bytes of the runs of a batch up to which they are stepped in vectors of that length: a processor's longest would be mostly copies."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
 GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100
@@ -81,12 +86,16 @@ STEP_SIZE_CHUNK = 1000
 """Steps between two looks at the pair of runs that tells a step size."""
 STUDY_IN_FLIGHT = 4
 """Blocks that are queued on a device at once: enough to keep it busy."""
+SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
+"""Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that a sweep has at least, if it is large."""
 TUNE_TOGETHER = 16
 """Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a processor's vectors hold."""
 CERTIFY_STRETCH = 1024
 """Steps that a certificate looks at together: memory does not grow with the length of a run, and one program serves every length."""
 CERTIFY_RECORDED = 20_000
 """Steps that a certificate has recorded at most of the run that it makes; the others are made again."""
+CERTIFY_TOGETHER = 512
+"""Positions whose mass matrices' eigenvalues a certificate works out together: bounds the memory."""
 CERTIFY_KEPT = 100_000
 """Steps up to which a certificate keeps a run in memory between its two looks at it."""
 
@@ -178,13 +187,17 @@ def xla_stretch(steps: int, every: int) -> int:
     return exact if exact > most // 16 else most
 
 
-def native_build(nodes: int, once: bool) -> tuple[int | None, tuple[str, ...]]:
+def native_build(nodes: int, once: bool, narrow: bool) -> tuple[int | None, tuple[str, ...]]:
     """Nodes of a function of the generated C, None for one function, and how the compiler is told to take it.
 
-    `once`: it makes one step, and takes longer to build than to run.
+    Args:
+      nodes: of the step.
+      once: it makes one step, and takes longer to build than to run.
+      narrow: for so few runs that they fill a short vector.
     """
     long = nodes > NATIVE_LONG
-    return NATIVE_SEGMENT if long else None, NATIVE_FLAGS if long or once else ()
+    sizes = (f"-DSTRETCH={NATIVE_STRETCH}", f"-DGROUP={NATIVE_GROUP}", *((f"-DVECTOR_BYTES={NATIVE_NARROW}",) if narrow else ()))
+    return NATIVE_SEGMENT if long else None, (*sizes, *(NATIVE_FLAGS if long or once else ()))
 
 
 def gpu_threads(runs: int, processors: int) -> int:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.lowering.passes import with_reciprocals
-from iblf_jax.lowering.program import INPUTS, LANE, Builder, Ids, Limits, Program, finished, needed
+from iblf_jax.lowering.program import INPUTS, LANE, Builder, Ids, LoweringLimits, Program, finished, needed
 
 Uses = tuple[bool, ...]
 """Which results of a function somebody reads."""
@@ -34,7 +34,7 @@ class Called(NamedTuple):
     """Of its operands."""
     dtype: Any
     sparse: bool
-    limits: Limits
+    limits: LoweringLimits
     read: Callable
     """Function (builder, jaxpr, operands) -> results."""
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from iblf_jax.lowering.toolchain import ToolchainError, content_of, kept
 
-FLAGS = ("--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true", "-w")
+NVRTC_FLAGS = ("--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true", "-w")
 """Products go into sums unrounded, as on `native`; otherwise every operation is rounded as IEEE 754 wants it."""
 
 
@@ -96,6 +96,6 @@ def compiled(source: str, architecture: str) -> bytes:
     Raises:
       ToolchainError: no NVRTC, an error from it, or an architecture that it does not know.
     """
-    flags = (*FLAGS, f"--gpu-architecture={architecture}")
+    flags = (*NVRTC_FLAGS, f"--gpu-architecture={architecture}")
     path, _ = kept([source, *flags, version()], ".cubin", lambda result: result.write_bytes(_compile(source, flags)))
     return content_of(path)

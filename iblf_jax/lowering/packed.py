@@ -12,7 +12,7 @@ import numpy as np
 
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.passes import with_reciprocals
-from iblf_jax.lowering.program import Builder, Known, Limits, Program, UnsupportedError, finished, kind_of
+from iblf_jax.lowering.program import Builder, Known, LoweringLimits, Program, UnsupportedError, finished, kind_of
 
 
 class Shapes(NamedTuple):
@@ -54,7 +54,7 @@ def lowered(
     shared: Shapes,
     lane: Shapes,
     carry: Shapes,
-    limits: Limits,
+    limits: LoweringLimits,
     sparse: bool = False,
     known: tuple[Known | None, ...] = (),
 ) -> Lowered:

@@ -72,7 +72,7 @@ class Known(NamedTuple):
     sign: int = 1
 
 
-class Limits(NamedTuple):
+class LoweringLimits(NamedTuple):
     """What is too long to be lowered; the caller says so."""
 
     choices: float = math.inf
@@ -85,9 +85,11 @@ class Limits(NamedTuple):
     """Steps up to which an inner scan is unrolled."""
     written_out: float = math.inf
     """Nodes up to which a function is written out wherever it is called."""
+    power: float = math.inf
+    """Whole exponents up to which a power is made of products."""
 
 
-NO_LIMITS = Limits()
+NO_LIMITS = LoweringLimits()
 
 
 def extend_classes(classes: list[int], nodes: Sequence[Node], still: Container[int]) -> None:
@@ -106,7 +108,7 @@ def extend_classes(classes: list[int], nodes: Sequence[Node], still: Container[i
 class Builder:
     """Makes nodes; equal ones are made once."""
 
-    def __init__(self, dtype, *, sparse: bool = False, limits: Limits = NO_LIMITS) -> None:
+    def __init__(self, dtype, *, sparse: bool = False, limits: LoweringLimits = NO_LIMITS) -> None:
         """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such a zero says "does not depend".
         `limits`: for what is read from a jaxpr.
         """

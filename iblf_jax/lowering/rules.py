@@ -47,7 +47,7 @@ def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
 def _pow(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
     exponents = {b.value(int(i)) for i in y.ravel()}
     value = next(iter(exponents)) if len(exponents) == 1 else None
-    if value is not None and float(value).is_integer() and abs(value) <= 64:
+    if value is not None and float(value).is_integer() and abs(value) <= b.limits.power:
         return power(b, eqn, x, int(value))
     if kind_of(eqn.invars[1].aval.dtype) != "f":
         y = each(b, "convert", eqn, y, kind="f")

@@ -33,7 +33,7 @@ from iblf_jax.core.cache import directory, processor
 from iblf_jax.core.drafts import draft, remove_abandoned
 from iblf_jax.core.progress import told
 
-FLAGS = (
+COMPILER_FLAGS = (
     "-x", "c++", "-std=gnu++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math",
     "-ffp-contract=fast", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden", "-w",
 )  # fmt: skip
@@ -174,7 +174,7 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     """The shared library of a source and its key, compiled unless it is in the cache; ToolchainError on failure."""
     path = compiler()
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    flags = [*FLAGS, *extra]
+    flags = [*COMPILER_FLAGS, *extra]
     content = [source, *flags, path, _version(path), processor(), header.read_text()]
 
     def compile_to(result: Path) -> None:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct
-from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, show, transient_end
+from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, show, transient_end
 from iblf_jax.simulation.results import Rollout
 
 Runs = Rollout | Mapping[str, Rollout]
@@ -28,15 +28,15 @@ MOST_ZOOMED = 0.3
 """The part of the time that it shows at most: more would magnify nothing."""
 
 
-class Row(NamedTuple):
+class PanelRow(NamedTuple):
     """One row of a figure: a quantity of a joint, and the label of its axis."""
 
-    quantity: Quantity
+    quantity: Plotted
     joint: int
     label: str
 
 
-def windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) -> tuple[Window, Window]:
+def windows(curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float | None) -> tuple[Window, Window]:
     """The whole time and the zoom's, by default two and a half transients in a round number; ValueError if the zoom is no time."""
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves) or 1e-3
     if zoom is None:
@@ -46,7 +46,7 @@ def windows(curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None) ->
 
 
 @_style.styled()
-def _rows_with_zoom(title: str, curves: Sequence[Curve], rows: Sequence[Row], zoom: float | None, height: float) -> Figure:
+def _rows_with_zoom(title: str, curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float | None, height: float) -> Figure:
     """A figure of rows against time, with the start magnified in a second column."""
     whole, start = windows(curves, rows, zoom)
     figure = _style.new_figure(_style.WIDTH, 1.0 + height * len(rows))
@@ -80,7 +80,7 @@ def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figu
     """A figure with one row a joint."""
     curves = curves_of(runs)
     n, quantity = curves[0].run.n, QUANTITIES[field]
-    rows = [Row(quantity, joint, f"{curves[0].called(joint)}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
+    rows = [PanelRow(quantity, joint, f"{curves[0].called(joint)}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
     return _rows_with_zoom(title, curves, rows, zoom, 1.75 if n <= 3 else 1.25)
 
 
@@ -100,7 +100,7 @@ def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
     """
     curves = curves_of(runs)
     joint = check_joint(curves, joint)
-    rows = [Row(quantity, joint, quantity.label) for quantity in (QUANTITIES["q"], QUANTITIES["e1"])]
+    rows = [PanelRow(quantity, joint, quantity.label) for quantity in (QUANTITIES["q"], QUANTITIES["e1"])]
     return _rows_with_zoom(f"Position and tracking error of {curves[0].called(joint)}", curves, rows, zoom, 2.1)
 
 

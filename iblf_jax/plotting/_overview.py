@@ -13,7 +13,7 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
-from iblf_jax.plotting._panels import QUANTITIES, Quantity, Window, draw, draw_frame, say_what_is_cut, set_limits, show
+from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, draw, draw_frame, say_what_is_cut, set_limits, show
 from iblf_jax.simulation.results import Rollout
 
 WIDTH = 10.0
@@ -82,7 +82,7 @@ def _together(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -
     _lyapunov(figure.add_subplot(grid[1, 2]), curve, whole)
 
 
-def _joints(axes: Axes, curve: Curve, quantity: Quantity, whole: Window) -> None:
+def _joints(axes: Axes, curve: Curve, quantity: Plotted, whole: Window) -> None:
     """One quantity of all joints, each in its colour."""
     # The walls of xi are the same for all joints; those of e1 are not, and are in the tubes above.
     frame = draw_frame(axes, curve, quantity, 0, whole, label="_") if quantity.field == "xi" else []

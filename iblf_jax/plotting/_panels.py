@@ -31,7 +31,7 @@ SPIKES, RULING = 0.98, 5.0
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Plotted:
     """What a panel shows."""
 
     field: str
@@ -59,12 +59,12 @@ class Quantity:
 QUANTITIES = {
     quantity.field: quantity
     for quantity in (
-        Quantity("q", "position", "$q$", "rad", ("lower", "upper"), "bounds", "q_d", "reference $q_d$", transient="e1"),
-        Quantity("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
-        Quantity("xi", "relative error", r"$\xi$", "1", ("wall_lower", "wall_upper"), r"walls $\xi = \pm 1$"),
-        Quantity("e2", "error", "$e_2$", "rad/s"),
-        Quantity("tau", "torque", r"$\tau$", "N m"),
-        Quantity("disturbance_estimate", "uncertain term", "$f$", "N m", truth="disturbance", transient="estimate_error"),
+        Plotted("q", "position", "$q$", "rad", ("lower", "upper"), "bounds", "q_d", "reference $q_d$", transient="e1"),
+        Plotted("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
+        Plotted("xi", "relative error", r"$\xi$", "1", ("wall_lower", "wall_upper"), r"walls $\xi = \pm 1$"),
+        Plotted("e2", "error", "$e_2$", "rad/s"),
+        Plotted("tau", "torque", r"$\tau$", "N m"),
+        Plotted("disturbance_estimate", "uncertain term", "$f$", "N m", truth="disturbance", transient="estimate_error"),
     )
 }
 """Every panel, by the signal that it shows."""
@@ -81,7 +81,7 @@ def draw(axes: Axes, curve: Curve, field: str, joint: int, window: Window, **opt
     return y[near]
 
 
-def draw_frame(axes: Axes, curve: Curve, quantity: Quantity, joint: int, window: Window, **options: Any) -> list[np.ndarray]:
+def draw_frame(axes: Axes, curve: Curve, quantity: Plotted, joint: int, window: Window, **options: Any) -> list[np.ndarray]:
     """Draws the bounds of a quantity as grey lines with a pale tube between them; returns them."""
     if quantity.frame is None:
         return []
@@ -181,7 +181,7 @@ def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None
         axes.plot(curve.t[index], np.clip(y[index], *axes.get_ylim()), color=_style.alarm(), zorder=5, clip_on=False, **look)
 
 
-def _draw_surroundings(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: int, window: Window) -> tuple[list, list]:
+def _draw_surroundings(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window) -> tuple[list, list]:
     """Draws bounds and guide, once for all runs that share them; returns the two."""
     bounds, guides = [], []
     fields = [*(quantity.frame or ()), *filter(None, [quantity.guide])]
@@ -194,7 +194,7 @@ def _draw_surroundings(axes: Axes, curves: Sequence[Curve], quantity: Quantity, 
     return bounds, guides
 
 
-def _draw_truth(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: int, window: Window) -> list[tuple[Curve, np.ndarray]]:
+def _draw_truth(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window) -> list[tuple[Curve, np.ndarray]]:
     """Draws what the runs estimate, once for all runs in which it cannot be told apart; returns it."""
     if quantity.truth is None:
         return []
@@ -208,7 +208,7 @@ def _draw_truth(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: 
     return drawn
 
 
-def show(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: int, window: Window, *, tight: bool = False) -> None:
+def show(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window, *, tight: bool = False) -> None:
     """Draws a quantity of one joint for every run.
 
     Args:
@@ -247,7 +247,7 @@ def show(axes: Axes, curves: Sequence[Curve], quantity: Quantity, joint: int, wi
             _mark_break(axes, curve, curve[quantity.field][:, joint], window)
 
 
-def transient_end(curves: Sequence[Curve], quantity: Quantity, joint: int) -> float:
+def transient_end(curves: Sequence[Curve], quantity: Plotted, joint: int) -> float:
     """When the last of the sound runs has come within 5 % of the range that it keeps to later, [s]; 0 if all start there."""
     ends = [0.0]
     for curve in curves:

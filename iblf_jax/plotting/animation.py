@@ -1,7 +1,7 @@
 """The arm in motion, as a GIF or as a web page with controls: its joint limits, its reference as a ghost, its tip's path.
 
 What stands still is drawn once; each frame moves and draws only what moves, which makes 20 s of motion a matter of seconds.
-A run longer than `LONGEST` plays faster than it was, unless the caller names a speed.
+A run longer than `LONGEST_FILM` plays faster than it was, unless the caller names a speed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from iblf_jax.plotting._curves import Curve, curves_of
 from iblf_jax.plotting._figures import Runs
 
 MOST_FPS, MOST_FRAMES = 50.0, 10_000
-LONGEST = 10.0
+LONGEST_FILM = 10.0
 """How long an animation lasts at most if its speed is not given [s]."""
 
 DPI = 90
@@ -67,7 +67,7 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
 def _instants(curves: list[Curve], fps: float, speed: float | None) -> np.ndarray:
     """The times of the frames, from 0 to the end of the longest run, (F,) [s]."""
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves)
-    speed = max(1.0, end / LONGEST) if speed is None else checks.positive_number("speed", speed, "1")
+    speed = max(1.0, end / LONGEST_FILM) if speed is None else checks.positive_number("speed", speed, "1")
     frames = end / speed * fps
     if not frames <= MOST_FRAMES:
         raise checks.fail("speed", speed, f"one at which the run has at most {MOST_FRAMES} frames", f"It would have {frames:.3g}.")

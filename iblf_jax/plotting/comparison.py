@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, check_joint, curves_of, thinned
-from iblf_jax.plotting._figures import Row, windows
+from iblf_jax.plotting._figures import PanelRow, windows
 from iblf_jax.plotting._panels import QUANTITIES, Window, draw, set_limits
 from iblf_jax.simulation.metrics import Settling
 
@@ -50,7 +50,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
         raise checks.fail("result", type(result).__name__, "a Comparison", "Draw what ij.compare returns.")
     given = curves_of(result.rollouts)
     joint = check_joint(given, joint)
-    error, torque = (Row(QUANTITIES[field], joint, QUANTITIES[field].label) for field in ("e1", "tau"))
+    error, torque = (PanelRow(QUANTITIES[field], joint, QUANTITIES[field].label) for field in ("e1", "tau"))
     start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:

@@ -31,7 +31,7 @@ _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 _TOKEN = re.compile(rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({_BARE})\]""")
 
 
-class Row(str):
+class RowName(str):
     """A token of a path that was the name of a row, in brackets."""
 
     __slots__ = ()
@@ -141,7 +141,7 @@ def parse(path: str) -> list[str | int]:
         name = match[4] if match[3] is None else _unquoted(match[3])
         if match[1] is None and match[2] is None and name is None:
             break
-        tokens.append(match[1] if match[1] is not None else int(match[2]) if match[2] is not None else Row(name))
+        tokens.append(match[1] if match[1] is not None else int(match[2]) if match[2] is not None else RowName(name))
         position = match.end()
     if not isinstance(path, str) or not path or position < len(path):
         raise checks.fail("path", path, 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"')
@@ -236,7 +236,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
     token = tokens[0]
     if isinstance(token, int):
         return [token], tokens[1:]
-    if isinstance(token, Row):
+    if isinstance(token, RowName):
         raise KeyError(token)
     rows = getattr(type(part), "rows", {})
     if token in rows and not _has_field(part, token):

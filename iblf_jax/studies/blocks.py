@@ -74,58 +74,58 @@ def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.where(admissible.reshape(admissible.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(mark, x.dtype))
 
 
-def _draws(program: StudyRun, shared: StudyInputs, lanes: Lanes):
+def _draws(study_run: StudyRun, shared: StudyInputs, lanes: Lanes):
     """The leaves that a block's runs replace, the draws, and whether they were admissible."""
 
     def one(lane: Lanes):
-        made, drawn, admissible = draw(shared.cases, program.targets, lane.index, lane.points, lane.u)
+        made, drawn, admissible = draw(shared.cases, study_run.targets, lane.index, lane.points, lane.u)
         return merge(shared.cases.scenario, lane.points, made), drawn, admissible
 
     # Without the barrier XLA works the random numbers into every operation of the run: 18 s to compile instead of 5.
     return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
 
 
-def with_chosen_backend(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> StudyRun:
+def with_chosen_backend(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> StudyRun:
     """The study's run with the backend that its blocks will run on in place of "auto" or one that is not available.
 
     Raises:
       ValueError: an unknown backend.
     """
-    varied, _, _ = jax.eval_shape(partial(_draws, program), shared, lanes)
+    varied, _, _ = jax.eval_shape(partial(_draws, study_run), shared, lanes)
     backend = chosen_backend(
-        program.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=program.method, mechanism=program.mechanism
+        study_run.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=study_run.method, mechanism=study_run.mechanism
     )
-    return program._replace(backend=backend)
+    return study_run._replace(backend=backend)
 
 
-def _block(program: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
+def _block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
     """Draws and runs one block."""
-    varied, drawn, admissible = _draws(program, shared, lanes)
-    run = Run(program.steps, program.method, mechanism=program.mechanism)
-    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=program.backend)
+    varied, drawn, admissible = _draws(study_run, shared, lanes)
+    run = Run(study_run.steps, study_run.method, mechanism=study_run.mechanism)
+    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend)
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
     return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
 
 
-def _record_block(program: StudyRun, shared: StudyInputs, lanes: Lanes, record_every: int):
+def _record_block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes, record_every: int):
     """Positions of a block's runs, (B, T, n), and their status."""
-    varied, _, admissible = _draws(program, shared, lanes)
-    run = Run(program.steps, program.method, record_every, program.mechanism)
-    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=program.backend)
+    varied, _, admissible = _draws(study_run, shared, lanes)
+    run = Run(study_run.steps, study_run.method, record_every, study_run.mechanism)
+    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend)
     arrays = outcome.records[0]
     return {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}, arrays["t"], outcome.status, admissible
 
 
-@partial(jax.jit, static_argnames=("program", "record_every"))
-def _execute(shared: StudyInputs, lanes: Lanes, *, program: StudyRun, record_every: int | None = None):
+@partial(jax.jit, static_argnames=("study_run", "record_every"))
+def _execute(shared: StudyInputs, lanes: Lanes, *, study_run: StudyRun, record_every: int | None = None):
     if record_every is None:
-        return _block(program, shared, lanes)
-    return _record_block(program, shared, lanes, record_every)
+        return _block(study_run, shared, lanes)
+    return _record_block(study_run, shared, lanes, record_every)
 
 
 def run_blocks(
-    program: StudyRun,
+    study_run: StudyRun,
     shared: StudyInputs,
     lanes_of: Callable[[np.ndarray], Lanes],
     blocks: Sequence[int],
@@ -138,7 +138,7 @@ def run_blocks(
     """Runs blocks and yields (block, its results on the host), in order.
 
     Args:
-      program, shared: what to run.
+      study_run, shared: what to run.
       lanes_of: cases (m,) -> what differs between them; it must accept cases past the last one and repeat there.
       blocks: numbers of the blocks to run.
       chunk: runs in flight; from `memory` if not given.
@@ -148,9 +148,9 @@ def run_blocks(
     """
     size = block_size()
     places = list(jax.local_devices() if devices is None else devices)[: max(1, len(blocks))]
-    call = partial(_execute, program=program, record_every=record_every)
+    call = partial(_execute, study_run=study_run, record_every=record_every)
     copies = [jax.device_put(shared, place) for place in places]
-    _compile(program, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
+    _compile(study_run, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
     waiting: deque = deque()
     for k, block in enumerate(blocks):
         place = k % len(places)
@@ -165,14 +165,14 @@ def run_blocks(
         yield _harvest(*waiting.popleft())
 
 
-def _compile(program: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]) -> None:
+def _compile(study_run: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]) -> None:
     """Compiles the block for several devices at the same time; tracing is done once and shared."""
     if len(copies) < 2:
         return
-    _execute.trace(copies[0], lanes[0], program=program, record_every=record_every)
+    _execute.trace(copies[0], lanes[0], study_run=study_run, record_every=record_every)
 
     def one(shared, lane):
-        _execute.lower(shared, lane, program=program, record_every=record_every).compile()
+        _execute.lower(shared, lane, study_run=study_run, record_every=record_every).compile()
 
     with ThreadPoolExecutor(len(copies)) as pool:
         list(pool.map(one, copies, lanes))

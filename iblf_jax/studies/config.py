@@ -15,7 +15,7 @@ from iblf_jax.lowering.toolchain import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.studies.blocks import _execute, block_size
 from iblf_jax.studies.points import Points
-from iblf_jax.studies.setup import Setup
+from iblf_jax.studies.setup import StudySetup
 
 
 def describe_component(part: Any) -> Any:
@@ -46,14 +46,14 @@ def structure(part: Any) -> Any:
     return found
 
 
-def program_digest(setup: Setup) -> str:
+def program_digest(setup: StudySetup) -> str:
     """A digest of what a run computes: it tells when the code of a law, a robot or a metric has changed."""
-    traced = _execute.trace(setup.shared, setup.lanes(np.arange(block_size())), program=setup.program)
+    traced = _execute.trace(setup.shared, setup.lanes(np.arange(block_size())), study_run=setup.study_run)
     text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, Any]:
+def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[str, Any]:
     """Everything that the data of a sweep depend on."""
     import jaxlib
 
@@ -69,28 +69,28 @@ def describe(setup: Setup, points: Points, design: str, dt: float) -> dict[str, 
             "shape": list(np.shape(get(scenario, path))),
         }
 
-    program = setup.program
+    study_run = setup.study_run
     return {
         "design": design,
         "dims": dict(points.dims),
         "points": {path: place(path) for path in points.values},
         "perturbations": {path: describe_component(p) for path, p in setup.perturbations.items()},
-        "perturbed": {t.path: {"unit": unit_at(scenario, t.path), "source": t.source} for t in program.targets},
+        "perturbed": {t.path: {"unit": unit_at(scenario, t.path), "source": t.source} for t in study_run.targets},
         "runs": setup.runs,
         "seed": setup.seed,
         "sampler": setup.sampler,
         "replicates": setup.replicates,
-        "duration": round(program.steps * dt, 12),
+        "duration": round(study_run.steps * dt, 12),
         "dt": dt,
-        "method": program.method,
+        "method": study_run.method,
         "metrics": describe_component(setup.shared.folds),
         "scenario": {p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)},
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
-        "backend": program.backend,
+        "backend": study_run.backend,
         "platform": jax.default_backend(),
-        **({"kernel": built_for()} if program.backend == "native" else {}),
+        **({"kernel": built_for()} if study_run.backend == "native" else {}),
         "block": block_size(),
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__, "jaxlib": jaxlib.__version__},
         "program": program_digest(setup),

@@ -38,7 +38,7 @@ LEAST_PATIENCE = 120.0
 """Seconds that another process is waited for at least."""
 LOST = 3
 """Exit code of a process that ends because another one was lost."""
-LONGEST = 86400
+LONGEST_WAIT = 86400
 """Seconds of a heartbeat or of a start, at most: a day."""
 
 _WATCHER = (
@@ -127,8 +127,8 @@ def initialize(
 
 def check_seconds(name: str, seconds: Any) -> None:
     """ValueError unless it is a number of seconds that JAX's runtime can take."""
-    if isinstance(seconds, bool) or not isinstance(seconds, int) or not 1 <= seconds <= LONGEST:
-        raise checks.fail(name, seconds, f"a whole number of seconds from 1 to {LONGEST}")
+    if isinstance(seconds, bool) or not isinstance(seconds, int) or not 1 <= seconds <= LONGEST_WAIT:
+        raise checks.fail(name, seconds, f"a whole number of seconds from 1 to {LONGEST_WAIT}")
 
 
 def _check_job(coordinator: Any, num_processes: Any, process_id: Any) -> None:

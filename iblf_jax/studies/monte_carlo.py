@@ -97,7 +97,7 @@ def monte_carlo(
     begin = time.monotonic()
     sizes = {block: min(block_size(), runs - block * block_size()) for block in mine}
     with bar(progress, sum(sizes.values())) as shown:
-        for block, part in run_blocks(setup.program, setup.shared, setup.lanes, mine, **how):
+        for block, part in run_blocks(setup.study_run, setup.shared, setup.lanes, mine, **how):
             results = _stored(results, part, block, runs)
             shown.update(sizes[block])
     results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))

@@ -58,7 +58,7 @@ def recommended_dt(
         steps = max(round(duration / dt), 1)
         options: dict[str, Any] = {"duration": steps * dt, "dt": dt, "method": method, "metrics": (), "backend": "auto"}
         setup = prepare(scenario, perturbations, block_size(), seed, **options)
-        ((_, results),) = run_blocks(setup.program, setup.shared, setup.lanes, [0])
+        ((_, results),) = run_blocks(setup.study_run, setup.shared, setup.lanes, [0])
         needed = needed_dt(results.status, results.fastest_mode, results.metrics[RELATIVE], dt, method)
         if needed is None:
             return dt

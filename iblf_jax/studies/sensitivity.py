@@ -33,7 +33,7 @@ from iblf_jax.studies.blocks import block_size, checked_how, run_blocks
 from iblf_jax.studies.designs import MOST_SOBOL, check_seed, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
-from iblf_jax.studies.setup import Setup, prepare
+from iblf_jax.studies.setup import StudySetup, prepare
 
 if TYPE_CHECKING:
     import xarray
@@ -135,7 +135,7 @@ def sensitivity(
         raise checks.fail("perturbations", perturbations, "at least one perturbation")
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
     setup = prepare(scenario, perturbations, 1, check_seed(seed), metrics=metrics, backend=backend, **timing)
-    shapes = sample_size(setup.program.targets, setup.shared.cases.perturbations)
+    shapes = sample_size(setup.study_run.targets, setup.shared.cases.perturbations)
     names = [path + "".join(f"[{i}]" for i in place) for path, shape in shapes.items() for place in np.ndindex(shape)]
     checks.fits("points", points, (len(names) + 2) * (setup.bytes_a_case + 3 * 8.0 * len(names)))
     label = output if isinstance(output, str) else str(getattr(output, "__name__", "output"))
@@ -180,12 +180,12 @@ def _called(output: Callable[[Metrics], Any], metrics: Metrics) -> np.ndarray:
         raise checks.fail("output", f"{type(error).__name__}: {error}", expected) from error
 
 
-def _evaluate(setup: Setup, u: np.ndarray, shapes: dict, output: Any, how: dict[str, Any], shown: Any) -> tuple[np.ndarray, int]:
+def _evaluate(setup: StudySetup, u: np.ndarray, shapes: dict, output: Any, how: dict[str, Any], shown: Any) -> tuple[np.ndarray, int]:
     """The output of every row of the unit cube, and how many of these runs failed."""
     dtype = setup.shared.cases.scenario.initial.q.dtype
     designed = dataclasses.replace(setup, runs=len(u), designed=split(u, shapes, dtype))
     parts: list[Any] = []
-    for _, part in run_blocks(setup.program, setup.shared, designed.lanes, range(-(-len(u) // block_size())), **how):
+    for _, part in run_blocks(setup.study_run, setup.shared, designed.lanes, range(-(-len(u) // block_size())), **how):
         shown.update(min(block_size(), len(u) - len(parts) * block_size()))
         parts.append(part)
     metrics: dict[str, Any] = {name: np.concatenate([p.metrics[name] for p in parts])[: len(u)] for name in parts[0].metrics}

@@ -24,10 +24,10 @@ from iblf_jax.studies.draws import Cases, Lanes, sample_size, targets_of
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class Setup:
+class StudySetup:
     """A study's arguments.  Cases are numbered: case = point * runs + run, with one point unless it is a sweep."""
 
-    program: StudyRun = dataclasses.field(metadata={"static": True})
+    study_run: StudyRun = dataclasses.field(metadata={"static": True})
     shared: StudyInputs
     perturbations: dict[str, Perturbation]
     """As the user gave them."""
@@ -49,7 +49,7 @@ class Setup:
     @cached_property
     def shapes(self) -> Results:
         """Shapes and types of what a block leaves."""
-        return jax.eval_shape(partial(_execute, program=self.program), self.shared, self.lanes(np.arange(block_size())))
+        return jax.eval_shape(partial(_execute, study_run=self.study_run), self.shared, self.lanes(np.arange(block_size())))
 
     @property
     def bytes_a_case(self) -> float:
@@ -77,7 +77,7 @@ def prepare(
     sampler: str = "independent",
     replicates: int = 1,
     points: Mapping[str, np.ndarray] | None = None,
-) -> Setup:
+) -> StudySetup:
     """Checks the arguments that studies share and puts together what their blocks need."""
     tableau(method)
     steps = checks.whole_steps(duration, dt)
@@ -91,7 +91,7 @@ def prepare(
         shapes = sample_size(targets, by_path)
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
-    program = StudyRun(targets, steps, method, backend, mechanism_of(scenario))
+    study_run = StudyRun(targets, steps, method, backend, mechanism_of(scenario))
     shared = StudyInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), folds, step)
-    setup = Setup(program, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
-    return dataclasses.replace(setup, program=with_chosen_backend(program, shared, setup.lanes(np.arange(block_size()))))
+    setup = StudySetup(study_run, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
+    return dataclasses.replace(setup, study_run=with_chosen_backend(study_run, shared, setup.lanes(np.arange(block_size()))))

@@ -32,7 +32,7 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import Results, block_size, run_blocks
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.setup import Setup
+from iblf_jax.studies.setup import StudySetup
 from iblf_jax.studies.statistics import Probability
 
 if TYPE_CHECKING:
@@ -67,16 +67,16 @@ class Study:
     """Largest measured mode of the closed loop, (N,) [1/s]."""
     samples: dict[str, Any]
     """Path -> the value of that leaf in each run, (N, ...), in the leaf's unit."""
-    setup: Setup
+    setup: StudySetup
     """What was asked for."""
 
     @classmethod
-    def of(cls, setup: Setup, results: Results) -> Study:
+    def of(cls, setup: StudySetup, results: Results) -> Study:
         """The study with these results."""
         units = metric_units(setup.shared.folds)
         order = {name: None for name, _ in units if name in results.metrics} | results.metrics  # theirs, not sorted as by jit
         metrics = Metrics({name: results.metrics[name] for name in order}, units)
-        samples = {target.path: results.samples[target.path] for target in setup.program.targets}
+        samples = {target.path: results.samples[target.path] for target in setup.study_run.targets}
         return cls(setup.shared.cases.scenario, metrics, results.status, results.fastest_mode, samples, setup)
 
     @property
@@ -97,7 +97,7 @@ class Study:
     @property
     def backend(self) -> str:
         """What the runs ran on: "native", "gpu", "xla" or "vmap", whatever was asked for."""
-        return self.setup.program.backend
+        return self.setup.study_run.backend
 
     @property
     def dt(self) -> float:
@@ -107,7 +107,7 @@ class Study:
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return self.setup.program.steps * self.dt
+        return self.setup.study_run.steps * self.dt
 
     def __len__(self) -> int:
         return self.runs
@@ -296,22 +296,22 @@ class Study:
         Source: design of this package.
         """
         i = checks.entry("index", index, self.runs, "runs")
-        record_every = checks.recorded_every(record_every, self.setup.program.steps)
+        record_every = checks.recorded_every(record_every, self.setup.study_run.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
             raise checks.fail(f"run {i}", drawn, "admissible draws", "It was not made; see study.made.")
         block, place = divmod(i, block_size())
-        ((_, again),) = run_blocks(self.setup.program, self.setup.shared, self.setup.lanes, [block])
+        ((_, again),) = run_blocks(self.setup.study_run, self.setup.shared, self.setup.lanes, [block])
         again = jax.tree.map(lambda x: x[place], again)
         if not all(np.array_equal(x, self.metrics[name][i], equal_nan=True) for name, x in again.metrics.items()):
             warnings.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.", stacklevel=2)
-        program, shared = self.setup.program, self.setup.shared
+        study_run, shared = self.setup.study_run, self.setup.shared
         run = simulate_unchecked(
             paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
             shared.folds,
             shared.dt,
-            steps=program.steps,
-            method=program.method,
+            steps=study_run.steps,
+            method=study_run.method,
             record_every=record_every,
         )
         self._warn_of_start(i)

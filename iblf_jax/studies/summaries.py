@@ -100,10 +100,10 @@ def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exc
     levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
     exclude_failed = checks.flag("exclude_failed", exclude_failed)
     count = min(checks.positive_integer("runs", runs), study.runs)
-    record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
+    record_every = max(1, setup.study_run.steps // checks.positive_integer("samples", samples))
     parts, times = [], np.zeros(0)
     for _, (arrays, t, _, _) in run_blocks(
-        setup.program, setup.shared, setup.lanes, range(-(-count // size)), chunk=size, record_every=record_every
+        setup.study_run, setup.shared, setup.lanes, range(-(-count // size)), chunk=size, record_every=record_every
     ):
         parts.append(arrays)
         times = t[0]
@@ -150,8 +150,8 @@ def to_xarray(study: Study) -> xarray.Dataset:
         )
     setup = study.setup
     attributes: dict[str, Any] = {"runs": study.runs, "failed": int(np.sum(study.status & int(FAILED) != 0)), "seed": study.seed}
-    attributes |= {"duration": study.duration, "dt": study.dt, "method": setup.program.method, "sampler": setup.sampler}
-    attributes |= {"backend": setup.program.backend, "iblf_jax_version": iblf_jax.__version__}
+    attributes |= {"duration": study.duration, "dt": study.dt, "method": setup.study_run.method, "sampler": setup.sampler}
+    attributes |= {"backend": setup.study_run.backend, "iblf_jax_version": iblf_jax.__version__}
     attributes["perturbations"] = json.dumps({path: describe_component(p) for path, p in study.perturbations.items()})
     attributes["parameters"] = json.dumps({p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario, named=False)})
     return xarray.Dataset(variables, coordinates, attributes)

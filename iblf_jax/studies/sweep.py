@@ -31,16 +31,11 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
 from iblf_jax.studies.recommended import tell_of_step
-from iblf_jax.studies.setup import Setup, prepare
+from iblf_jax.studies.setup import StudySetup, prepare
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
 
 if TYPE_CHECKING:
     import xarray
-
-STEPS_A_UNIT = 2e8
-"""Steps of all runs of a unit together, unless the caller says otherwise: seconds to a minute of work."""
-UNITS = 16
-"""Units that a sweep has at least, if it is large enough."""
 
 
 class _How(NamedTuple):
@@ -168,7 +163,7 @@ def _flat(results: Results) -> dict[str, Any]:
     return {**results.metrics, "status": results.status, "fastest_mode": results.fastest_mode, **drawn}
 
 
-def _variables(setup: Setup, config: dict[str, Any]) -> dict[str, Variable]:
+def _variables(setup: StudySetup, config: dict[str, Any]) -> dict[str, Variable]:
     """The arrays of a sweep."""
     shapes = _flat(setup.shapes)
     units = dict(metric_units(setup.shared.folds))
@@ -180,7 +175,7 @@ def _variables(setup: Setup, config: dict[str, Any]) -> dict[str, Variable]:
     }
 
 
-def _in_memory(setup: Setup, config: dict[str, Any], how: _How) -> xarray.Dataset:
+def _in_memory(setup: StudySetup, config: dict[str, Any], how: _How) -> xarray.Dataset:
     if distributed.size() > 1:
         raise checks.fail("store", None, "a store, in a job of several processes", "They meet there: store='sweep.zarr' on a shared disk.")
     variables = _variables(setup, config)
@@ -192,7 +187,7 @@ def _in_memory(setup: Setup, config: dict[str, Any], how: _How) -> xarray.Datase
     return to_dataset(config, data, {name: v.unit for name, v in variables.items()}, np.ones(setup.cases, bool))
 
 
-def _units(setup: Setup, units: Sequence[int], unit: int, how: _How, shown: Any) -> Iterator[tuple[dict[str, np.ndarray], slice]]:
+def _units(setup: StudySetup, units: Sequence[int], unit: int, how: _How, shown: Any) -> Iterator[tuple[dict[str, np.ndarray], slice]]:
     """Computes units and yields their data and cases, in order; in pieces, if a unit is all there is."""
     size = block_size()
     spans = [slice(u * unit, min((u + 1) * unit, setup.cases)) for u in units]
@@ -200,7 +195,7 @@ def _units(setup: Setup, units: Sequence[int], unit: int, how: _How, shown: Any)
     pieces: list[dict[str, np.ndarray]] = []
     waiting = iter(spans)
     span = next(waiting, None)
-    for block, results in run_blocks(setup.program, setup.shared, setup.lanes, blocks, **how.where):
+    for block, results in run_blocks(setup.study_run, setup.shared, setup.lanes, blocks, **how.where):
         assert span is not None
         here = min(size, span.stop - block * size)
         pieces.append({name: x[:here] for name, x in _flat(results).items()})
@@ -210,14 +205,14 @@ def _units(setup: Setup, units: Sequence[int], unit: int, how: _How, shown: Any)
             pieces, span = [], next(waiting, None)
 
 
-def _chosen_unit(setup: Setup, unit: int | None) -> int:
+def _chosen_unit(setup: StudySetup, unit: int | None) -> int:
     """Cases in a unit: whole blocks, or all there is."""
     size, cases = block_size(), setup.cases
-    wanted = min(STEPS_A_UNIT / setup.program.steps, cases / UNITS) if unit is None else unit
+    wanted = min(plan.SWEEP_UNIT / setup.study_run.steps, cases / plan.SWEEP_UNITS) if unit is None else unit
     return min(cases, size * max(1, round(wanted / size)))
 
 
-def _into_store(setup: Setup, config: dict[str, Any], how: _How, path: str | os.PathLike, unit: int | None) -> xarray.Dataset:
+def _into_store(setup: StudySetup, config: dict[str, Any], how: _How, path: str | os.PathLike, unit: int | None) -> xarray.Dataset:
     store = open_store(path, config, _variables(setup, config), setup.cases, _chosen_unit(setup, unit), any_unit=unit is None)
     size = store.unit
     pending, damaged = store.pending()

@@ -2,9 +2,7 @@
    (sizes), record_arrays, shared_constants, shared_signals (a table of what only time decides) and advance (W runs over some steps).
 
    A group of blocks goes through all steps before the next one, a stretch of steps at a time: its states and the stretch's table stay
-   in the cache.  A block that has fewer than W runs repeats its last one; the copies are not written back. */
-#define STRETCH 128
-#define GROUP 32
+   in the cache; the caller says how many (STRETCH, GROUP).  A block that has fewer than W runs repeats its last one; the copies are not written back. */
 
 typedef struct {
   const real *shared, *leaves, *floats_in;
