@@ -113,9 +113,9 @@ def short_run(paper) -> ij.Rollout:
 
 
 @pytest.fixture(scope="session")
-def compiled(tmp_path_factory):
-    """A folder for compiled programs, shared between the processes of all tests."""
-    return tmp_path_factory.getbasetemp() / "compiled"
+def compiled() -> Path:
+    """The folder of compiled programs, shared between the processes of all tests: a worker's own would have each compile the same."""
+    return Path(jax.config.jax_compilation_cache_dir)
 
 
 @pytest.fixture(scope="session")
