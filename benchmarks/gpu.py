@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _timing import compile_seconds, interleaved, report
-from throughput import GAINS, chain, draws, textbook
+from throughput import GAINS, chain, draws, method_for, textbook
 
 import iblf_jax as ij
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
@@ -59,15 +59,15 @@ def peak(dtype: str) -> float:
     return 1e3 * clock.value * lanes * device.core_count
 
 
-def candidates(scenario, dtype: str, is_paper: bool) -> dict:
+def candidates(scenario, dtype: str, is_paper: bool, method: str) -> dict:
     """Name -> function of (values, dt, steps)."""
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
 
     def on(backend, folds=folds):
-        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps), backend=backend)
+        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend)
 
     def tangents(v, dt, steps):
-        return run_batch_jvp(scenario, v, GAINS, folds[:1], dt, Run(steps), backend=compiled)
+        return run_batch_jvp(scenario, v, GAINS, folds[:1], dt, Run(steps, method), backend=compiled)
 
     compiled = "gpu" if on_a_gpu() else "native"
     rows = {"textbook": lambda v, dt, steps: textbook(v, dt, steps=steps)} if is_paper else {}
@@ -75,13 +75,13 @@ def candidates(scenario, dtype: str, is_paper: bool) -> dict:
     return rows | ({f"{compiled} + 6 tangents": tangents} if is_paper else {})
 
 
-def check(scenario, dtype: str, steps: int) -> None:
+def check(scenario, dtype: str, steps: int, method: str) -> None:
     """Prints how far the kernel is from the reference on some runs."""
     folds, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard()), jnp.asarray(1e-3, dtype)
     values = draws(scenario, 300, dtype)
 
     def outcome(backend):
-        return jax.jit(lambda v: run_batch(scenario, v, folds, dt, Run(steps), backend=backend))(values)
+        return jax.jit(lambda v: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend))(values)
 
     found, expected = outcome("gpu"), outcome("vmap")
     worst = 0.0
@@ -99,11 +99,11 @@ def table(which: str, dtype: str, batches, quick: bool) -> list[list]:
     dt, rows, device = jnp.asarray(1e-3, dtype), [], jax.local_devices()[0].device_kind
     slots = ij.explain(scenario, varied=["plant.mass[1]"]).slots
     if on_a_gpu():
-        check(scenario, dtype, 20 if quick else 10_000)
+        check(scenario, dtype, 20 if quick else 10_000, method_for(quick))
     for runs in batches:
         values = draws(scenario, runs, dtype)
         calls, seconds, steps_of = {}, {}, {}
-        for name, function in candidates(scenario, dtype, which == "paper").items():
+        for name, function in candidates(scenario, dtype, which == "paper", method_for(quick)).items():
             rate = RATES.get(name, 5e7) if on_a_gpu() else 5e7
             steps = steps_of[name] = 20 if quick else int(min(max(rate / runs, 40), 10_000)) // 20 * 20
             seconds[name], compiled = compile_seconds(partial(function, steps=steps), values, dt)
@@ -141,7 +141,7 @@ def main() -> None:
     if on_a_gpu():
         same = ["--dtype", options.dtype, "--batches", str(min(batches)), *(["--quick"] if options.quick else [])]
         rows += rows_of_the_processor(same)
-    report("One kernel a rollout, RK4 at 1 ms", COLUMNS, rows, options.json)
+    report(f"One kernel a rollout, {method_for(options.quick)} at 1 ms", COLUMNS, rows, options.json)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ SIZES = {"native": 20_480, "xla": 10_240, "vmap": 2_048}
 """Runs of 1 s that one device is timed on: seconds."""
 
 
-def study(runs: int, steps: int, backend: str, dtype: str, devices: int) -> dict[str, float]:
+def study(runs: int, steps: int, backend: str, dtype: str, devices: int, method: str) -> dict[str, float]:
     """One study in this process: seconds without compilation, and the most memory it held."""
     import jax
 
@@ -41,7 +41,7 @@ def study(runs: int, steps: int, backend: str, dtype: str, devices: int) -> dict
 
     scenario = ij.presets.zhang_yan_2024()
     start = {"initial.q": ij.offset(ij.normal(0.0, SPREAD))}
-    options = {"duration": steps * DT, "dt": DT, "seed": 0, "backend": backend, "progress": False}
+    options = {"duration": steps * DT, "dt": DT, "method": method, "seed": 0, "backend": backend, "progress": False}
     ij.monte_carlo(scenario, start, runs=block_size() * devices, **options)  # compiles, for every device
     begin = time.perf_counter()
     ij.monte_carlo(scenario, start, runs=runs, **options)
@@ -66,12 +66,12 @@ def in_its_own_process(name: str = "study", **words) -> dict[str, float]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def two_devices(backend: str, dtype: str, runs: int, steps: int, repeats: int) -> dict[str, float]:
+def two_devices(backend: str, dtype: str, runs: int, steps: int, method: str, repeats: int) -> dict[str, float]:
     """Seconds of one study in this process on one and on two of its devices, and in one and in two processes on a core each."""
     import jax
 
     jax.config.update("jax_num_cpu_devices", 2)
-    words = {"backend": backend, "dtype": dtype, "runs": runs, "steps": steps}
+    words = {"backend": backend, "dtype": dtype, "runs": runs, "steps": steps, "method": method}
     workers = [subprocess.Popen(_command("worker", core=core, **words), **PIPES) for core in two_cores()]
     here = _study(**words)
     for worker in workers:
@@ -114,7 +114,7 @@ def worker(core: int, **words) -> None:
         print("done", flush=True)
 
 
-def _study(backend: str, dtype: str, runs: int, steps: int):
+def _study(backend: str, dtype: str, runs: int, steps: int, method: str):
     """A study with a mass and the start drawn, as a function of the devices; compiled for all of them."""
     import jax
 
@@ -123,7 +123,7 @@ def _study(backend: str, dtype: str, runs: int, steps: int):
     from iblf_jax.studies.blocks import block_size
 
     ways = {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)), "initial.q": ij.offset(ij.normal(0.0, SPREAD))}
-    options = {"duration": steps * DT, "dt": DT, "backend": backend, "progress": False}
+    options = {"duration": steps * DT, "dt": DT, "method": method, "backend": backend, "progress": False}
 
     def run(devices=None, runs=runs) -> None:
         ij.monte_carlo(ij.presets.zhang_yan_2024(), ways, runs=runs, devices=devices, **options)
@@ -184,6 +184,11 @@ def diffrax_vmap(count: int, duration: float) -> float:
     return count / (time.perf_counter() - begin)
 
 
+def method_of(args: argparse.Namespace) -> str:
+    """The quick size is there to be run, and four stages compile four times as long as one."""
+    return "euler" if args.quick else "rk4"
+
+
 def ours(args: argparse.Namespace, reference: float) -> list[list]:
     """Rows of this package; the length of a row's runs is fitted to the budget by the rate of the row before."""
     rows, whole = [], round(DURATION / DT)
@@ -192,7 +197,7 @@ def ours(args: argparse.Namespace, reference: float) -> list[list]:
         rate = 1e6
         for runs in (300,) if args.quick else (1_000, 10_000, 100_000, 1_000_000):
             steps = int(np.clip(args.budget * rate / max(runs, 256), 5, whole))
-            found = in_its_own_process(runs=runs, steps=steps, backend=args.backend, dtype=dtype, devices=devices)
+            found = in_its_own_process(runs=runs, steps=steps, backend=args.backend, dtype=dtype, devices=devices, method=method_of(args))
             rate = max(runs, 256) * steps / found["seconds"]
             speed = runs / found["seconds"] * steps / whole
             said = "measured" if steps == whole else f"from {steps} steps of {whole}"
@@ -206,7 +211,8 @@ def devices(args: argparse.Namespace, reference: float) -> list[list]:
     for backend in ("native",) if args.quick else SIZES:
         for dtype in ("float32",) if args.quick else ("float64", "float32"):
             steps, runs = (20, 512) if args.quick else (round(1.0 / DT), SIZES[backend])
-            found = in_its_own_process("two_devices", backend=backend, dtype=dtype, runs=runs, steps=steps, repeats=1 if args.quick else 5)
+            words = {"backend": backend, "dtype": dtype, "runs": runs, "steps": steps, "method": method_of(args)}
+            found = in_its_own_process("two_devices", **words, repeats=1 if args.quick else 5)
             speed = runs / found["two"] * steps * DT / DURATION
             gain, most = found["one"] / found["two"], 2 * found["process"] / found["processes"]
             said = f"{gain:.2f} times one device; two processes {most:.2f} times one (runs of {steps * DT:g} s)"
@@ -241,7 +247,7 @@ def main() -> None:
         rows += devices(args, reference)
     from _timing import report
 
-    report(f"Runs of {DURATION:g} s at {DT:g} s, random start", COLUMNS, rows, args.json)
+    report(f"Runs of {DURATION:g} s at {DT:g} s by {method_of(args)}, random start", COLUMNS, rows, args.json)
 
 
 if __name__ == "__main__":

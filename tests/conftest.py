@@ -16,6 +16,11 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
+# Where in Python an operation was written stands in no program that is compiled, and costs a tenth of the tracing.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+# Tracing makes millions of objects that live as long as the process: at Python's own setting a tenth of its time is a search for garbage.
+gc.set_threshold(50_000, 20, 20)
+
 import hypothesis
 import jax
 import numpy as np
@@ -39,6 +44,11 @@ SHORT = {"duration": 0.5, "dt": 1e-3}
 """A run with every step recorded; used wherever the length does not matter, so that it compiles once."""
 
 
+XLA_FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+"""Half of the tests' time was LLVM's, spent on making loops faster that run for milliseconds.  XLA is asked for the same programs; it
+writes the machine's code plainly, operation by operation and on one thread.  `test_users_settings.py` runs tests as users compile; so do
+the release tests, and all of them with TEST_XLA_FLAGS="" in the environment."""
+
 MEMORY = 2 * 2**30
 """Bytes of a process from which what it has compiled is let go after a test: what is needed again comes from the cache on disk."""
 
@@ -56,10 +66,15 @@ def memory() -> dict[str, int]:
 
 
 def pytest_configure(config):
-    """In the default run an array of another type is a slip, not a promotion; with the slow tests it is as in a user's session.
+    """What XLA is told, by this process and those that it starts, and what JAX refuses.
 
-    Ranks are promoted in both: the package broadcasts leading axes throughout.
+    In the default run an array of another type is a slip, not a promotion; with the slow tests it is as in a user's session.  Ranks are
+    promoted in both: the package broadcasts leading axes throughout.
     """
+    # A worker's environment is its parent's, which has been here: the tester's own flags are kept apart.
+    own = os.environ.setdefault("TESTER_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+    ours = os.environ.get("TEST_XLA_FLAGS", "" if config.option.markexpr == "release" else XLA_FLAGS)
+    os.environ["XLA_FLAGS"] = f"{ours} {own}".strip()  # read when the first program is compiled, and the last of two flags wins
     if "not slow" in config.option.markexpr:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -98,9 +113,9 @@ def short_run(paper) -> ij.Rollout:
 
 
 @pytest.fixture(scope="session")
-def compiled(tmp_path_factory):
-    """A folder for compiled programs, shared between the processes of all tests."""
-    return tmp_path_factory.getbasetemp() / "compiled"
+def compiled() -> Path:
+    """The folder of compiled programs, shared between the processes of all tests: a worker's own would have each compile the same."""
+    return Path(jax.config.jax_compilation_cache_dir)
 
 
 @pytest.fixture(scope="session")

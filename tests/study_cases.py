@@ -1,15 +1,19 @@
 """The one small study that these tests share, in this process and in others: few programs to compile.
 
-As a script it does the small sweep in a process of its own: `python study_cases.py OUT [--store S] [--devices N] [--job ADDRESS N I]`.
+As a script it does the small sweep in a process of its own: `python study_cases.py OUT [--store S] [--devices N] [--job ADDRESS N I]`;
+with `--serve` alone, in a process for each line that comes in (`Forks`).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
+import threading
 import tomllib
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +118,76 @@ def start_python(cache: Path, *words: str, **more: str) -> subprocess.Popen:
     return subprocess.Popen(command, env=environment(cache, **more), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+class Forks:
+    """Many processes of this script, each forked from one that has imported everything and started nothing: half of a start is imports.
+
+    Args:
+      cache: folder of compiled programs.
+      errors: file for what they say on stderr.
+    """
+
+    def __init__(self, cache: Path, errors: Path):
+        with errors.open("w") as file:
+            command = [sys.executable, __file__, "--serve"]
+            self.server = subprocess.Popen(
+                command, env=environment(cache), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True
+            )
+
+    def __enter__(self) -> Forks:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.server.kill()
+        self.server.communicate()
+
+    def start(self, *words: str) -> int:
+        """The process that does what the script does with these words; the one before must have ended."""
+        self.server.stdin.write(json.dumps(words) + "\n")
+        self.server.stdin.flush()
+        return int(self.line().removeprefix("pid "))
+
+    def line(self) -> str:
+        """What the process says next; "ended CODE" once it has ended."""
+        return self.server.stdout.readline()
+
+    def ended(self) -> int:
+        """Waits for the end of the process: its exit code, or less than 0 the signal that ended it."""
+        while not (said := self.line()).startswith("ended"):
+            assert said, "the server of processes is gone"
+        return int(said.removeprefix("ended "))
+
+
+def serve() -> None:
+    """Forks for each line of words, and says when the child has ended; threads, which do not survive a fork, have not been started."""
+    import jax  # noqa: F401
+    import xarray  # noqa: F401
+    import zarr  # noqa: F401
+
+    import iblf_jax as ij
+
+    ij.sweep, ij.presets.zhang_yan_2024  # noqa: B018
+    assert threading.active_count() == 1
+    for line in sys.stdin:
+        child = os.fork()
+        if not child:
+            sys.argv[1:] = json.loads(line)
+            print("pid", os.getpid(), flush=True)
+            os._exit(_exit_code_of_main())
+        print("ended", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+
+
+def _exit_code_of_main() -> int:
+    try:
+        main()
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return 0
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("out")
@@ -163,4 +237,4 @@ def _hinder(args) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    serve() if sys.argv[1:] == ["--serve"] else main()

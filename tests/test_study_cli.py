@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import time
@@ -141,7 +142,8 @@ monte_carlo.monte_carlo = compile_for_long
 sys.argv[1:] = ["montecarlo", "study.toml"]
 cli.entry()
 """
-    process = cases.start_python(tmp_path / "nothing_compiled", "-c", code)
+    # As users compile: at the tests' own settings it could be over before the signal comes.
+    process = cases.start_python(tmp_path / "nothing_compiled", "-c", code, XLA_FLAGS=os.environ["TESTER_XLA_FLAGS"])
     assert process.communicate(timeout=60) == ("", "iblf-jax: error: interrupted\n")
     assert process.returncode == 130
 

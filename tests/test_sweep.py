@@ -462,20 +462,22 @@ def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
 
 def killed_until_done(path, compiled, table, kills, seed):
     """Kills the sweep at random moments, then lets it finish."""
-    rng, out = random.Random(seed), path.parent / "out.npz"
-    done = 0
-    while done < kills:
-        process = cases.start(compiled, str(out), "--store", str(path), "--slow", "0.15")
-        first = process.stdout.readline() if done % 2 else ""  # every second time, not before a unit is written
-        time.sleep(rng.uniform(0.0, 1.0 if first else 4.0))
-        if process.poll() is not None:
-            shutil.rmtree(path)
-        process.kill()
-        process.communicate()
-        done += 1
+    rng, out, errors = random.Random(seed), path.parent / "out.npz", path.parent / "errors.txt"
+    with cases.Forks(compiled, errors) as forks:
+        for count in range(kills):
+            process = forks.start(str(out), "--store", str(path), "--slow", "0.15")
+            first = forks.line() if count % 2 else ""  # every second time, not before a unit is written
+            assert not first.startswith("ended"), errors.read_text()
+            time.sleep(rng.uniform(0.0, 1.0 if first else 4.0))
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+            code = forks.ended()
+            assert code in (0, -signal.SIGKILL), errors.read_text()
+            if code == 0:
+                shutil.rmtree(path)
     process = cases.start(compiled, str(out), "--store", str(path))
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
     assert cases.same(dict(np.load(out)), cases.arrays(table))
 
 

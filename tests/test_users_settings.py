@@ -1,0 +1,46 @@
+"""What other tests find holds as users compile too: the tests' own XLA_FLAGS (conftest.py) leave out what LLVM optimises.
+
+An optimiser may add up in another order in another batch, and fails on functions of its own; so these are the tests of the reference data,
+of bit-identity, and of the ways in which XLA is given a loop.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import conftest
+import pytest
+
+ROOT = Path(__file__).parents[1]
+AGAIN = {
+    "the paper": ["test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]", "test_paper.py::test_what_the_paper_shows"],
+    "shapes": ["test_engine.py::test_every_shape_is_the_same_run[euler-None]"],
+    "runs": [
+        "test_transforms.py::test_a_failing_run_leaves_the_others_bit_identical",
+        "test_transforms.py::test_the_same_run_twice_is_bit_identical",
+        "test_monte_carlo.py::test_chunk_changes_nothing[1]",
+        "test_monte_carlo.py::test_number_of_runs_changes_no_run[257]",
+        "test_monte_carlo.py::test_replay_is_bit_identical_and_has_the_trajectory",
+    ],
+}
+"""Name -> tests."""
+SETTINGS = "test_users_settings.py::test_the_testers_own_flags_come_last"
+
+
+def test_the_testers_own_flags_come_last():
+    flags, own = os.environ["XLA_FLAGS"], os.environ["TESTER_XLA_FLAGS"]
+    assert flags == f"{os.environ.get('TEST_XLA_FLAGS', conftest.XLA_FLAGS)} {own}".strip()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", AGAIN)
+def test_the_same_as_users_compile(what):
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-m", "not release", *names]
+    done = subprocess.run(command, cwd=ROOT, env=plain | {"TEST_XLA_FLAGS": ""}, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert f"{len(names)} passed" in done.stdout
