@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from iblf_jax.core import checks
 
@@ -57,6 +56,8 @@ def unit_points(sampler: str, dimension: int, runs: int, replicates: int, seed: 
     if sampler == "sobol" and (dimension > MOST_SOBOL[0] or runs // replicates > MOST_SOBOL[1]):
         came = f"{runs // replicates} of {dimension} numbers"
         raise checks.fail("sampler", sampler, f"at most {MOST_SOBOL[1]} points of {MOST_SOBOL[0]} numbers in a design, not {came}")
+    from scipy.stats import qmc  # a second to import
+
     designs = []
     for replicate in range(replicates):
         rng = np.random.default_rng([seed, replicate, salt])

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from scipy import stats
 
 from iblf_jax.core import checks, tables
 from iblf_jax.core.progress import bar
@@ -149,6 +148,8 @@ def sensitivity(
             values.append(y)
             # Twice, as if there were two outputs: of one number and one output SciPy makes scalars, and then fails to write into them.
             return np.stack([y, y])
+
+        from scipy import stats  # a second to import
 
         rng = np.random.default_rng(setup.seed)
         found = stats.sobol_indices(func=evaluate, n=points, dists=[stats.uniform()] * len(names), rng=rng)

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from iblf_jax.core import checks
 
@@ -58,6 +57,8 @@ def probability(events: np.ndarray, valid: np.ndarray, confidence: float, sample
       confidence: of the interval.
       sampler, replicates: how the runs were drawn; replicates follow each other.
     """
+    from scipy import stats  # a second to import
+
     count, runs = int(np.sum(events & valid)), int(np.sum(valid))
     estimate = count / runs if runs else float("nan")
     low, high, method = None, None, "no run was made"
@@ -77,6 +78,8 @@ def _between_replicates(events: np.ndarray, valid: np.ndarray, confidence: float
     spread = means.std(ddof=1) / np.sqrt(replicates)
     if spread == 0:
         return None, None, "all replicates agree, so their spread says nothing; ask for more runs or independent draws"
+    from scipy import stats
+
     half = stats.t.ppf(0.5 + confidence / 2, replicates - 1) * spread
     return float(max(0.0, means.mean() - half)), float(min(1.0, means.mean() + half)), f"Student t over {replicates} replicates"
 
@@ -105,5 +108,7 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Spearman's rank correlation and its two-sided p-value; (nan, nan) where one of the two is constant."""
     if len(x) < 3 or np.all(x == x[0]) or np.all(y == y[0]):
         return float("nan"), float("nan")
+    from scipy import stats
+
     result = stats.spearmanr(x, y)
     return float(result.statistic), float(result.pvalue)
