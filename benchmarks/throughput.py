@@ -32,6 +32,7 @@ from _timing import compile_seconds, report
 import iblf_jax as ij
 from iblf_jax import lowering
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
 from iblf_jax.simulation.metrics import standard
@@ -195,13 +196,13 @@ LARGE = (4096, 65536)
 
 def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
     """What is measured on a loop."""
-    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    folds, mechanism = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard()), mechanism_of(scenario)
 
     def on(backend, folds=folds):
-        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend)
+        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps, method, mechanism=mechanism), backend=backend)
 
     def sensitivities(folds):
-        return lambda v, dt, steps: run_batch_jvp(scenario, v, GAINS, folds, dt, Run(steps, method), backend="native")
+        return lambda v, dt, steps: run_batch_jvp(scenario, v, GAINS, folds, dt, Run(steps, method, mechanism=mechanism), backend="native")
 
     if loop == "arm":
         return [Row("vmap", on("vmap"), 2e4, batches=(1, 64)), Row("native", on("native"), 2e6, batches=(1, 64, 4096))]
