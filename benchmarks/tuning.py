@@ -1,6 +1,6 @@
 """Gain tuning against black-box search, on the same compiled rollout.
 
-    python benchmarks/tuning.py [--quick] [--problem two_link|chain_4|chain_7] [--starts 8] [--seeds 3] [--json FILE]
+    python benchmarks/tuning.py [--quick] [--problem NAME] [--starts 8] [--seeds 3] [--json FILE]
 
 The loss, without smoothing, is
 
@@ -19,11 +19,18 @@ each method came within 0.5 %, and the expected rollouts to get there by searchi
     rollouts of all searches, each up to the goal or to its end / number of searches that reached it
 
 (if none did: more than the rollouts of all of them).
+
+Problems under limits that bind (`LIMITED`) are the tracking error + 0.3 effort + 0.02 torque rate, each relative to the start, with a limit
+on the peak torque below the start's, and on the margin.  Their table has the best objective that keeps the limits; a search counts what it
+needs to come within 0.5 % of the best of all.  Peers: CMA-ES and differential evolution with an exact penalty, SciPy's SLSQP from ten
+starts with central differences, and SLSQP from the one start with the exact values and slopes that `tune` has, of the largest peak of
+each requirement.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from typing import Any, NamedTuple
 
@@ -34,6 +41,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 from _timing import interleaved, report
+from scipy import optimize
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, disturbances, observers, references, robots
@@ -242,17 +250,181 @@ def _method_row(name: str, method: str, searches: list[Search], goal: float) -> 
     return [name, method, f"{reached} of {len(searches)}", median, spent / reached if reached else f"> {spent:.0f}"]
 
 
+LIMITED = {
+    "two gains, tan": ("tan", 0.3, ("controller.k1", "controller.K2"), True, 0.93, 0.9),
+    "four gains, mapping": ("mapping", 0.0, ("controller.k1", "controller.K2"), False, 0.95, 0.75),
+    "six gains, integral": ("integral", 0.0, ("controller.k1", "controller.K2", "observer.kf"), False, 0.85, 0.9),
+    "fourteen gains, ur5, log": ("ur5", 2.0, ("controller.k1", "controller.K2"), False, 0.97, 0.9),
+}
+"""Law or arm, payload [kg], gains, whether they are one number for all joints, limits relative to the start: peak torque, margin."""
+PENALTY = 10.0
+"""On the sum of the excesses, for searches that know no limits."""
+
+
+def limited_problem(name: str, quick: bool) -> tuple[ij.Scenario, list[Any], Any, dict[str, Any]]:
+    """Scenario, parameters, objective and timing of one of `LIMITED`."""
+    law, payload, paths, tied, torque, margin = LIMITED[name]
+    if law == "ur5":
+        scenario, duration, backend = ij.presets.ur5(law="log", payload=payload), 1.0, "native"
+        tunables = [*paths, ij.tunable("observer.kf", tied=True), ij.tunable("controller.o", tied=True)]
+    else:
+        scenario, duration, backend = ij.presets.zhang_yan_2024(law=law, reading="corrected"), 0.3 if quick else 2.0, "auto"
+        plant = dataclasses.replace(scenario.plant, payload=payload)
+        scenario = dataclasses.replace(scenario, plant=plant, model=scenario.plant)
+        tunables = [ij.tunable(path, tied=tied) for path in paths]
+    start = ij.simulate(scenario, duration=duration, dt=1e-3).metrics
+    o = ij.objectives
+    goal = o.tracking() + 0.3 * o.effort() + 0.02 * o.torque_rate()
+    goal += o.peak_torque_below(torque * float(np.max(start.peak_torque))) + o.margin_above(margin * float(np.min(start.margin)))
+    return scenario, tunables, goal, {"duration": duration, "dt": 1e-3, "backend": backend}
+
+
+class LimitedJudge:
+    """Objective and excess at many points; remembers every value."""
+
+    def __init__(self, built: _tune.Problem):
+        self.built = built
+        self.seen: list[float] = []
+        self.began = time.perf_counter()
+        reach = np.full(len(built.box.z), 4.0)
+        self.low, self.high = np.maximum(built.box.low, built.box.z - reach), np.minimum(built.box.high, built.box.z + reach)
+
+    def both(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Objective (S,), and excess (S, R); sixteen at a time, so that one shape is compiled."""
+        points = np.atleast_2d(points)
+        parts = [np.concatenate([part, np.repeat(part[:1], 16 - len(part), 0)]) for part in np.split(points, range(16, len(points), 16))]
+        found = [problem.value(self.built.shared, self.built.lanes(part), formulation=self.built.formulation) for part in parts]
+        f = np.concatenate([np.where(np.asarray(x.valid), np.asarray(x.objective), 1e3) for x in found])[: len(points)]
+        excess = np.concatenate([np.where(np.asarray(x.valid)[:, None], np.asarray(x.exact_excess), 1e3) for x in found])[: len(points)]
+        self.seen += np.where(np.all(excess <= 0, axis=1), f, np.inf).tolist()
+        return f, excess
+
+    def penalised(self, points: np.ndarray) -> np.ndarray:
+        """What searches without limits are given."""
+        f, excess = self.both(points)
+        return f + PENALTY * np.maximum(excess, 0).sum(axis=1)
+
+    def search(self, method: str, cost: float = 1.0) -> Search:
+        """What was seen."""
+        spent = cost * (1.0 + np.arange(len(self.seen)))
+        return Search(method, 0, np.asarray(self.seen), spent, np.full(len(self.seen), time.perf_counter() - self.began))
+
+
+def _slsqp(judge: LimitedJudge, start: np.ndarray, everything: Any, steps: int) -> None:
+    """SciPy's SLSQP with a function that gives objective, excess and their slopes at once."""
+    kept: dict[bytes, Any] = {}
+
+    def at(z: np.ndarray) -> Any:
+        if z.tobytes() not in kept:
+            kept[z.tobytes()] = everything(z)
+        return kept[z.tobytes()]
+
+    limit = {"type": "ineq", "fun": lambda z: -at(z)[1] - 1e-6, "jac": lambda z: -at(z)[3]}
+    bounds_ = list(zip(judge.low, judge.high, strict=True))
+    options = {"maxiter": steps, "ftol": 1e-8}
+    optimize.minimize(lambda z: at(z)[0], start, jac=lambda z: at(z)[2], method="SLSQP", bounds=bounds_, constraints=limit, options=options)
+
+
+def limited_searches(name: str, quick: bool) -> tuple[list[Search], float]:
+    """Every search of one limited problem, `tune` first, and what a value with its derivatives costs."""
+    import cma
+
+    scenario, tunables, goal, timing = limited_problem(name, quick)
+    built = _tune.build(scenario, tunables, goal, None, 1, 0, "mean", timing | {"method": "rk4"})
+    z, size = built.box.z, len(built.box.z)
+    one, steps, values = built.lanes(z[None]), 2 if quick else 40, 60 if quick else 250 * size
+    calls = {
+        "value": lambda: problem.value(built.shared, one, formulation=built.formulation),
+        "slope": lambda: problem.slope(built.shared, one, formulation=built.formulation),
+    }
+    seconds = interleaved(calls, 2 if quick else 10)
+    cost, began = seconds["slope"] / seconds["value"], time.perf_counter()
+    history = ij.tune(scenario, tunables, goal, iterations=4 if quick else 60, progress=False, **timing).history
+    feasible = history["valid"] & np.all(history["excess"] <= 0, axis=-1)
+    seen, spent = np.where(feasible, history["objective"], np.inf)[:, 0], cost * history["evaluations"]
+    searches = [Search("iblf_jax tune", 0, seen, spent, np.full(len(seen), time.perf_counter() - began))]
+
+    judge = LimitedJudge(built)
+
+    def exact(z: np.ndarray) -> Any:
+        found = jax.tree.map(lambda x: np.asarray(x)[0], problem.slope(built.shared, built.lanes(z[None]), formulation=built.formulation))
+        judge.seen.append(float(found.value.objective) if np.all(found.value.exact_excess <= 0) else np.inf)
+        worst = [np.flatnonzero(built.limits.owner == r)[np.argmax(found.excess[0, built.limits.owner == r])] for r in range(2)]
+        return float(found.value.objective), found.value.exact_excess, found.gradient, found.slopes[0][:, worst].T
+
+    _slsqp(judge, z, exact, steps)
+    searches.append(judge.search("SLSQP, exact slopes", cost))
+    judge = LimitedJudge(built)
+
+    def by_differences(z: np.ndarray) -> Any:
+        f, excess = judge.both(np.concatenate([z[None], z + 1e-5 * np.eye(size), z - 1e-5 * np.eye(size)]))
+        halves = slice(1, size + 1), slice(size + 1, None)
+        return f[0], excess[0], (f[halves[0]] - f[halves[1]]) / 2e-5, (excess[halves[0]] - excess[halves[1]]).T / 2e-5
+
+    rng = np.random.default_rng(0)
+    drawn = z + rng.uniform(-1, 1, (1 if quick else 9, size))
+    for start in [z, *np.clip(drawn, judge.low, judge.high)]:
+        _slsqp(judge, start, by_differences, steps)
+    searches.append(judge.search("SLSQP, 10 starts"))
+    judge = LimitedJudge(built)
+    ends = {"bounds": [judge.low.tolist(), judge.high.tolist()], "seed": 1, "verbose": -9, "maxfevals": values}
+    evolution = cma.CMAEvolutionStrategy(z, 0.5, ends)
+    while not evolution.stop():
+        points = evolution.ask()
+        evolution.tell(points, judge.penalised(np.stack(points)).tolist())
+    searches.append(judge.search("CMA-ES"))
+    judge = LimitedJudge(built)
+    options = {
+        "vectorized": True,
+        "updating": "deferred",
+        "popsize": 6,
+        "maxiter": values // (6 * size),
+        "polish": False,
+        "rng": 1,
+        "tol": 0,
+    }
+    pairs = list(zip(judge.low, judge.high, strict=True))
+    optimize.differential_evolution(lambda x: judge.penalised(x.T), pairs, x0=z, **options)
+    searches.append(judge.search("differential evolution"))
+    return searches, cost
+
+
+def compare_limited(name: str, quick: bool) -> list[list[Any]]:
+    """The rows of one limited problem."""
+    searches, cost = limited_searches(name, quick)
+    goal = WITHIN * min(float(s.seen.min()) for s in searches)
+    rows = []
+    for s in searches:
+        at = s.reached(goal) if np.isfinite(goal) else None
+        exact = cost if s.method in ("iblf_jax tune", "SLSQP, exact slopes") else 1.0
+        best = float(s.seen.min())
+        reached: list[Any] = ["never", "never"] if at is None else [at + 1, float(s.spent[at])]
+        rows.append(
+            [name, s.method, best if np.isfinite(best) else "none", *reached, len(s.seen), float(s.spent[-1]), float(s.times[-1]), exact]
+        )
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="half a second of motion, few values")
-    parser.add_argument("--problem", choices=("two_link", "chain_4", "chain_7"), help="one problem only")
+    parser.add_argument("--problem", choices=("two_link", "chain_4", "chain_7", *LIMITED), help="one problem only")
     parser.add_argument("--starts", type=int, help="starts of tune; 8 on the chain of four and 1 elsewhere if not given")
     parser.add_argument("--seeds", type=int, default=3, help="searches by CMA-ES, and by tune where it has several starts")
     parser.add_argument("--json", help="also write the table to this file")
     args = parser.parse_args()
-    names = [args.problem] if args.problem else ["two_link"] if args.quick else ["two_link", "chain_4", "chain_7"]
+    names = (
+        [args.problem] if args.problem else ["two_link", *list(LIMITED)[:1]] if args.quick else ["two_link", "chain_4", "chain_7", *LIMITED]
+    )
+    limits = [row for name in names if name in LIMITED for row in compare_limited(name, args.quick)]
+    names = [name for name in names if name not in LIMITED]
     found = [compare(name, args.quick, args.starts or STARTS[name], 1 if args.quick else args.seeds) for name in names]
     columns = ["problem", "gains", "search", "first J", "best J", "rollouts to 0.5 %", "seconds to 0.5 %", "rollouts", "seconds"]
+    if limits:
+        under = ["problem", "search", "best within the limits", "values to 0.5 %", "rollouts to 0.5 %", "values", "rollouts", "seconds"]
+        report("Under limits", [*under, "cost of one"], limits, None if found else args.json)
+    if not found:
+        return
     report("Gain tuning", [*columns, "cost of one"], [row for rows, _ in found for row in rows], args.json)
     columns = ["problem", "method", "within 0.5 %", "median best J", "expected rollouts to 0.5 %"]
     report("Methods", columns, [row for _, rows in found for row in rows], None)

@@ -254,7 +254,7 @@ def test_forward_sensitivities(monkeypatch, written_out):
     directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
 
-    folds = (*standard()[:1], *as_folds((Quantities((TimeIntegral(), Peak(10.0))),), jnp.float64))
+    folds = (*standard()[:1], *as_folds((Quantities((TimeIntegral(), TimeIntegral("torque"), Peak(10.0))),), jnp.float64))
 
     def pushed(backend):
         return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, Run(60, "euler"), backend=backend))(scenario, varied)

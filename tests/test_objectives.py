@@ -143,12 +143,12 @@ class Square:
         return acc + sample.dt * jnp.sum(sample.dq**2)
 
     def finish(self, acc):
-        return acc, acc, jnp.ones_like(acc)
+        return acc, acc, acc[None]
 
     def curvature(self, acc, sample):
         return quantities.Outer(sample.dq, 2 * sample.dt)
 
-    def hessian(self, products, gradient, weight):
+    def hessian(self, products, pieces, slopes):
         return products
 
 
@@ -164,17 +164,18 @@ def test_a_quantity_of_ones_own_passes():
 @pytest.mark.parametrize(
     ("methods", "words"),
     [
-        ({"finish": lambda self, acc: acc}, ("finish(acc)", "(smooth value, exact value, weight for `hessian`)")),
-        ({"finish": lambda self, acc: (acc, acc, jnp.ones(2))}, ("the weight of finish(acc)", "shape (2,)")),
+        ({"finish": lambda self, acc: acc}, ("finish(acc)", "(smooth value, exact value, pieces)")),
+        ({"finish": lambda self, acc: (acc, acc, acc)}, ("the pieces of finish(acc)", "shape ()")),
+        ({"finish": lambda self, acc: (acc, acc, 2 * acc[None])}, ("the largest of its pieces", "is not its exact value")),
         ({"update": lambda self, acc, sample: acc + sample.dq}, ("update(acc, sample)", "carried by a scan")),
         ({"curvature": lambda self, acc, sample: sample.dq}, ("curvature(acc, sample)", "iblf_jax.engine.derivatives.Outer")),
-        ({"hessian": lambda self, products, gradient, weight: products[0]}, ("hessian gives shape", "(D, D)")),
-        ({"hessian": lambda self, products, gradient, weight: jnp.triu(products)}, ("not symmetric",)),
-        ({"finish": lambda self, acc: (jnp.sqrt(acc), acc, acc)}, ("derivative is NaN on a run without any error",)),
-        ({"finish": lambda self, acc: (jax.lax.stop_gradient(acc), acc, acc)}, ("differs from its finite difference",)),
+        ({"hessian": lambda self, products, pieces, slopes: products[0]}, ("hessian gives shape", "(D, D)")),
+        ({"hessian": lambda self, products, pieces, slopes: jnp.triu(products)}, ("not symmetric",)),
+        ({"finish": lambda self, acc: (jnp.sqrt(acc), acc, acc[None])}, ("derivative is NaN on a run without any error",)),
+        ({"finish": lambda self, acc: (jax.lax.stop_gradient(acc), acc, acc[None])}, ("differs from its finite difference",)),
         ({"init": lambda self, sample: jnp.zeros((), "float64")}, ("the smooth value is float64 for float32 arguments",)),
     ],
-    ids=["bare", "weight", "grows", "not-outer", "row", "triangle", "root", "stopped", "float64"],
+    ids=["bare", "pieces", "largest", "grows", "not-outer", "row", "triangle", "root", "stopped", "float64"],
 )
 def test_broken_quantities(methods, words):
     rejects(changed(**methods), *words, duration=0.5)

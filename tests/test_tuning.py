@@ -1,5 +1,7 @@
 """Gain tuning: derivatives, objectives, coordinates, the loop, and the truth of its report."""
 
+import dataclasses
+import itertools
 import os
 import signal
 import subprocess
@@ -18,8 +20,8 @@ from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning import _tune, problem
-from iblf_jax.tuning.newton import box_step
+from iblf_jax.tuning import _tune, problem, quadratic
+from iblf_jax.tuning.newton import Newton, Pieces
 from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -86,7 +88,8 @@ def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     expected = 2 * SHORT["dt"] * np.einsum("utn,vtn->uv", J, J)
     only = ij.objectives.Objective((nominal.shared.objective.terms[0],))
     shared = nominal.shared._replace(objective=only)
-    one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), formulation=nominal.formulation)
+    formulation = nominal.formulation._replace(pieces=(1, nominal.formulation.pieces[-1]))
+    one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), formulation=formulation)
     np.testing.assert_allclose(one.hessian[0] * only.terms[0].scale, expected, rtol=1e-5, atol=1e-9 * np.max(expected))
     assert np.all(np.isfinite(found.hessian))
 
@@ -116,7 +119,7 @@ def test_quantities_are_what_numpy_makes_of_the_records(paper):
         TimeIntegral("torque_rate"),
         TimeIntegral("outside", tolerance=0.05),
         Peak(10.0, "torque"),
-        Peak(0.1, "deficit", smoothing=0.05),
+        Peak(0.1, "deficit", smoothing=0.05, windows=[0.1, 0.2]),
         Peak(0.1, "error", after=0.1),
     )
     run = ij.simulate(paper, metrics=(Quantities(parts),), **SHORT)
@@ -134,8 +137,12 @@ def test_quantities_are_what_numpy_makes_of_the_records(paper):
     ]
     np.testing.assert_allclose(run.metrics["tuning_exact"], expected, rtol=1e-9)
     T = 0.1 * 0.05
-    both = np.concatenate([run.lower - run.q, run.q - run.upper], axis=1) / T
-    np.testing.assert_allclose(run.metrics["tuning_smooth"][5], T * np.logaddexp.reduce(np.ravel(both)), rtol=1e-9)
+    edges = [0.0, *np.asarray(parts[5].windows), np.inf]
+    both = np.concatenate([run.lower - run.q, run.q - run.upper], axis=1)
+    pieces = np.stack([np.max(both[(t >= a - 1e-9) & (t < b - 1e-9)], axis=0) for a, b in itertools.pairwise(edges)])
+    np.testing.assert_allclose(run.metrics["tuning_smooth"][5], T * np.logaddexp.reduce(np.ravel(pieces) / T), rtol=1e-9)
+    first = 4 + 4  # the integrals, one each, and the torque of two joints with both signs
+    np.testing.assert_allclose(run.metrics["tuning_pieces"][first : first + 12], pieces.ravel(), rtol=1e-9)
     assert np.all(np.asarray(run.metrics["tuning_smooth"])[4:] >= np.asarray(run.metrics["tuning_exact"])[4:])
 
 
@@ -193,17 +200,67 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
         layout(canonical(paper), [ij.tunable("controller.k1", 3.0, 4.0)], 1e-3, "rk4")
 
 
-def test_box_step_solves_the_quadratic_programme():
+def test_a_quadratic_programme_is_solved_with_its_multipliers():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        A = rng.normal(size=(5, 5))
-        B, g = A @ A.T + 0.1 * np.eye(5), rng.normal(size=5)
-        step, drop = box_step(g, B, np.full(5, -0.3), np.full(5, 0.5))
-        slope = g + B @ step
-        free = (step > -0.3 + 1e-9) & (step < 0.5 - 1e-9)
-        assert np.all(np.abs(slope[free]) < 1e-8)
-        assert np.all(slope[step <= -0.3 + 1e-9] > -1e-8)
-        assert drop > 0
+        root, c, A = rng.normal(size=(3, 5)), rng.normal(size=5), rng.normal(size=(8, 5))
+        H, A, b = root.T @ root, np.concatenate([A, np.eye(5), -np.eye(5)]), np.concatenate([rng.uniform(0.1, 1, 8), np.full(10, 0.5)])
+        x, y = quadratic.solve(H, c, A, b)
+        slack = b - A @ x
+        np.testing.assert_allclose(H @ x + c + A.T @ y, 0.0, atol=1e-8)
+        assert np.all(slack > -1e-9) and np.all(y >= 0) and np.max(y * slack) < 1e-8
+
+
+class TwoPieces:
+    """An evaluator of (z0 - 2)^2 + (z1 - 2)^2 with g = the larger of z0^2 + z1^2 - 1 and z0 - `most`, in each of two runs, the second
+    of which is further from its limit."""
+
+    def __init__(self, most):
+        self.most = most
+
+    def __call__(self, z):
+        loss, slope, none = np.sum((z - 2) ** 2, axis=1), 2 * (z - 2), z[:, :0]
+        g = np.stack([np.sum(z**2, axis=1) - 1, z[:, 0] - self.most], axis=1)
+        a = np.stack([2 * z, np.stack([np.ones(len(z)), np.zeros(len(z))], axis=1)], axis=2)
+        value = problem.Value(loss, loss, loss[:, None], none, none, loss, loss < np.inf, none)
+        two = np.stack([g, g - 0.5], axis=1), np.stack([a, a], axis=1)
+        return problem.Slope(value, slope, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), *two)
+
+
+@pytest.mark.parametrize(("share", "shift"), [(0.0, 0.0), (1.0, 0.25)], ids=["every run", "the mean of both"])
+@pytest.mark.parametrize("most", [0.2, 5.0], ids=["corner", "circle"])
+def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
+    """The optimum on a circle, and at the corner of a circle and a line; moved outwards where the mean of two runs counts."""
+    box = Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0))
+    method = Newton(box, 1e-10, limits=Pieces.of((2,), (share,), 2), runs=2)
+    state = method.init(np.array([[3.0, -1.0]]))
+    for _ in range(12):
+        method.step(TwoPieces(most), state)
+    radius, x = np.sqrt(1 + shift), most + shift
+    point = np.array([x, np.sqrt(radius**2 - x**2)]) if x < radius / np.sqrt(2) else np.full(2, radius / np.sqrt(2))
+    np.testing.assert_allclose(state["z"][0], point, atol=2e-5)
+    gradients = np.array([2 * point, [1.0, 0.0]]).T
+    y = np.linalg.lstsq(gradients if x < radius / np.sqrt(2) else gradients[:, :1], 2 * (2 - point), rcond=None)[0]
+    assert state["prices"][0, 0] == pytest.approx(y.sum(), rel=1e-3)
+    assert state["done"][0] and np.all(state["residuals"][0] < 1e-3)
+
+
+def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
+    """The circle and z0 > 1.5, another requirement: between them the sum of both is least at the end of the circle."""
+
+    class Both(Pieces):
+        def __call__(self, z):
+            found = super().__call__(z)
+            found.excess[:, :, 1], found.slopes[:, :, :, 1] = 1.5 - z[:, :1], np.array([-1.0, 0.0])
+            return found
+
+    method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-8, limits=Pieces.of((1, 1), (0.0, 0.0), 2), runs=2)
+    state = method.init(np.array([[0.3, -0.7]]))
+    for _ in range(40):
+        method.step(Both(5.0), state)
+    assert state["done"][0]
+    np.testing.assert_allclose(state["z"][0], [1.0, 0.0], atol=1e-4)
+    assert state["residuals"][0, 1] == pytest.approx(0.5, abs=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------------------------- the loop
@@ -244,6 +301,46 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
     best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
     assert 11.0 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 12.0
+
+
+@pytest.mark.slow
+def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
+    """Against the optima themselves, with the limit moved by 1 % to both sides; few values are needed for each."""
+    gains = ["controller.k1", "controller.K2"]
+
+    def tuned(limit):
+        wanted = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(limit)
+        return ij.tune(paper, gains, wanted, tolerance=1e-7, **SHORT)
+
+    tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
+    price = (tight.objective - loose.objective) / 0.18
+    assert best.prices == pytest.approx({"peak torque < 9 N m": price}, rel=0.02)
+    assert price > 1e-3 and best.stopped == "converged" and best.evaluations <= 30
+    assert 8.99 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 9.0
+    assert f"would fall by {best.prices['peak torque < 9 N m']:.3g} for each N m" in str(best.report)
+    gradient, excess, complementarity = best.residuals
+    assert gradient < 1e-2 * best.objective and excess == 0 and complementarity < 1e-4
+    assert "dt / 2: objective" in str(best.report)
+
+
+@pytest.mark.slow
+def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
+    """Gravity alone takes more than 2 N m.  Beside it, what else a reader is warned of."""
+    wanted = objectives.tracking() + 0.3 * objectives.effort() + objectives.peak_torque_below(2.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, **SHORT)
+    peak = float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque))
+    assert best.stopped == "the requirements cannot be kept together near these gains"
+    assert f"fail; {peak:.5g} N m, {peak - 2:.3g} N m above the limit" in str(best.report)
+    for factor in (0.9, 1.1):  # no gains near these break them less
+        for path, value in best.values.items():
+            near = np.maximum(value * factor, 0.505)
+            assert np.max(ij.simulate(ij.with_parameters(best.scenario, {path: near}), **SHORT).metrics.peak_torque) > peak - 1e-3
+    assert best.prices == {}
+    priceless = ij.tune(paper, ["controller.k1"], objectives.tracking(), iterations=1, **SHORT)
+    assert any("no price on torque" in line for line in priceless.notes)
+    assert any("WARNING: not converged: give more iterations than 1" in line for line in priceless.notes)
+    far = dataclasses.replace(priceless, values={"controller.k1": np.array([2.0, 210.0])})
+    assert [line for line in far.notes if "controller.k1[1] ended at 105 times its start" in line]
 
 
 def plain_status(scenario):
@@ -387,7 +484,7 @@ def test_lbfgs_tunes_the_paper_as_well_as_newton(paper):
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
     assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["valid"][-1].all()
-    with pytest.raises(ValueError, match="Take a smaller dt"):
+    with pytest.raises(ValueError, match=r"Take dt=\S+, not 0.001 s"):
         ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
 
 

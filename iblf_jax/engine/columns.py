@@ -182,9 +182,9 @@ def outer_vectors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax
     return [outer.vector for outer in outers_of(folds, begun, sample)]
 
 
-def _factors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[tuple[jax.Array, jax.Array]]:
-    """And what they are summed up with."""
-    return [(jnp.broadcast_to(o.weight, o.vector.shape), jnp.asarray(o.decay, o.vector.dtype)) for o in outers_of(folds, begun, sample)]
+def _weights(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Array]:
+    """And their weights."""
+    return [jnp.broadcast_to(outer.weight, outer.vector.shape) for outer in outers_of(folds, begun, sample)]
 
 
 def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
@@ -202,16 +202,10 @@ def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run
     along = jax.vmap(lambda unit: jax.jvp(leaves_at, (zero,), (unit,))[1])(units)
     every = 1 if any(hasattr(fold, "curvatures") for fold in inputs.folds) else None
     run = run._replace(record_every=every)
-    outcome, factors = run_step(executor, batch, TimeStep(run.method, _factors if every else None), run)
+    outcome, weights = run_step(executor, batch, TimeStep(run.method, _weights if every else None), run)
     step = TangentStep(TimeStep(run.method, outer_vectors if every else None), (places,))
     found, tangents = _stepped(executor, batch, step, [along], run)
     still = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
     nothing = {name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype) for name, x in still.items()}
-    return Tangents(outcome, nothing | tangents, tuple(_product(y, *f) for y, f in zip(found, factors, strict=True)))
-
-
-def _product(y: jax.Array, weight: jax.Array, decay: jax.Array) -> jax.Array:
-    """sum_k weight_k prod_{j > k} decay_j y_k y_k^T, (R, P, P), from tangents (R, P, T, m), weights (R, T, m) and decays (R, T)."""
-    later = jnp.cumprod(decay[:, ::-1], axis=1)[:, ::-1]
-    later = jnp.concatenate([later[:, 1:], jnp.ones_like(later[:, :1])], axis=1)
-    return jnp.einsum("rptm,rtm,rqtm->rpq", y, weight * later[..., None], y)
+    products = [jnp.einsum("rptm,rtm,rqtm->rpq", y, weight, y) for y, weight in zip(found, weights, strict=True)]
+    return Tangents(outcome, nothing | tangents, tuple(products))

@@ -35,14 +35,12 @@ FLAG_FIELDS = ("guard_active", "saturated")
 
 
 class Outer(NamedTuple):
-    """What one sample adds to a curvature matrix: N <- decay N + sum_i weight_i y_iu y_iv, y_u the tangent of `vector`."""
+    """What one sample adds to a curvature matrix: N <- N + sum_i weight_i y_iu y_iv, y_u the tangent of `vector`."""
 
     vector: jax.Array
     """y, (m,)."""
     weight: jax.Array
     """(m,) or ()."""
-    decay: jax.Array | float = 1.0
-    """()."""
 
 
 class Tangents(NamedTuple):
@@ -194,11 +192,11 @@ class DerivativeStep:
             loop = evaluate if not form.scalar else preaccumulated(inputs.scenario, self.directions, eps, before.state)
             after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
             outer = outers_of(inputs.folds, begun, sample)
-            return (floats_of_carry(after)[0], [o.vector for o in outer]), (after, [(o.weight, o.decay) for o in outer])
+            return (floats_of_carry(after)[0], [o.vector for o in outer]), (after, [o.weight for o in outer])
 
-        _, (tangents, vectors), (after, factors) = pushed(one, self.directions, inputs.scenario, carry, inputs.dt.dtype)
-        terms = zip(carry.products, vectors, factors, strict=True)
-        products = [decay * N + jnp.sum(weight * y[rows] * y[columns], axis=-1) for N, y, (weight, decay) in terms]
+        _, (tangents, vectors), (after, weights) = pushed(one, self.directions, inputs.scenario, carry, inputs.dt.dtype)
+        terms = zip(carry.products, vectors, weights, strict=True)
+        products = [N + jnp.sum(weight * y[rows] * y[columns], axis=-1) for N, y, weight in terms]
         return Differentiated(after, tangents, products), ()
 
 

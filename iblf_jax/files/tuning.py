@@ -181,6 +181,10 @@ def _objective(terms: Any, requirements: Any) -> Objective:
 # ------------------------------------------------------------------------------------------------------------- saved results
 
 
+RESULT = ("names", "best_start", "stopped", "optimiser", "mode", "seconds", "multipliers", "residuals")
+"""Fields of a result that are words and numbers."""
+
+
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     target, setup = checks.file_to_write("path", path), result.setup
@@ -195,7 +199,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
         "perturbations": {key: components.encode_fields(x, key) for key, x in setup.perturbations.items()},
-        **{name: getattr(result, name) for name in ("names", "best_start", "stopped", "optimiser", "mode", "seconds")},
+        **{name: getattr(result, name) for name in RESULT},
         "report": result.report.to_dict(),
     }
     temporary = target.with_name(f".{target.name}.partial")
@@ -260,4 +264,17 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         raise checks.fail("history", Words("arrays that do not fit each other"), f"(steps, starts, ...) of {len(names)} numbers")
     best = checks.positive_integer("best_start", data["best_start"], least=0, most=starts - 1)
     seconds = checks.positive_number("seconds", data["seconds"], "s", zero=True)
-    return TuneResult(with_parameters(start, values), start, values, names, history, best, seconds=seconds, setup=setup, **words)
+    ends = [tuple(float(x) for x in data[name]) for name in ("multipliers", "residuals")]
+    return TuneResult(
+        with_parameters(start, values),
+        start,
+        values,
+        names,
+        history,
+        best,
+        seconds=seconds,
+        setup=setup,
+        multipliers=ends[0],
+        residuals=ends[1],
+        **words,
+    )

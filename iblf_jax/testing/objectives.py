@@ -81,7 +81,9 @@ def _quantity(findings: Findings, quantity: Any, duration: float) -> None:
     findings.require(np.all(np.isfinite(exact)), f"the exact value is not finite on an ordinary run: {np.asarray(exact)}")
     probe(findings, outputs, fold, (moving,))
     at_rest(findings, fold, some)
-    if hasattr(quantity, "curvature"):
+    largest = np.max(jax.jit(folded)(fold, some)["tuning_pieces"])
+    findings.require(np.allclose(largest, exact), f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}")
+    if hasattr(quantity, "hessian"):
         _second_order(findings, quantity, moving, flags)
 
 
@@ -96,12 +98,16 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
     result = shape_of(findings, "finish(acc)" + kind, quantity.finish, acc)
     three = isinstance(result, tuple) and len(result) == 3
     if result is not None and findings.require(
-        three, f"finish(acc) gives {type(result).__name__}", "It must be (smooth value, exact value, weight for `hessian`), () each"
+        three, f"finish(acc) gives {type(result).__name__}", "It must be (smooth value, exact value, pieces)"
     ):
-        for name, value in zip(("smooth value", "exact value", "weight"), result, strict=True):
+        for name, value in zip(("smooth value", "exact value"), result[:2], strict=True):
             has_shape(findings, f"the {name} of finish(acc){kind}", value, ())
-    both = hasattr(quantity, "curvature") == hasattr(quantity, "hessian")
-    findings.require(both, "it has one of `curvature` and `hessian`", "Second-order methods need both; without, leave both out")
+        shape = getattr(result[2], "shape", ())
+        findings.require(
+            len(shape) == 1, f"the pieces of finish(acc){kind} have shape {shape}", "They must be (m,): value[None] if it is one"
+        )
+    matrix = hasattr(quantity, "hessian") or not hasattr(quantity, "curvature")
+    findings.require(matrix, "it has `curvature` without `hessian`", "Second-order methods need both")
     if not hasattr(quantity, "curvature"):
         return
     outer = shape_of(findings, "curvature(acc, sample)" + kind, quantity.curvature, acc, first)
@@ -124,28 +130,27 @@ def _second_order(findings: Findings, quantity: Any, moving: dict[str, jax.Array
     def matrix(quantity, moving, directions):
         def run(moving):
             def one(acc, sample):
-                outer = quantity.curvature(acc, sample)
-                kept = outer.vector, jnp.broadcast_to(outer.weight, outer.vector.shape), jnp.asarray(outer.decay, sample.t.dtype)
-                return quantity.update(acc, sample), kept
+                none = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
+                outer = quantity.curvature(acc, sample) if hasattr(quantity, "curvature") else none
+                return quantity.update(acc, sample), (outer.vector, jnp.broadcast_to(outer.weight, outer.vector.shape))
 
             run = samples_from(moving, flags)
             acc, kept = jax.lax.scan(one, quantity.init(jax.tree.map(lambda x: x[0], run)), run)
-            smooth, _, weight = quantity.finish(acc)
-            return (smooth, kept[0]), (kept[1], kept[2], weight)
+            pieces = quantity.finish(acc)[2]
+            return (pieces, kept[0]), (kept[1], pieces)
 
         def along(direction):
             _, pushed, rest = jax.jvp(run, (moving,), (direction,), has_aux=True)
             return pushed, rest
 
-        (gradient, vectors), (weights, decays, weight) = jax.vmap(along, out_axes=(0, None))(directions)
-        left = jnp.concatenate([jnp.cumprod(decays[::-1])[::-1][1:], jnp.ones(1)])  # of a sample's part at the end
-        products = jnp.einsum("utm,vtm,tm,t->uv", vectors, vectors, weights, left)
-        return quantity.hessian(products, gradient, weight)
+        (slopes, vectors), (weights, pieces) = jax.vmap(along, out_axes=(0, None))(directions)
+        products = jnp.einsum("utm,vtm,tm->uv", vectors, vectors, weights)
+        return quantity.hessian(products, pieces, slopes)
 
     try:
         found = np.asarray(matrix(quantity, moving, directions))
     except Exception as error:
-        findings.add(f"hessian(products, gradient, weight) raised {type(error).__name__}: {str(error).splitlines()[0]}")
+        findings.add(f"hessian(products, pieces, slopes) raised {type(error).__name__}: {str(error).splitlines()[0]}")
         return
     if not findings.require(
         found.shape == (DIRECTIONS, DIRECTIONS), f"hessian gives shape {found.shape}", "It must be (D, D) for products (D, D)"

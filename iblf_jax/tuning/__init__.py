@@ -6,7 +6,7 @@
 
 `parameters`  which leaves, within which limits, in which coordinates      `quantities`, `objectives`  what for
 `robust`      one number from many perturbed runs                          `problem`      the compiled loss and its derivatives
-`newton`, `first_order`  how to step                                       `optimise`     the loop: multipliers, best so far, resume
+`newton`, `quadratic`, `first_order`  how to step                          `optimise`     the loop: best so far, resume
 `report`      the verdict, on fresh runs if perturbed                      `_pareto`, `_falsify`  fronts, and attacks on a result
 """
 

@@ -140,7 +140,7 @@ def pareto(
     lanes = problem.lanes(z)._replace(weights=jnp.asarray(np.stack([share, 1 - share], axis=1), problem.shared.dt.dtype))
     loop = Loop(
         CountedProblem(problem.formulation, problem.shared, lanes, "forward"),
-        make_method("newton", problem.box, iterations, tolerance, 0.1),
+        make_method("newton", problem.box, iterations, tolerance, 0.1, problem.limits, problem.runs),
         z,
     )
     loop.rescue = partial(way_in, problem, seed)

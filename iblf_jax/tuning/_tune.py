@@ -22,13 +22,14 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, targets_of
+from iblf_jax.studies.recommended import recommended_dt
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.first_order import LBFGS, Adam
-from iblf_jax.tuning.newton import Newton
+from iblf_jax.tuning.newton import Newton, Pieces
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import NUMBERS_A_RUN, Formulation, Lane, ProblemInputs, Slope, gradient, slope, value
+from iblf_jax.tuning.problem import NUMBERS_A_RUN, Formulation, Lane, ProblemInputs, Slope, gradient, piece_counts, slope, value
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
@@ -37,6 +38,8 @@ SPREAD = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a factor e for gains."""
 MOST_SHARPENINGS = 60
 """Past them the smoothing is no number in float32."""
+INFEASIBLE = "the requirements cannot be kept together near these gains"
+"""Why a tuning stopped that converged to gains that break a requirement as little as can be."""
 SCREENED = 32
 """Points that are looked at where the first start leaves its bounds."""
 
@@ -87,13 +90,14 @@ def tune(
       resample: draw the runs anew at every step (adam only); the same ones for all steps otherwise.
       method: integrator.
       backend: what values and forward mode run on, as in `monte_carlo`.  Reverse mode is plain XLA.
-      optimiser: "newton" (Gauss-Newton in a trust region), "lbfgs", "adam", or "auto": newton where forward mode is used, else lbfgs, and
-        adam where runs are resampled.
+      optimiser: "newton" (sequential quadratic programming with Gauss-Newton matrices, in a trust region; requirements are constraints of
+        it), "lbfgs" and "adam" (requirements are penalties), or "auto": newton where forward mode is used, else lbfgs, and adam where
+        runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
       starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch; at each
         sharpening the better half goes on.
-      sharpenings: how many times the smoothing of the objective's peaks is divided by 4, each time once the starts have converged; 0 where
-        nothing is smoothed, and with adam.
+      sharpenings: how many times the smoothing of the peaks in the objective's terms is divided by 4, each time once the starts have
+        converged; 0 where no term is smoothed, and with adam.  Requirements are exact from the start.
       iterations: steps of the optimiser at most.
       tolerance: relative change of the loss below which a start has converged.
       patience: stop (before the last sharpening: sharpen) after so many steps without a better result.
@@ -135,14 +139,15 @@ def tune(
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = starting_points(problem.box, starts, seed)
+    method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate, problem.limits, problem.runs)
     # The line search of L-BFGS is a loop of JAX's around the problem.
-    evaluator = CountedProblem(problem.formulation._replace(nested=optimiser == "lbfgs"), problem.shared, problem.lanes(z), mode)
-    method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate)
+    formulation = problem.formulation._replace(nested=optimiser == "lbfgs", penalised=method_.penalised)
+    evaluator = CountedProblem(formulation, problem.shared, problem.lanes(z), mode)
     stages = sharpenings if method_.converges and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
     loop.rescue = partial(way_in, problem, seed)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
-    mark = fingerprint(problem.formulation, problem.shared, options)
+    mark = fingerprint(formulation, problem.shared, options)
     if checkpoint is not None and checkpoint.exists():
         load_checkpoint(checkpoint, loop, mark)
     with bar(progress, iterations, int(loop.state["iteration"]), unit="steps") as shown:
@@ -155,7 +160,8 @@ def tune(
                 callback(loop)
 
         stopped = loop.run(iterations, tolerance=tolerance, patience=patience, on_step=on_step)
-    _check_found(loop, problem)
+    if not np.any(np.isfinite(loop.state["best_key"])):
+        raise problem.too_stiff()
     setup = TuneSetup(
         problem.shared.objective,
         dict(perturbations or {}),
@@ -177,8 +183,25 @@ def tune(
 class Problem:
     """A tuning problem, checked and ready to be evaluated."""
 
-    def __init__(self, formulation: Formulation, shared: ProblemInputs, box: Box, runs: int):
+    def __init__(self, formulation: Formulation, shared: ProblemInputs, box: Box, runs: int, step: Callable[[], float]):
         self.formulation, self.shared, self.box, self.runs = formulation, shared, box, runs
+        self.step = step
+        """Looks for a time step that will do, which takes some runs."""
+
+    def too_stiff(self) -> ValueError:
+        """The error of a problem in which no gains that were tried have runs that can be integrated; it names a step that will do."""
+        return checks.fail(
+            "scenario",
+            "gains with which no run could be integrated to its end",
+            "a start whose runs are all finite and within the step's stability",
+            f"Take dt={self.step():g}, not {float(self.shared.dt):g} s (ij.recommended_dt), lower gains, or narrower perturbations.",
+        )
+
+    @property
+    def limits(self) -> Pieces:
+        """The requirements, as `newton` sees them."""
+        own = self.formulation.pieces[len(self.shared.objective.terms) : -1]
+        return Pieces.of(own, self.formulation.shares, self.runs)
 
     def lanes(self, z: np.ndarray) -> Lane:
         """Lanes at z, (S, p): the same runs for all, no multipliers yet."""
@@ -209,8 +232,13 @@ def build(
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
     backend, mechanism = timing.get("backend", "auto"), mechanism_of(scenario)
-    formulation = Formulation(blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, backend, mechanism=mechanism)
-    problem = Problem(formulation, ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step), box, runs)
+    pieces = piece_counts(ones, scenario, float(timing["duration"]))
+    formulation = Formulation(
+        blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, backend, mechanism=mechanism, pieces=pieces
+    )
+    inputs = ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step)
+    again = {"duration": timing["duration"], "method": timing["method"], "perturbations": perturbations, "seed": seed}
+    problem = Problem(formulation, inputs, box, runs, partial(recommended_dt, scenario, **again))
     if not is_complete(goal):
         derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient
         start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), formulation=formulation).value.exact[0])
@@ -234,10 +262,12 @@ def choose(mode: str, optimiser: str, size: int, resample: bool) -> tuple[str, s
     return mode, optimiser
 
 
-def make_method(optimiser: str, box: Box, iterations: int, tolerance: float, learning_rate: float) -> Any:
+def make_method(
+    optimiser: str, box: Box, iterations: int, tolerance: float, learning_rate: float, limits: Pieces | None = None, runs: int = 1
+) -> Any:
     """The optimiser by name."""
     if optimiser == "newton":
-        return Newton(box, tolerance)
+        return Newton(box, tolerance, limits=limits, runs=runs)
     return LBFGS(box, tolerance) if optimiser == "lbfgs" else Adam(box, iterations, learning_rate)
 
 
@@ -253,6 +283,9 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
 
     Past the wall the motion is chaotic, and its gradient points nowhere.  So SCREENED points of the box are looked at, values
     only, and the starts are those that break the requirements and the bounds least.
+
+    Raises:
+      ValueError: none of them can be integrated; the message names a step that will do.
     """
     if found.value.valid[0] and found.value.margin[0] > 0:
         return None
@@ -262,6 +295,8 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
     seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), formulation=problem.formulation))
     broken = np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
+    if not np.any(seen.valid):
+        raise problem.too_stiff()
     order = np.lexsort((seen.objective, broken, ~seen.valid))
     return points[order[: len(z)]]
 
@@ -273,16 +308,6 @@ def _show(shown: Any, loop: Loop) -> None:
     shown.set_postfix_str(f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin {last['margin'][s]:.3g} rad")
 
 
-def _check_found(loop: Loop, problem: Problem) -> None:
-    if not np.any(np.isfinite(loop.state["best_key"])):
-        raise checks.fail(
-            "scenario",
-            "gains with which no run could be integrated to its end",
-            "a start whose runs are finite and within the step's stability",
-            f"Take a smaller dt than {float(problem.shared.dt):g} s (ij.recommended_dt), lower gains, or narrower perturbations.",
-        )
-
-
 def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
     """Coordinates z, (..., p), as numbers in the units of their leaves."""
     log = np.concatenate([np.full(b.size, b.log) for b in blocks])
@@ -291,7 +316,14 @@ def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
 
 def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
     state, blocks = loop.state, problem.formulation.blocks
-    best = min(range(len(state["best_key"])), key=lambda s: tuple(state["best_key"][s]))
+    best = loop.best
+    broken = float(np.sum(np.maximum(state["best_excess"][best], 0.0)))
+    if stopped == "converged" and broken > 0:
+        stopped = INFEASIBLE
+    prices, residuals = (), ()
+    if broken == 0:  # where the requirements cannot be kept, the multipliers are those of breaking them
+        prices = state["lam"][best] if loop.penalised else state["method"]["prices"][best]
+        residuals = () if loop.penalised else state["method"]["residuals"][best]
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
     history = {name: np.stack(x) for name, x in loop.history.items()}
     history["x"] = _in_units(blocks, history["z"])
@@ -308,4 +340,6 @@ def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimi
         mode=mode,
         seconds=seconds,
         setup=setup,
+        multipliers=tuple(map(float, prices)),
+        residuals=tuple(map(float, residuals)),
     )

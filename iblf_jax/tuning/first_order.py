@@ -31,6 +31,7 @@ class Adam:
     """Adam for S starts at once, with a cosine schedule; its state is a dict of arrays."""
 
     converges = False
+    penalised = True
 
     def __init__(self, box: Box, iterations: int, learning_rate: float = 0.1, schedule: str = "cosine"):
         self.box = box
@@ -72,6 +73,7 @@ class LBFGS:
     """L-BFGS of optax with its zoom line search, one start after another; its state is a dict of arrays."""
 
     converges = True
+    penalised = True
 
     def __init__(self, box: Box, tolerance: float = 1e-6, memory: int = 10, line_steps: int = 12):
         self.box, self.tolerance = box, tolerance

@@ -12,7 +12,7 @@ runs).  A requirement holds where
 
     g = (value - limit) / scale < 0        (its sign turned for "above" requirements);
 
-in the loss g is driven below zero by an augmented Lagrangian (`optimise`), in the report it passes or fails, with a confidence.
+the tuning keeps g below zero (`newton`), in the report it passes or fails, with a confidence.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, leaf, static
-from iblf_jax.simulation.metrics import Fold
+from iblf_jax.simulation.metrics import Fold, Settling, Tracking
 from iblf_jax.tuning.quantities import MetricResult, Peak, Quantity, TimeIntegral
 
 
@@ -94,6 +94,12 @@ class Requirement:
     def excess(self, x: jax.Array) -> jax.Array:
         """g: below zero where the requirement holds."""
         return (x - self.limit) / self.scale
+
+    @property
+    def measure(self) -> tuple[float, str]:
+        """Sign and unit with which its numbers are shown: a deficit is shown as a margin."""
+        signal = getattr(self.quantity, "signal", "")
+        return -1.0 if signal == "deficit" else 1.0, getattr(self.quantity, "units", {}).get(signal, "")
 
     def __add__(self, other: Any) -> Objective:
         return Objective((), (self,)) + other
@@ -190,7 +196,7 @@ def _completed(t: Term, x: Any) -> Term:
 
 
 def sharper(objective: Objective, factor: float) -> Objective:
-    """The objective with the smoothing of every peak in it multiplied by a factor; all else, and the structure, stays."""
+    """The objective with the smoothing of every peak in its terms multiplied by a factor; all else, and the structure, stays."""
 
     def mended(part: Any) -> Any:
         smoothing = getattr(part.quantity, "smoothing", None)
@@ -199,12 +205,22 @@ def sharper(objective: Objective, factor: float) -> Objective:
         return dataclasses.replace(part, quantity=dataclasses.replace(part.quantity, smoothing=factor * smoothing))
 
     objective = _composed(objective)
-    return Objective(tuple(map(mended, objective.terms)), tuple(map(mended, objective.requirements)))
+    return Objective(tuple(map(mended, objective.terms)), objective.requirements)
 
 
 def is_smoothed(objective: Objective) -> bool:
-    """Whether a quantity of the objective is smoothed, so that `sharper` changes it."""
-    return any(getattr(quantity, "smoothing", None) is not None for quantity in _composed(objective).quantities)
+    """Whether a term of the objective is smoothed, so that `sharper` changes it."""
+    return any(getattr(term.quantity, "smoothing", None) is not None for term in _composed(objective).terms)
+
+
+def has_price_on_torque(objective: Objective) -> bool:
+    """Whether a term or a requirement grows with the torque; a metric of the user's own is taken for one that does."""
+    quantities = _composed(objective).quantities
+    return any(getattr(q, "signal", "torque") in ("torque", "torque_rate") for q in quantities if not _of_the_error(q))
+
+
+def _of_the_error(quantity: Quantity) -> bool:
+    return isinstance(quantity, MetricResult) and isinstance(quantity.fold, Tracking | Settling)
 
 
 def _one_term(name: str, quantity: Quantity, scale: Any) -> Objective:

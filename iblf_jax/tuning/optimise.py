@@ -1,16 +1,18 @@
 """The loop of a tuning: steps of a method, multipliers, sharper and sharper peaks, the best so far, early stop, checkpoint and resume.
 
-Requirements are driven in by an augmented Lagrangian: whenever a start has converged (or after INNER steps),
+The default method (`newton`) takes the requirements as they are.  Methods that know one loss only (`penalised`) have them driven in by an
+augmented Lagrangian: whenever a start has converged (or after INNER steps),
 
     lam <- max(0, lam + mu G),     mu <- 5 mu where the largest G has not fallen to a quarter,
 
 so a start that breaks them finds its way in while the penalty stays finite everywhere.  The best so far is the one with the lowest
-objective among those that keep the requirements and the bounds, or, while none does, the one that breaks them least.
+objective among those that keep the requirements and the bounds, or, while none does, the one that breaks them least, their G added up.
 
-The smooth maximum in the loss lies above the maximum by smoothing times a logarithm, so its bottom is not where the maximum's is; but it
-is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once all starts have converged at the
-tolerance ROUGH (or after INNER steps, HASTY where several are left to choose from), the smoothing is divided by SHARPER, the better half of
-the starts goes on and the others are given up.  What counts as the best is judged without smoothing throughout.
+A peak in the objective is smoothed in the loss.  The smooth maximum lies above the maximum by smoothing times a logarithm, so its bottom is
+not where the maximum's is; but it is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once
+all starts have converged at the tolerance ROUGH (or after INNER steps, HASTY where several are left to choose from), the smoothing is
+divided by SHARPER, the better half of the starts goes on and the others are given up.  What counts as the best is judged without
+smoothing throughout.
 
 A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
 from there and gives the same numbers, bit by bit, as one that was not.
@@ -133,6 +135,7 @@ class Loop:
             "best_terms": np.full((starts, terms), np.nan),
             "best_excess": np.full((starts, count), np.nan),
         }
+        self.penalised = method.penalised
         self.history: dict[str, list[np.ndarray]] = {}
         self.rescue: Callable[[np.ndarray, Slope], np.ndarray | None] = lambda z, found: None
         """Called with the first step's points and what they gave; better starting points, or None."""
@@ -153,6 +156,11 @@ class Loop:
             self._step(tolerance)
             on_step(self)
         return "converged" if np.all(state["finished"]) else "iterations used up"
+
+    @property
+    def best(self) -> int:
+        """The start that found the best so far."""
+        return min(range(len(self.state["best_key"])), key=lambda s: tuple(self.state["best_key"][s]))
 
     def _enter(self, tolerance: float) -> None:
         """Makes loss and tolerance those of the stage that the state says."""
@@ -201,7 +209,7 @@ class Loop:
             if not found.value.valid[s]:
                 continue
             excess = found.value.exact_excess[s]
-            broken = float(np.max(np.maximum(excess, 0.0), initial=0.0)) + max(-float(found.value.margin[s]), 0.0)
+            broken = float(np.sum(np.maximum(excess, 0.0))) + max(-float(found.value.margin[s]), 0.0)
             key = (broken, float(found.value.objective[s]))
             old = state["best_key"][s]
             if not np.isfinite(key[1]) or key >= tuple(old):
@@ -236,7 +244,7 @@ class Loop:
         state["since"][s] += 1
         if state["finished"][s] or not (done or state["since"][s] >= INNER):
             return
-        if state["lam"].shape[1] == 0 or not found.value.valid[s]:
+        if not self.penalised or state["lam"].shape[1] == 0 or not found.value.valid[s]:
             state["finished"][s] = done
             return
         excess = found.value.excess[s]

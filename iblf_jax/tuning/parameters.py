@@ -31,7 +31,7 @@ CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the paper's law."""
 SHARE = 0.7
 """Part of the integrator's stability range that a gain may use up by default."""
-MOST = 1e3
+MOST = 1e2
 """How far above its start a gain may go by default, as a factor, where the step sets no limit."""
 EDGE = 1e-3
 """Distance from a limit, relative to the box, from which a squashed coordinate starts at least."""

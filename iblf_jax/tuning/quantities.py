@@ -3,15 +3,18 @@
 Two kinds cover what gains are tuned for, over a signal y(t), a vector:
 
     TimeIntegral   sum_k dt |y(t_k)|^2
-    Peak           max_k max_i y_i(t_k), in the loss as T log sum_k sum_i exp(y_i(t_k) / T), which is smooth and never below it
+    Peak           max_j p_j,   p_j the largest y_i(t_k) of one entry i of the signal within one window of time
+
+The pieces p_j are smooth where their maximum is not: a requirement on a peak is one on each of its pieces.  In a term of the objective
+the maximum is T log sum_j exp(p_j / T), which is smooth and never below it.
 
 Both also give the matrix of their second derivatives without the second derivatives of the motion (Gauss-Newton), from the tangents
-y_u of their signal (`derivatives.Outer`):
+y_u of their signal (`derivatives.Outer`) or p_ju of their pieces:
 
-    TimeIntegral   2 sum dt y_u . y_v         Peak   (sum_w y_u y_v - mean_u mean_v) / T,  w the weights of the smooth maximum
+    TimeIntegral   2 sum dt y_u . y_v         Peak   (sum_j w_j p_ju p_jv - mean_u mean_v) / T,  w the weights of the smooth maximum
 
-`MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`, `finish`, and for second-order methods
-`curvature` and `hessian`; `iblf_jax.testing.check_objective` looks at it.
+`MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`, `finish`; for second-order methods
+`hessian`, and `curvature` if that is made of tangents along the way; `iblf_jax.testing.check_objective` looks at it.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ class Quantity(Protocol):
         ...
 
     def finish(self, acc: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The smooth value, the exact one (the report's), and what `hessian` wants to know, () each."""
+        """The smooth value and the exact one (the report's), () each, and the pieces of which the exact one is the largest, (m,)."""
         ...
 
 
@@ -106,15 +109,15 @@ class TimeIntegral:
         return acc[0] + sample.dt * jnp.sum(self._at(acc, sample) ** 2), sample.tau
 
     def finish(self, acc):
-        """The integral, twice, and 1."""
-        return acc[0], acc[0], jnp.ones_like(acc[0])
+        """The integral, three times."""
+        return acc[0], acc[0], acc[0][None]
 
     def curvature(self, acc, sample: Sample) -> Outer:
         """2 dt y_u . y_v."""
         y = self._at(acc, sample)
         return Outer(y, jnp.broadcast_to(2 * sample.dt, y.shape))
 
-    def hessian(self, products: jax.Array, gradient: jax.Array, weight: jax.Array) -> jax.Array:
+    def hessian(self, products: jax.Array, pieces: jax.Array, slopes: jax.Array) -> jax.Array:
         """The sum of products itself."""
         return products
 
@@ -123,8 +126,9 @@ class TimeIntegral:
 class Peak:
     """max over time and joints of a signal (of its size for error and torque), over the samples with t >= after.
 
-    In the loss T log sum exp(y / T) with T = smoothing scale: above the maximum by at most T times the logarithm of the number of
-    samples that come within T of it.
+    Its pieces are the maxima of each entry of the signal within each window of time.  In a term of the objective it is
+    T log sum exp(piece / T) with T = smoothing scale: above the maximum by at most T times the logarithm of the number of pieces that come
+    within T of it.
 
     Args:
       scale: the size of y that matters, () in its unit, > 0.
@@ -132,6 +136,7 @@ class Peak:
       joints: weight of each joint, () or (n,) [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       smoothing: T as a part of the scale, () [1], > 0; 0.01 if not given.
+      windows: when each window of time after the first begins, (W,) [s]; one window if not given.  `tune` sets them.
     """
 
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
@@ -139,6 +144,7 @@ class Peak:
     joints: jax.Array = leaf("1", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     smoothing: jax.Array = leaf("1", sign="positive", shape="scalar", default=0.01)
+    windows: jax.Array | None = leaf("s", shape="any", default=None)
     units: ClassVar[dict[str, str]] = {name: unit for name, unit in TUNED_SIGNALS.items() if name != "outside"}
 
     def check(self) -> None:
@@ -146,42 +152,41 @@ class Peak:
         checks.one_of("Peak.signal", self.signal, tuple(self.units))
 
     def _at(self, acc, sample: Sample) -> jax.Array:
-        y = signal_of(self.signal, sample, acc[2], None)
+        y = signal_of(self.signal, sample, acc[1], None)
         if self.signal != "deficit":
             y = self.joints * y
             y = jnp.concatenate([y, -y])
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
 
-    def _weights(self, acc, sample: Sample):
-        """Scaled signal y / scale, the largest so far, the weights of this sample and the factor on what was before."""
-        y = self._at(acc, sample)
-        top = jnp.maximum(acc[0], jnp.max(jax.lax.stop_gradient(y)))
-        return y, top, jnp.exp((y - top) / self.smoothing), jnp.exp((acc[0] - top) / self.smoothing)
-
     def init(self, sample: Sample):
-        """Below everything."""
-        far = jnp.full_like(sample.t, -FAR)
-        return far, jnp.zeros_like(sample.t), sample.tau
+        """Below everything, (W, 2 n); the first torque has no predecessor but itself."""
+        count = 1 if self.windows is None else 1 + self.windows.size
+        return jnp.full((count, 2 * sample.q.size), -FAR, sample.t.dtype), sample.tau
 
     def update(self, acc, sample: Sample):
-        """Adds one sample."""
-        _, top, weights, decay = self._weights(acc, sample)
-        return top, acc[1] * decay + jnp.sum(weights), sample.tau
+        """Adds one sample to the window that it is in."""
+        y = jnp.broadcast_to(self._at(acc, sample), acc[0].shape)
+        above = y > acc[0]
+        if self.windows is not None:
+            edge = self.windows * (1 - 1e-6)
+            begun, none = sample.t >= edge, jnp.zeros((1,), bool)
+            inside = jnp.concatenate([~none, begun]) & ~jnp.concatenate([begun, none])
+            above = above & inside[:, None]
+        return jnp.where(above, y, acc[0]), sample.tau
 
     def finish(self, acc):
-        """The smooth maximum, the maximum, and the sum of weights."""
-        smooth = acc[0] + self.smoothing * jnp.log(acc[1])
-        return self.scale * smooth, self.scale * acc[0], jax.lax.stop_gradient(acc[1])
+        """The smooth maximum, the maximum, and the pieces."""
+        pieces = acc[0].ravel()
+        top = jnp.max(jax.lax.stop_gradient(pieces))
+        smooth = top + self.smoothing * jnp.log(jnp.sum(jnp.exp((pieces - top) / self.smoothing)))
+        return self.scale * smooth, self.scale * top, self.scale * pieces
 
-    def curvature(self, acc, sample: Sample) -> Outer:
-        """Weighted y_u . y_v, what was before scaled down when the maximum moves up."""
-        y, _, weights, decay = self._weights(acc, sample)
-        return Outer(y, weights, decay)
-
-    def hessian(self, products: jax.Array, gradient: jax.Array, weight: jax.Array) -> jax.Array:
-        """Matrix scale (sum w y_u y_v / sum w - mean_u mean_v) / smoothing."""
-        mean = gradient / self.scale
-        return self.scale * (products / weight - mean[:, None] * mean[None, :]) / self.smoothing
+    def hessian(self, products: jax.Array, pieces: jax.Array, slopes: jax.Array) -> jax.Array:
+        """Matrix (sum_j w_j p_ju p_jv - mean_u mean_v) / T."""
+        T = self.smoothing * self.scale
+        weights = jax.nn.softmax(pieces / T)
+        mean = slopes @ weights
+        return ((slopes * weights) @ slopes.T - mean[:, None] * mean[None, :]) / T
 
 
 @component
@@ -214,14 +219,14 @@ class MetricResult:
         return self.fold.update(acc, sample)
 
     def finish(self, acc):
-        """The weighted sum, twice, and 1."""
+        """The weighted sum, three times."""
         found = self.fold.finish(acc)[self.name]
         if not jnp.issubdtype(found.dtype, jnp.floating):
             raise checks.fail("MetricResult.name", self.name, "a result that can be differentiated", f"This one is {found.dtype}.")
         if jnp.shape(self.joints) not in ((), found.shape):
             raise checks.fail("MetricResult.joints", self.joints, f"one number, or shape {found.shape} as {self.name!r} has")
         value = jnp.sum(self.joints * found)
-        return value, value, jnp.ones_like(value)
+        return value, value, value[None]
 
 
 MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult}
@@ -237,12 +242,12 @@ class Quantities:
     """
 
     parts: tuple
-    units: ClassVar[dict[str, str]] = {"tuning_smooth": "", "tuning_exact": "", "tuning_weight": "1"}
+    units: ClassVar[dict[str, str]] = {"tuning_smooth": "", "tuning_exact": "", "tuning_pieces": ""}
 
     @property
     def curvatures(self) -> int:
         """How many `Outer` there are."""
-        return len(self.parts)
+        return sum(hasattr(part, "curvature") for part in self.parts)
 
     def init(self, sample: Sample):
         """The quantities' accumulators."""
@@ -253,19 +258,26 @@ class Quantities:
         return tuple(part.update(a, sample) for part, a in zip(self.parts, acc, strict=True))
 
     def finish(self, acc) -> dict[str, jax.Array]:
-        """Smooth values, exact values and weights."""
+        """Smooth values and exact values, (K,) each, and the pieces of all, one quantity after the other."""
         found = [part.finish(a) for part, a in zip(self.parts, acc, strict=True)]
-        return {name: jnp.stack(x) for name, x in zip(self.units, zip(*found, strict=True), strict=True)}
+        smooth, exact, pieces = zip(*found, strict=True)
+        return {"tuning_smooth": jnp.stack(smooth), "tuning_exact": jnp.stack(exact), "tuning_pieces": jnp.concatenate(pieces)}
+
+    def counts(self, sample: Sample) -> tuple[int, ...]:
+        """How many pieces each quantity has, for samples such as this one; shapes are enough."""
+        return tuple(jax.eval_shape(lambda s, part=part: part.finish(part.init(s))[2], sample).size for part in self.parts)
 
     def curvature(self, acc, sample: Sample) -> tuple[Outer, ...]:
-        """One `Outer` a quantity; an empty one where it offers none."""
-        none = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
-        return tuple(part.curvature(a, sample) if hasattr(part, "curvature") else none for part, a in zip(self.parts, acc, strict=True))
+        """One `Outer` for each quantity that offers one."""
+        return tuple(part.curvature(a, sample) for part, a in zip(self.parts, acc, strict=True) if hasattr(part, "curvature"))
 
-    def hessians(self, products: Sequence[jax.Array], gradients: jax.Array, weights: jax.Array) -> jax.Array:
-        """Gauss-Newton matrix of each quantity, (K, D, D), from its products (D, D), gradients (D, K) and weights (K,)."""
-        found = [
-            part.hessian(products[k], gradients[:, k], weights[k]) if hasattr(part, "hessian") else jnp.zeros_like(products[k])
-            for k, part in enumerate(self.parts)
-        ]
+    def hessians(self, products: Sequence[jax.Array], pieces: Sequence[jax.Array], slopes: Sequence[jax.Array]) -> jax.Array:
+        """Gauss-Newton matrix of each quantity, (K, D, D), from the products (D, D) of those that have a `curvature`, its pieces (m,) and
+        their slopes (D, m); zero where it offers none.
+        """
+        left, none = iter(products), jnp.zeros((slopes[0].shape[0],) * 2, slopes[0].dtype)
+        found = []
+        for part, own, slope in zip(self.parts, pieces, slopes, strict=True):
+            product = next(left) if hasattr(part, "curvature") else none
+            found.append(part.hessian(product, own, slope) if hasattr(part, "hessian") else none)
         return jnp.stack(found)

@@ -30,7 +30,7 @@ from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.quantities import Quantities
-from iblf_jax.tuning.robust import Risk
+from iblf_jax.tuning.robust import Risk, worst_share
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +69,24 @@ class Verdict:
     after: Probability
     verdict: str
     """"pass", "fail" or "undecided"."""
+    value: float = float("nan")
+    """What is limited, after: the mean over the worst allowed share of the runs; a margin as a margin."""
+    limit: float = float("nan")
+    unit: str = ""
+    price: float | None = None
+    """By how much the objective of the tuning would fall if the limit were loosened by one unit; None where that is not known."""
 
     def __str__(self) -> str:
+        text = self._verdict()
+        if np.isfinite(self.value):
+            text += f"; {self.value:.5g} {self.unit}"
+            away = self.value - self.limit
+            text += f", {abs(away):.3g} {self.unit} {'above' if away > 0 else 'below'} the limit" if self.verdict == "fail" else ""
+        if self.price is not None and self.verdict != "fail" and self.price > 0:
+            text += f"; the objective would fall by {self.price:.3g} for each {self.unit} that the limit is loosened by"
+        return text
+
+    def _verdict(self) -> str:
         if self.after.runs == 1:
             return f"{self.name}: {'broken' if self.before.count else 'kept'} -> {'broken' if self.after.count else 'kept'}: {self.verdict}"
         text = f"{self.name} (broken by at most {self.allowed:g} of the runs): {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
@@ -99,6 +115,10 @@ class Report:
     """The largest torque of all runs, joint by joint, before and after [N m]."""
     at_limits: tuple[str, ...] | None = None
     """The tuned numbers that sit at an end of their range, in words; None where the ranges are not known."""
+    halved: str = ""
+    """What the nominal run with the tuned gains gives at dt / 2, in words."""
+    notes: tuple[str, ...] = ()
+    """How the search ended, and warnings."""
 
     @property
     def passed(self) -> bool:
@@ -123,6 +143,7 @@ class Report:
         lines += [f"  peak torque{'' if self.seed is None else ' of all runs'}, joint by joint: {torques[0]} -> {torques[1]} N m"]
         if self.at_limits is not None:
             lines += [f"  {words}" for words in self.at_limits] or ["  gains at an end of their range: none"]
+        lines += [f"  {words}" for words in (self.halved, *self.notes) if words]
         before, after = (p.count if self.seed is None else p for p in self.violation)
         lines += [f"  bounds violated: {before} -> {after}"]
         if self.changes[0].significant is False:
@@ -138,6 +159,10 @@ class Report:
         out = dataclasses.asdict(self)
         out["changes"] = [{**dataclasses.asdict(c), "significant": c.significant} for c in self.changes]
         return out
+
+
+APART = 0.01
+"""By how much the objective may differ at half the step before the report warns."""
 
 
 class _Sample:
@@ -205,6 +230,8 @@ def make_report(
     timing: dict[str, Any],
     backend: str = "auto",
     at_limits: tuple[str, ...] | None = None,
+    prices: tuple[float, ...] = (),
+    notes: tuple[str, ...] = (),
 ) -> Report:
     """Runs both scenarios on the same fresh draws and compares them.
 
@@ -218,6 +245,8 @@ def make_report(
       timing: duration, dt, method.
       backend: what the fresh runs run on.
       at_limits: the tuned numbers at an end of their range, in words.
+      prices: of each requirement, by the unit of its limit; none if not known.
+      notes: lines for the reader.
     """
     samples = [_run(scenario, objective, perturbations, runs, seed, timing, backend) for scenario in (before, after)]
     both = samples[0].made & samples[1].made
@@ -232,12 +261,42 @@ def make_report(
     for r, requirement in enumerate(objective.requirements):
         found = [probability(_broken(objective, r, s), s.made, confidence, "independent", 1) for s in samples]
         allowed = float(requirement.allowed)
-        verdicts.append(Verdict(requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed)))
+        (sign, unit), price = requirement.measure, prices[r] if r < len(prices) else None
+        worst = float(worst_share(jnp.asarray(samples[1].exact[samples[1].made, len(objective.terms) + r]), allowed))
+        shown = sign * worst, sign * float(requirement.limit), unit, price
+        verdicts.append(Verdict(requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed), *shown))
     left = tuple(probability(s.status & int(VIOLATED) != 0, s.made, confidence, "independent", 1) for s in samples)
     margins = tuple(float(s.margin[s.made].min()) for s in samples)
     torques = tuple(tuple(s.torque[s.made].max(axis=0).tolist()) for s in samples)
     drawn = seed if perturbations else None
-    return Report(len(both), drawn, confidence, tuple(changes), tuple(verdicts), left, margins, torques, at_limits)  # type: ignore[arg-type]
+    halved = _at_half_the_step(after, objective, timing, samples[1] if not perturbations else None)
+    return Report(
+        len(both),
+        drawn,
+        confidence,
+        tuple(changes),
+        tuple(verdicts),
+        left,  # type: ignore[arg-type]
+        margins,  # type: ignore[arg-type]
+        torques,  # type: ignore[arg-type]
+        at_limits,
+        halved,
+        notes,
+    )
+
+
+def _at_half_the_step(scenario: Scenario, objective: Objective, timing: dict[str, Any], known: _Sample | None) -> str:
+    """The nominal run at dt and at dt / 2, in words: a result that the step made is no result."""
+    full = _run(scenario, objective, None, 1, 0, timing, "auto") if known is None else known
+    half = _run(scenario, objective, None, 1, 0, timing | {"dt": 0.5 * timing["dt"]}, "auto")
+    values = [float(sum(t.value(jnp.asarray(s.exact[0, i])) for i, t in enumerate(objective.terms))) for s in (full, half)]
+    text = f"the nominal run at dt / 2: objective {values[1]:.5g} instead of {values[0]:.5g}"
+    text += f", smallest margin {half.margin[0]:.4g} rad, peak torque {np.max(half.torque):.5g} N m"
+    apart = abs(values[1] - values[0]) > APART * abs(values[0])
+    lost = any(_broken(objective, r, half)[0] and not _broken(objective, r, full)[0] for r in range(len(objective.requirements)))
+    if lost:
+        return "WARNING: " + text + "; a requirement is broken there: leave it some room, or take a smaller dt"
+    return "WARNING: " + text + f", more than {APART:.0%} apart: take a smaller dt" if apart else text
 
 
 def _objective_change(risk: Risk, name: str, terms: list[np.ndarray], confidence: float) -> Change:

@@ -23,12 +23,14 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.objectives import Objective, has_price_on_torque
 from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import Report, make_report
 from iblf_jax.tuning.robust import Risk
 
+FAR = 100.0
+"""A gain that ended so many times above or below its start is worth a warning."""
 NEAR = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where the limit is 0)."""
 
@@ -95,6 +97,11 @@ class TuneResult:
     """"forward" or "reverse"."""
     seconds: float
     setup: TuneSetup
+    multipliers: tuple[float, ...] = ()
+    """Of each requirement: by how much the objective would fall if its limit were moved by one `scale`; none where one is broken."""
+    residuals: tuple[float, ...] = ()
+    """At the end, of "newton": the largest entry of the Lagrangian's gradient by the coordinates z that no limit of a gain holds, the
+    largest excess g of a requirement, and the sum of multipliers times distances from the limits; all 0 at an optimum."""
 
     @property
     def objective(self) -> float:
@@ -126,6 +133,42 @@ class TuneResult:
                 if np.isfinite(end) and abs(x - end) <= NEAR * (abs(end) or width):
                     found[name] = AtLimit(float(x), side, float(end))
         return found
+
+    @property
+    def prices(self) -> dict[str, float]:
+        """By the name of a requirement: how much the objective would fall if its limit were loosened by one of its unit."""
+        pairs = zip(self.setup.objective.requirements, self.multipliers, strict=False)
+        return {r.name: price / float(r.scale) for r, price in pairs}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What to know before these gains are believed, in words: how the search ended, gains far from their start, no price on torque."""
+        lines = [f"stopped: {self.stopped}"]
+        if self.residuals:
+            numbers = "gradient of the Lagrangian {:.2g}, largest excess {:.2g}, complementarity {:.2g}".format(*self.residuals)
+            lines[0] += f" ({numbers}; objective {self.objective:.5g})"
+        if self.setup.objective.requirements and not self.multipliers:
+            lines.append("WARNING: these gains break the requirements as little as was found: loosen one, or add parameters or starts")
+        if self.stopped == "iterations used up":
+            steps = len(self.history["evaluations"])
+            lines.append(f"WARNING: not converged: give more iterations than {steps}, or several starts")
+        first = np.concatenate([np.ravel(paths.get(self.start, path)) for path in self.values])
+        last = np.concatenate([np.ravel(value) for value in self.values.values()])
+        for name, before, after in zip(self._entries, first, last, strict=True):
+            factor = after / before if before * after > 0 else 1.0
+            if not 1 / FAR < factor < FAR:
+                lines.append(
+                    f"WARNING: {name} ended at {factor:.3g} times its start: the objective hardly feels it, or puts no price on it"
+                )
+        if not has_price_on_torque(self.setup.objective):
+            lines.append("WARNING: this objective has no price on torque: add effort(), torque_rate() or peak_torque_below(limit)")
+        return tuple(lines)
+
+    @property
+    def _entries(self) -> list[str]:
+        """A name for each number of `values`."""
+        sizes = {path: np.shape(value) for path, value in self.values.items()}
+        return [path + "".join(f"[{i}]" for i in index) for path, shape in sizes.items() for index in np.ndindex(shape)]
 
     @cached_property
     def nominal(self) -> tuple[Rollout, Rollout]:
@@ -173,6 +216,8 @@ class TuneResult:
             timing=timing,
             backend=setup.backend,
             at_limits=tuple(f"{name} {end}" for name, end in self.at_limits.items()) if setup.limits else None,
+            prices=tuple(self.prices.values()),
+            notes=self.notes,
         )
 
     def landscape(self, first: str, second: str, *, points: int = 13, span: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

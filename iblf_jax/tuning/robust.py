@@ -57,10 +57,14 @@ def cvar(level: float = 0.9) -> Risk:
     return Risk("cvar", float(level))
 
 
+def worst_count(runs: int, share: float) -> int:
+    """How many the worst `share` of some runs are, at least one."""
+    return max(1, math.ceil(share * runs - 1e-9))
+
+
 def worst_share(x: jax.Array, share: float) -> jax.Array:
     """The mean of the largest `share` of x, (B,), at least of one entry."""
-    count = max(1, math.ceil(share * x.shape[0] - 1e-9))
-    return jnp.mean(jax.lax.top_k(x, count)[0])
+    return jnp.mean(jax.lax.top_k(x, worst_count(x.shape[0], share))[0])
 
 
 def combine(risk: Risk, losses: jax.Array) -> jax.Array:
