@@ -63,7 +63,7 @@ def test_any_explicit_method_is_a_row_of_the_table(paper, monkeypatch):
     monkeypatch.setitem(TABLEAUS, "kutta", kutta)
     inputs, run = inputs_of(paper), Run(50, "kutta", 10)
     written_out, rolled = (outcome(inputs, run, plan.Shape("together", "none", loop)) for loop in (False, True))
-    lowered = outcome(inputs, run, varied={"initial.q": inputs.scenario.initial.q[None]}, executor=execute._executor("xla"))
+    lowered = outcome(inputs, run, varied={"initial.q": inputs.scenario.initial.q[None]}, executor=execute.executor_named("xla"))
     assert_same(written_out, rolled)
     assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
     off = np.max(np.abs(written_out.records[0]["q"] - outcome(inputs, Run(50, "rk4", 10)).records[0]["q"]))
