@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.core import checks
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.engine.transformable import run_transformable
@@ -586,3 +587,13 @@ def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
     ij.tune(paper, GAINS, objective(), iterations=2, checkpoint=file, **SHORT)
     with pytest.raises(ValueError, match="this very problem"):
         ij.tune(paper, GAINS, 2 * objective(), iterations=2, checkpoint=file, **SHORT)
+
+
+def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
+    """A requirement on a peak has a matrix for each piece of it in each run."""
+    monkeypatch.setattr(checks, "memory", lambda: 1_400_000)
+    goal = ij.objectives.tracking(scale=1.0) + ij.objectives.peak_torque_below(20.0)
+    paths = ["controller.k1", "controller.K2", "observer.kf"]
+    perturbed = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
+    with pytest.raises(ValueError, match=r"runs: got 200.*at most"):
+        ij.tune(paper, paths, goal, perturbations=perturbed, runs=200, **SHORT)
