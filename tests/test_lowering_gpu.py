@@ -202,7 +202,7 @@ def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
 @needs_compiler
 def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     told = repr(ij.explain(paper))
-    assert "a batch runs on native\n" in told and told.endswith("first and second on native, one run a number; further ones by plain JAX")
+    assert "a batch runs on native\n" in told and told.endswith("on native, one run a number, first and second ones; others by plain JAX")
     monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
     told = repr(ij.explain(paper))
     assert "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told and "derivatives of simulate: by plain JAX: it needs" in told

@@ -22,7 +22,7 @@ from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import _tune, problem, quadratic
-from iblf_jax.tuning.newton import Newton, Pieces
+from iblf_jax.tuning.newton import Newton, Pieces, planned
 from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -249,7 +249,7 @@ def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
 def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
     """The circle and z0 > 1.5, another requirement: between them the sum of both is least at the end of the circle."""
 
-    class Both(Pieces):
+    class Both(TwoPieces):
         def __call__(self, z):
             found = super().__call__(z)
             found.excess[:, :, 1], found.slopes[:, :, :, 1] = 1.5 - z[:, :1], np.array([-1.0, 0.0])
@@ -597,3 +597,13 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
     perturbed = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
     with pytest.raises(ValueError, match=r"runs: got 200.*at most"):
         ij.tune(paper, paths, goal, perturbations=perturbed, runs=200, **SHORT)
+
+
+@pytest.mark.parametrize(("runs", "share"), [(1000, 0.3), (60, 0.1)])
+def test_a_share_of_many_runs_is_in_the_programme(runs, share):
+    """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down, whatever the number of the worst."""
+    pieces = Pieces.of((1,), (share,), runs)
+    excess, slopes = np.full((runs, 1), 0.2), np.ones((runs, 1, 1))
+    found = planned(np.array([-1.0]), np.eye(1), np.array([-1.0]), np.array([1.0]), pieces, excess, slopes, 10.0)
+    np.testing.assert_allclose(found.step, -0.2, atol=1e-4)
+    np.testing.assert_allclose(found.prices, 1.2, rtol=1e-3)  # 1 - z, what the objective's slope is there

@@ -142,7 +142,7 @@ def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
     """The tangents of leaves by each of their numbers in turn."""
     sizes = [math.prod(shape) for shape in shapes]
     parts = np.split(np.eye(sum(sizes), dtype=dtype), np.cumsum(sizes)[:-1], axis=1)
-    return [jnp.asarray(x.reshape(-1, *shape)) for x, shape in zip(parts, shapes, strict=True)]
+    return [jnp.asarray(x.reshape(len(x), *shape)) for x, shape in zip(parts, shapes, strict=True)]
 
 
 def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:

@@ -89,7 +89,7 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = automatic()
     backend = f"{name}: {reason}" if reason else name
-    columns = f"first and second on {name}, one run a number; further ones by plain JAX"
+    columns = f"by numbers of the scenario on {name}, one run a number, first and second ones; others by plain JAX"
     derivatives = f"by plain JAX: {reason}" if reason else columns
     return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives)
 

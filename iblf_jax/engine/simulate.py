@@ -67,7 +67,8 @@ def simulate(
       backend: "native": generated code, built by the system's compiler once for a structure and kept on disk; "xla": the same program
         without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native where there is a
         compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside your own `jit` or `vmap` a run
-        is plain JAX; its first and second derivatives are the kernel's, where there is one, but for "xla".
+        is plain JAX; where it is differentiated by numbers of the scenario, it and its first and second derivatives are the kernel's if
+        there is one, but for "xla".  Derivatives are of all that is recorded, so record little where only metrics matter.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.

@@ -5,7 +5,7 @@ The run itself is plain JAX (`scan`).  Its first derivatives are a kernel's, whe
     out' = J leaves',       J = d (records, metrics) / d leaves,
 
 each column of J a run with one tangent (`columns`).  JAX transposes the product, so both modes have it.  J's own derivative is made in the
-same way; third derivatives are the scan's.
+same way.  Third derivatives are the scan's, and those by the step, by a metric's parameters, or of more records than are kept.
 """
 
 from __future__ import annotations
@@ -83,10 +83,13 @@ def _differentiable(runs: Runs, is_asked: bool = False) -> Callable:
     def rule(leaves, tangents):
         places, moves = _moves(tangents)
         by_kernel = _by_kernel(runs, (places,), leaves)
-        if by_kernel is None:
-            return jax.jvp(lambda *moved: _plain(runs, *_put(leaves, places, moved)), [leaves[i] for i in places], moves)
-        found = _differentiable(runs, True)(*leaves)
-        return found, _in_form_of(found, *_times(by_kernel, moves, 0))
+        if by_kernel is not None:
+            try:
+                found = _differentiable(runs, True)(*leaves)
+                return found, _in_form_of(found, *_times(by_kernel, moves, 0))
+            except (UnsupportedError, ToolchainError):
+                pass
+        return jax.jvp(lambda *moved: _plain(runs, *_put(leaves, places, moved)), [leaves[i] for i in places], moves)
 
     whole.defjvp(rule, symbolic_zeros=True)
     return whole

@@ -40,6 +40,8 @@ MOST_SHARPENINGS = 60
 """Past them the smoothing is no number in float32."""
 INFEASIBLE = "the requirements cannot be kept together near these gains"
 """Why a tuning stopped that converged to gains that break a requirement as little as can be."""
+NO_SLOPE = "the objective has no finite derivative at the start"
+"""Why one stopped that could not make a step."""
 SCREENED = 32
 """Points that are looked at where the first start leaves its bounds."""
 
@@ -319,13 +321,16 @@ def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
 def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
     state, blocks = loop.state, problem.formulation.blocks
     best = loop.best
-    broken = float(np.sum(np.maximum(state["best_excess"][best], 0.0)))
-    if stopped == "converged" and broken > 0:
+    broken = state["best_key"][best][0] > 0
+    prices, residuals = (state["lam"][best], ()) if loop.penalised else (state["method"][name][best] for name in ("prices", "residuals"))
+    if stopped == "converged" and not np.all(np.isfinite(residuals)):
+        stopped = NO_SLOPE
+    elif stopped == "converged" and broken:
         stopped = INFEASIBLE
-    prices, residuals = (), ()
-    if broken == 0:  # where the requirements cannot be kept, the multipliers are those of breaking them
-        prices = state["lam"][best] if loop.penalised else state["method"]["prices"][best]
-        residuals = () if loop.penalised else state["method"]["residuals"][best]
+    # They are of where the method stands; where the requirements cannot be kept, the multipliers are those of breaking them.
+    here = stopped == "converged" if loop.penalised else np.array_equal(state["best_z"][best], state["method"]["z"][best])
+    if broken or not here or stopped == NO_SLOPE:
+        prices, residuals = () if broken else np.full(len(prices), np.nan), ()
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
     history = {name: np.stack(x) for name, x in loop.history.items()}
     history["x"] = _in_units(blocks, history["z"])

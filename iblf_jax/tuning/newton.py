@@ -155,7 +155,10 @@ def _that_may_bind(limits: Pieces, r: int, excess: np.ndarray, slopes: np.ndarra
     if k > 1:
         may[np.argsort(-np.max(excess[:, own], axis=1), kind="stable")[MORE_RUNS * k :]] = False
     b, m = np.nonzero(may)
-    worst = np.argsort(-excess[b, own[m]], kind="stable")[:MOST_PIECES]
+    # A mean of k runs needs k runs: the worst piece of each comes before all others.
+    further = (m != np.argmax(np.where(may, excess[:, own], -np.inf), axis=1)[b]) & (k > 1)
+    room = max(MOST_PIECES, int(np.sum(~further)) if k > 1 else 0)
+    worst = np.lexsort((-excess[b, own[m]], further))[:room]
     return b[worst], own[m[worst]]
 
 
@@ -244,7 +247,7 @@ class Newton:
         size, foretold, gain = float(np.max(np.abs(step))), state["foretold"][s], -np.inf
         if valid:
             gain = self._merit(state, s, state["loss"][s], state["excess"][s]) - self._merit(state, s, here["loss"], excess)
-            gain = gain / foretold
+            gain = gain / foretold if foretold > 0 else -np.inf
             self._learn(state, s, step, here)
         if gain > 1e-4:
             self._move(state, s, trial, here)

@@ -33,12 +33,12 @@ def solve(H: np.ndarray, c: np.ndarray, A: np.ndarray, b: np.ndarray) -> tuple[n
     x, s, y = np.zeros(len(c)), np.maximum(b, 1.0), np.ones(len(b))
     limit = PRECISION * (1.0 + float(np.max(np.abs(b))))
     for _ in range(MOST):
-        dual, primal, gap = H @ x + c + A.T @ y, A @ x + s - b, float(s @ y) / len(b)
+        dual, primal, gap = H @ x + c + A.T @ y, A @ x + s - b, max(float(s @ y) / len(b), 1e-300)
         if gap < PRECISION and np.max(np.abs(dual)) < PRECISION * 10 and np.max(np.abs(primal)) < limit:
             break
         try:
             factor = cho_factor(H + (A.T * (y / s)) @ A)
-        except LinAlgError:  # as near as the numbers allow
+        except (LinAlgError, ValueError):  # as near as the numbers allow
             break
 
         def towards(target, dual=dual, primal=primal, factor=factor, s=s, y=y):

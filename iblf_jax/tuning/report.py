@@ -261,7 +261,9 @@ def make_report(
     for r, requirement in enumerate(objective.requirements):
         found = [probability(_broken(objective, r, s), s.made, confidence, "independent", 1) for s in samples]
         allowed = float(requirement.allowed)
-        (sign, unit), price = requirement.measure, prices[r] if r < len(prices) else None
+        # What limits a probability is a margin in the programme: its multiplier is no price of the probability.
+        priced = r < len(prices) and requirement.event == "value"
+        (sign, unit), price = requirement.measure, prices[r] if priced else None
         worst = float(worst_share(jnp.asarray(samples[1].exact[samples[1].made, len(objective.terms) + r]), allowed))
         shown = sign * worst, sign * float(requirement.limit), unit, price
         verdicts.append(Verdict(requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed), *shown))

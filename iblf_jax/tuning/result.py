@@ -98,7 +98,8 @@ class TuneResult:
     seconds: float
     setup: TuneSetup
     multipliers: tuple[float, ...] = ()
-    """Of each requirement: by how much the objective would fall if its limit were moved by one `scale`; none where one is broken."""
+    """Of each requirement: by how much the objective would fall if its limit were moved by one `scale`; none where one is broken,
+    NaN where the gains are not those at which the search ended."""
     residuals: tuple[float, ...] = ()
     """At the end, of "newton": the largest entry of the Lagrangian's gradient by the coordinates z that no limit of a gain holds, the
     largest excess g of a requirement, and the sum of multipliers times distances from the limits; all 0 at an optimum."""
@@ -106,7 +107,8 @@ class TuneResult:
     @property
     def objective(self) -> float:
         """The objective at the tuned gains, on the runs that it was tuned on."""
-        valid = self.history["valid"] & np.all(np.abs(self.history["x"] - self.tuned) <= 1e-12 * np.abs(self.tuned), axis=-1)
+        rounding = 100 * np.finfo(self.tuned.dtype).eps * np.abs(self.tuned)
+        valid = self.history["valid"] & np.all(np.abs(self.history["x"] - self.tuned) <= rounding, axis=-1)
         return float(np.min(np.where(valid, self.history["objective"], np.inf)))
 
     @property
@@ -136,7 +138,9 @@ class TuneResult:
 
     @property
     def prices(self) -> dict[str, float]:
-        """By the name of a requirement: how much the objective would fall if its limit were loosened by one of its unit."""
+        """By the name of a requirement: how much the objective would fall if its limit were loosened by one of its unit;
+        for a violation probability, by one radian of the margin that its worst runs keep.
+        """
         pairs = zip(self.setup.objective.requirements, self.multipliers, strict=False)
         return {r.name: price / float(r.scale) for r, price in pairs}
 
