@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from _timing import compile_seconds, report
 from scipy.spatial.transform import Rotation
-from throughput import measured
+from throughput import measured, method_for
 
 import iblf_jax as ij
 from iblf_jax.engine.execute import run_batch
@@ -160,7 +160,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     options = parser.parse_args()
     runs, steps = (8, 10) if options.quick else (options.runs, options.steps)
-    method = "euler" if options.quick else "rk4"
+    method = method_for(options.quick)
     rows = []
 
     def add(name: str, dtype: str, made: int, found: tuple, limit: float = math.nan) -> None:

@@ -45,6 +45,11 @@ class Leaves(NamedTuple):
         one, other = iter(shared), iter(lane)
         return jax.tree.unflatten(self.treedef, [next(other) if lane else next(one) for lane in self.is_lane])
 
+    @property
+    def first(self):
+        """The pytree of the first run."""
+        return self.together(self.shared, [x[0] for x in self.lane])
+
 
 def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
     """The leaves of what runs are made from: those that `varied` replaces in the scenario become one value a run."""
@@ -125,7 +130,7 @@ def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
     leaves = batch.leaves
     shared, lane = jax.lax.stop_gradient((leaves.shared, leaves.lane))
     batch = batch._replace(leaves=leaves._replace(shared=shared, lane=lane))
-    steps = probe_steps(leaves.together(leaves.shared, [x[0] for x in leaves.lane]).scenario)
+    steps = probe_steps(leaves.first.scenario)
     return executor(Probe(), batch, carry, steps, None)[0]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from iblf_jax.engine.batch import Batch, Executor, Leaves, run_step
 from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of
-from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep, start
+from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep, finished, start
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
@@ -109,8 +109,8 @@ def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
 def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict[str, jax.Array]:
     """The derivative of every metric that is a float."""
     if not isinstance(carry, WithTangent):
-        results = [fold.finish(acc) for fold, acc in zip(inputs.folds, carry.accumulators, strict=True)]
-        return {name: x for found in results for name, x in found.items() if jnp.issubdtype(x.dtype, jnp.floating)}
+        results = finished(inputs.folds, carry.accumulators).items()
+        return {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}
     floats, replaced = _floats(carry.carry)
     zero = jnp.zeros_like(inputs.dt)
 
@@ -147,8 +147,7 @@ def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
 
 def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
     """Shapes of the leaves of one run's scenario."""
-    leaves = batch.leaves
-    return [jnp.shape(x) for x in jax.tree.leaves(leaves.together(leaves.shared, [x[0] for x in leaves.lane]).scenario)]
+    return [jnp.shape(x) for x in jax.tree.leaves(batch.leaves.first.scenario)]
 
 
 def _stepped(executor: Executor, batch: Batch, step: TangentStep, directions: list[list[Any]], run: Run) -> tuple[list[jax.Array], Any]:
@@ -189,8 +188,7 @@ def _weights(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Arra
 
 def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
     """As `run_with_tangents`, one run a tangent."""
-    leaves = batch.leaves
-    inputs = leaves.together(leaves.shared, [x[0] for x in leaves.lane])
+    inputs = batch.leaves.first
     zero, units = jnp.zeros(directions.tangents, batch.dtype), np.eye(directions.tangents, dtype=batch.dtype)
     before = jax.tree.leaves(inputs.scenario)
     places = tuple(i for i, x in enumerate(jax.tree.leaves(directions.moved(inputs.scenario, zero))) if x is not before[i])

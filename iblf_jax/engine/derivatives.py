@@ -24,7 +24,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.engine.batch import Batch, Executor, begin, end
-from iblf_jax.engine.step import Carry, Form, Inputs, Outcome, Run, advance
+from iblf_jax.engine.step import Carry, Form, Inputs, Outcome, Run, advance, finished
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -216,9 +216,8 @@ def run_with_tangents(executor: Executor, batch: Batch, directions: Directions, 
         def metrics(scenario, carry, eps):
             found: dict[str, jax.Array] = dict.fromkeys((name for name, _ in accuracy.UNITS), jnp.zeros_like(inputs.dt))
             found[accuracy.ERROR] = jnp.zeros_like(carry.accuracy.error)
-            for fold, acc in zip(inputs.folds, carry.accumulators, strict=True):
-                found |= {name: x for name, x in fold.finish(acc).items() if jnp.issubdtype(x.dtype, jnp.floating)}
-            return found, ()
+            results = finished(inputs.folds, carry.accumulators).items()
+            return found | {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}, ()
 
         _, tangents, _ = pushed(metrics, directions, inputs.scenario, before, inputs.dt.dtype)
         full = jnp.zeros((directions.tangents,) * 2, inputs.dt.dtype)

@@ -297,6 +297,14 @@ class Kick:
         return accuracy.kicked(inputs.scenario, carry), ()
 
 
+def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
+    """The results of all folds."""
+    found: dict[str, jax.Array] = {}
+    for fold, acc in zip(folds, accumulators, strict=True):
+        found |= fold.finish(acc)
+    return found
+
+
 def verdict(inputs: Inputs, method: str, carry: Carry, kicked: accuracy.Unseen, instants: Probed) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
 
@@ -312,7 +320,5 @@ def verdict(inputs: Inputs, method: str, carry: Carry, kicked: accuracy.Unseen, 
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     status = carry.status | flag(inputs.dt * mode > integrators.tableau(method).stability, Status.STEP_TOO_LARGE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
-    metrics = accuracy.results(estimate)
-    for fold, acc in zip(inputs.folds, carry.accumulators, strict=True):
-        metrics |= fold.finish(acc)
+    metrics = accuracy.results(estimate) | finished(inputs.folds, carry.accumulators)
     return Outcome(None, metrics, status, mode)

@@ -141,8 +141,6 @@ def tune(
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     z = starting_points(problem.box, starts, seed)
-    if optimiser == "newton":  # a matrix for each peak of a requirement in each run
-        checks.fits("runs", problem.runs, 8.0 * starts * max(len(problem.limits.owner), 1) * len(problem.box.z) ** 2)
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate, problem.limits, problem.runs)
     # The line search of L-BFGS is a loop of JAX's around the problem.
     formulation = problem.formulation._replace(nested=optimiser == "lbfgs", penalised=method_.penalised)

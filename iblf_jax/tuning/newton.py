@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax.core import checks
 from iblf_jax.tuning import quadratic
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
@@ -175,9 +176,14 @@ class Newton:
         self.limits = Pieces(np.zeros(0, int), ()) if limits is None else limits
 
     def init(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """The state before the first evaluation."""
+        """The state before the first evaluation.
+
+        Raises:
+          ValueError: more runs than the memory holds, as each has a matrix for every piece.
+        """
         starts, size = z.shape
         pieces, R = len(self.limits.owner), len(self.limits.worst)
+        checks.fits("runs", self.runs, 8.0 * starts * pieces * size**2)
         square = np.zeros((starts, size, size))
         return {
             "z": z.copy(),
