@@ -8,8 +8,9 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
-from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
 from iblf_jax.controllers.systems import observer_of
 
 TARGET = Path(__file__).with_name("members.md")
@@ -22,6 +23,9 @@ FAMILIES = (
     ("References", references, "`iblf_jax.references`", ()),
     ("Bounds", bounds, "`iblf_jax.bounds`", ()),
     ("Disturbances", disturbances, "`iblf_jax.disturbances`", ()),
+    ("Sensors", sensors, "`iblf_jax.sensors`", ()),
+    ("Velocities of an encoder", SimpleNamespace(MEMBERS=sensors.VELOCITIES), "`iblf_jax.sensors`", ()),
+    ("Actuators", actuators, "`iblf_jax.actuators`", ()),
 )
 
 

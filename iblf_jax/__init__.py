@@ -7,6 +7,7 @@ import importlib as _importlib
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
+from iblf_jax import actuators as actuators
 from iblf_jax import barriers as barriers
 from iblf_jax import bounds as bounds
 from iblf_jax import controllers as controllers
@@ -15,6 +16,7 @@ from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
+from iblf_jax import sensors as sensors
 from iblf_jax.core import linalg as linalg
 from iblf_jax.core import pytree as pytree
 from iblf_jax.core import status as status
@@ -37,6 +39,7 @@ from iblf_jax.simulation.paths import parameters as parameters
 from iblf_jax.simulation.paths import with_parameters as with_parameters
 from iblf_jax.simulation.results import Metrics as Metrics
 from iblf_jax.simulation.results import Rollout as Rollout
+from iblf_jax.simulation.sampling import Sampling as Sampling
 from iblf_jax.simulation.scenario import Initial as Initial
 from iblf_jax.simulation.scenario import Scenario as Scenario
 from iblf_jax.simulation.scenario import with_parts as with_parts
@@ -59,6 +62,7 @@ if TYPE_CHECKING:
     from iblf_jax.certificates import Certificate as Certificate
     from iblf_jax.certificates import Counterexample as Counterexample
     from iblf_jax.certificates import certify as certify
+    from iblf_jax.engine.period import recommended_period as recommended_period
     from iblf_jax.files.tuning import load_tuning as load_tuning
     from iblf_jax.files.tuning import save_tuning as save_tuning
     from iblf_jax.files.tuning import tune_file as tune_file
@@ -102,6 +106,7 @@ _ON_FIRST_USE = {
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
     "recommended_dt": ("iblf_jax.studies.recommended", "recommended_dt"),
+    "recommended_period": ("iblf_jax.engine.period", "recommended_period"),
     "save_tuning": ("iblf_jax.files.tuning", "save_tuning"),
     "Sensitivity": ("iblf_jax.studies.sensitivity", "Sensitivity"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),

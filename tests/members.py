@@ -8,7 +8,7 @@ from __future__ import annotations
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
 from iblf_jax.simulation import metrics
 
 TWO_LINK = ij.presets.customary_two_link()
@@ -65,6 +65,25 @@ OBSERVERS = {
     "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
 }
 
+VELOCITIES = {
+    "measured": sensors.Measured(noise=[0.01, 0.02]),
+    "filtered_difference": sensors.FilteredDifference(cutoff=[200.0, 300.0]),
+    "tracking": sensors.Tracking(bandwidth=100.0),
+}
+
+SENSORS = {
+    "ideal": sensors.Ideal(),
+    "encoder_bare": sensors.Encoder(velocity=sensors.Measured()),
+    **{f"encoder_{name}": sensors.Encoder(counts=4096, offset=[0.1, 0.0], noise=1e-4, velocity=v) for name, v in VELOCITIES.items()},
+}
+
+ACTUATORS = {
+    "ideal": actuators.Ideal(),
+    "motor_bare": actuators.Motor(),
+    "motor_lag": actuators.Motor(bandwidth=[300.0, 400.0]),
+    "motor": actuators.Motor(bandwidth=300.0, limit=[40.0, 20.0], rate_limit=500.0, stall=[40.0, 20.0], no_load_speed=[6.0, 8.0]),
+}
+
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"),
@@ -84,6 +103,8 @@ FAMILIES = {
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
     "observer": (OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
+    "sensor": (SENSORS, sensors.MEMBERS, ij.testing.check_sensor),
+    "actuator": (ACTUATORS, actuators.MEMBERS, ij.testing.check_actuator),
     "law": (LAWS, controllers.MEMBERS, ij.testing.check_law),
     "fold": (FOLDS, {type(fold).__name__: type(fold) for fold in metrics.standard()}, ij.testing.check_fold),
 }

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
 import numpy as np
 
+from iblf_jax import actuators, sensors
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
@@ -16,10 +18,10 @@ from iblf_jax.certificates.retrace import believed
 from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
 from iblf_jax.core import checks
 from iblf_jax.engine.plan import CERTIFY_RECORDED
-from iblf_jax.engine.simulate import simulate
+from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 
 WORST = 16
 
@@ -38,7 +40,8 @@ def certify(
         V2' + rho V2 - 1/2 |f'|^2 <= 0  at every step, and what follows from it                             (3.17)-(3.31)
 
     V2' and f' are exact (by jvp along the vector field of the whole loop).  A law, an observer or a situation without a claim is
-    "not applicable", never "fails".  Steps that a run did not record are made again, from each recorded sample to the next.
+    "not applicable", never "fails"; a sampled loop is held against its continuous run instead.  Steps that a run did not record are made
+    again, from each recorded sample to the next.
 
     Args:
       scenario: what runs.
@@ -122,6 +125,8 @@ def _heading(scenario: Scenario) -> str:
 
 def _one(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
+    if run.scenario.sampling is not None:
+        return _sampled(run)
     whole, stretches = look(run)
     parts, traces = [], []
     for trajectory in stretches:
@@ -130,6 +135,44 @@ def _one(run: Rollout) -> Certificate:
     lines = tuple(over_run(whole, parts))
     joined = Traces(*map(np.concatenate, zip(*traces, strict=True)))
     return Certificate(_heading(run.scenario), lines, _numbers(whole), joined, joints=joint_names(run.scenario.plant, run.n))
+
+
+def _sampled(run: Rollout) -> Certificate:
+    """That of a run whose law is sampled: nothing is claimed of it, and it is held against the continuous run instead."""
+    scenario, steps = run.scenario, run.steps if run.steps is not None else round(float(run.t[-1]) / float(run.dt))
+    every = max(round(float(run.t[1] - run.t[0]) / float(run.dt)), 1) if len(run.t) > 1 else 1
+    ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SimulationWarning)
+        continuous = simulate(ideal, duration=steps * float(run.dt), dt=float(run.dt), method=run.method, record_every=every)
+    beside = jax.tree.map(np.asarray, continuous)
+    certificate = _one(beside)
+    nothing: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time"))
+    lines = tuple(dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **nothing) for line in certificate.lines)
+    count = min(len(run.V), len(beside.V))
+    excess, margins = run.V[:count] - beside.V[:count], [_margins(x) for x in (run, beside)]
+    k, joint = int(np.argmax(excess)), int(np.argmin(margins[0] - margins[1]))
+    measured = (
+        Line("V2, sampled less continuous", "(3.12)", "max over t of V2 of this run less V2 of the continuous one", NOT_APPLICABLE,
+             value=float(excess[k]), time=float(run.t[k]), note=MEASURED, counts=False),
+        Line("margin, sampled less continuous", "(2.2)", "smallest distance to a bound, less that of the continuous run", NOT_APPLICABLE,
+             value=float((margins[0] - margins[1])[joint]), unit="rad", joint=joint, note=MEASURED, counts=False),
+    )  # fmt: skip
+    nan = np.full(run.t.shape, np.nan)
+    traces = Traces(*(nan for _ in Traces._fields))._replace(
+        t=run.t, V=run.V, xi=run.xi, xi_bound=np.full(run.xi.shape, np.nan), e2=np.linalg.norm(run.e2, axis=1),
+        f_tilde=np.linalg.norm(run.disturbance - run.disturbance_estimate, axis=1), held=np.ones(run.t.shape, bool),
+    )  # fmt: skip
+    return Certificate(_heading(scenario), (*lines, *measured), certificate.numbers, traces, joints=joint_names(scenario.plant, run.n))
+
+
+SAMPLED = "sampled loop: Theorem 2 is about a law that runs at every instant"
+MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
+
+
+def _margins(run: Rollout) -> np.ndarray:
+    """Smallest distance of each joint to a bound at the recorded samples, (n,) [rad]."""
+    return np.min(np.minimum(run.q - run.lower, run.upper - run.q), axis=0)
 
 
 def _numbers(whole: Whole) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.actuators import Ideal
 from iblf_jax.controllers import Backstepping
 from iblf_jax.observers import Momentum, Printed
 from iblf_jax.simulation.scenario import Scenario
@@ -54,6 +55,8 @@ def why_no_claim(scenario: Scenario) -> str:
         return f"the barrier {type(law.barrier).__name__} states no decay rate of its V1"
     if not isinstance(observer, Printed | Momentum):
         return f"Theorem 2 needs the observer (3.11), printed or in momentum form; {type(observer).__name__} has no claim of this kind"
+    if not isinstance(scenario.actuator, Ideal):
+        return f"Theorem 2 is about a torque that acts as it is commanded; a {type(scenario.actuator).__name__} has no claim of this kind"
     return ""
 
 

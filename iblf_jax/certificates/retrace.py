@@ -42,7 +42,7 @@ class Stretch(NamedTuple):
 
 def states_of(run: Any) -> LoopState:
     """The states at the recorded samples."""
-    return LoopState(run.q, run.dq, run.controller_state, run.observer_state)
+    return LoopState(run.q, run.dq, run.controller_state, run.observer_state, run.actuator_state)
 
 
 def believed(run: Any) -> bool:

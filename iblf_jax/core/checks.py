@@ -295,6 +295,13 @@ class NoSuchEntryError(IndexError, ValueError):
     """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's own protocols look for."""
 
 
+def seed(name: str, value: Any) -> int:
+    """A seed as a Python int in [0, 2^32), or a ValueError."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer) or not 0 <= value < 2**32:
+        raise fail(name, value, "a whole number from 0 to 2**32 - 1")
+    return int(value)
+
+
 def entry(name: str, value: Any, count: int, what: str) -> int:
     """A Python int from 0 to `count` - 1 from a user's index, which may count from the end; NoSuchEntryError where it leads nowhere."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -count <= value < count:

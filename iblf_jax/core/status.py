@@ -34,6 +34,9 @@ class Status(enum.IntFlag):
     GUARD_STAYED = 256
     """The guard was active beyond the first instant: there another law ran, softer than the one that was asked for."""
 
+    SAMPLING_TOO_SLOW = 512
+    """The loop grows from one period to the next (spectral radius above 1) at one of the instants that were looked at: sample faster."""
+
 
 FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
 """The flags that make a run one that did not do its job."""
@@ -55,6 +58,7 @@ _WORDS = {
     Status.INADMISSIBLE_DRAW: "a drawn parameter was inadmissible, so the run was not made",
     Status.INACCURATE: "the positions are inaccurate: the time step is too large",
     Status.GUARD_STAYED: "the guard stayed active beyond the first instant",
+    Status.SAMPLING_TOO_SLOW: "the law is sampled too slowly",
 }
 
 

@@ -29,6 +29,7 @@ from iblf_jax.engine.step import (
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.sampling import NOISE_NAME
 
 
 class Leaves(NamedTuple):
@@ -56,7 +57,9 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
     before, treedef = jax.tree.flatten(inputs)
 
     def replaced(values):
-        return jax.tree.leaves(inputs._replace(scenario=with_parameters(inputs.scenario, values)))
+        leaves = {path: x for path, x in values.items() if path != NOISE_NAME}
+        noise = values[NOISE_NAME].astype(inputs.dt.dtype) if NOISE_NAME in values else inputs.noise
+        return jax.tree.leaves(inputs._replace(scenario=with_parameters(inputs.scenario, leaves), noise=noise))
 
     touched: list[bool] = []
 

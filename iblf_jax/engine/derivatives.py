@@ -189,8 +189,8 @@ class DerivativeStep:
 
         def one(scenario, before, eps):
             # On arrays a Jacobian for a few tangents would cost more than the tangents.
-            loop = evaluate if not form.scalar else preaccumulated(inputs.scenario, self.directions, eps, before.state)
-            after, sample, begun = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
+            loop = evaluate if not form.scalar or before.state.held else preaccumulated(inputs.scenario, self.directions, eps, before.state)
+            after, sample, begun, _ = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
             outer = outers_of(inputs.folds, begun, sample)
             return (floats_of_carry(after)[0], [o.vector for o in outer]), (after, [o.weight for o in outer])
 

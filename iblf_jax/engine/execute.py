@@ -88,9 +88,10 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
     return on_scan()
 
 
-def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Inputs:
-    """What a run is made from."""
-    return Inputs(scenario, folds, dt, jnp.asarray(run.steps, dt.dtype))
+def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: Any = None) -> Inputs:
+    """What a run is made from; `noise` is the key of a sampled loop's."""
+    noise = () if scenario.sampling is None else jnp.zeros((4,), dt.dtype) if noise is None else noise.astype(dt.dtype)
+    return Inputs(scenario, folds, dt, jnp.asarray(run.steps, dt.dtype), noise=noise)
 
 
 def executor_named(name: str) -> Executor:
@@ -155,7 +156,7 @@ def run_batch(
 
     Args:
       scenario: the scenario that all runs share, canonical.
-      varied: path -> values, batch axis first; each run replaces these leaves.
+      varied: path -> values, batch axis first; each run replaces these leaves, and `sampling.NOISE_NAME`, the key of its noise.
       folds: the metrics.
       dt: time step, () [s].
       run: what to run, static.
@@ -179,15 +180,16 @@ def run_batch(
     return with_fallback(backend, run_on, on_scan)
 
 
-def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto") -> Outcome:
+def run_one(scenario: Scenario, folds: Any, dt: jax.Array, noise: jax.Array | None, run: Run, *, backend: str = "auto") -> Outcome:
     """One run; call it inside `jit`, and do not batch or differentiate it from outside.
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
+      noise: key of a sampled loop's noise.
       backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native where there is a compiler.  What
         is long or does not lower is, on "auto" and "xla", on scan, without a warning.
     """
-    inputs = inputs_of(scenario, folds, dt, run)
+    inputs = inputs_of(scenario, folds, dt, run, noise)
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)
 
     def run_on(name):
@@ -210,9 +212,9 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
         return on_scan()
 
 
-def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run) -> Outcome:
+def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: jax.Array | None = None) -> Outcome:
     """One run for reverse mode: few states are in memory at a time; `run` records nothing."""
-    inputs = inputs_of(scenario, folds, dt, run)
+    inputs = inputs_of(scenario, folds, dt, run, noise)
     return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 

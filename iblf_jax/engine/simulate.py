@@ -23,7 +23,9 @@ from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
+from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.stability import RADIUS
 
 MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""
@@ -47,6 +49,7 @@ def simulate(
     metrics: Sequence[Fold] | None = None,
     throw: bool = False,
     backend: str = "auto",
+    seed: int = 0,
 ) -> Rollout:
     """Runs a scenario with a fixed step and returns everything that can be looked at.
 
@@ -69,6 +72,7 @@ def simulate(
         compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside your own `jit` or `vmap` a run
         is plain JAX; where it is differentiated by numbers of the scenario, it and its first and second derivatives are the kernel's if
         there is one, but for "xla".  Derivatives are of all that is recorded, so record little where only metrics matter.
+      seed: fixes the noise of a sensor; the run is number 0 of a study with this seed.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -86,24 +90,27 @@ def simulate(
     if steps // record_every > MOST_SAMPLES:
         remedy = f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all the same."
         raise checks.fail("record_every", record_every, f"at most {MOST_SAMPLES} recorded samples of {steps} steps", remedy)
-    scenario = canonical(scenario)
+    scenario, seed = canonical(scenario), checks.seed("seed", seed)
+    check_step(scenario, dt)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario.n)
-    step_size = jnp.asarray(dt, dtype)
-    result = simulate_unchecked(scenario, folds, step_size, steps=steps, method=method, record_every=record_every, backend=backend)
+    step_size, noise = jnp.asarray(dt, dtype), noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
+    result = simulate_unchecked(scenario, folds, step_size, noise, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
         _report(result, steps, throw)
     return result
 
 
-def simulate_unchecked(scenario: Scenario, folds, dt, *, steps: int, method: str, record_every: int, backend: str = "auto") -> Rollout:
+def simulate_unchecked(
+    scenario: Scenario, folds, dt, noise: jax.Array | None = None, *, steps: int, method: str, record_every: int, backend: str = "auto"
+) -> Rollout:
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_now(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend)
+        outcome = run_now(scenario, folds, dt, noise, run._replace(mechanism=mechanism_of(scenario)), backend=backend)
     else:
-        outcome = run_transformable(scenario, folds, dt, run, backend=backend)
-    arrays, controller_state, observer_state = outcome.records
+        outcome = run_transformable(scenario, folds, dt, noise, run, backend=backend)
+    arrays, controller_state, observer_state, actuator_state, measured = outcome.records
     return Rollout(
         scenario=scenario,
         controller_state=controller_state,
@@ -112,6 +119,8 @@ def simulate_unchecked(scenario: Scenario, folds, dt, *, steps: int, method: str
         status=outcome.status,
         fastest_mode=outcome.fastest_mode,
         dt=dt,
+        actuator_state=actuator_state,
+        measured=measured,
         method=method,
         steps=steps,
         **arrays,
@@ -124,7 +133,7 @@ def _report(result: Rollout, steps: int, throw: bool) -> None:
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
     failed = status & FAILED
-    told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED)
+    told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW)
     if not told:
         return
     heading = f"{'The run failed' if failed else 'Look again'}: {describe(told)}."
@@ -156,10 +165,17 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
     elif status & Status.INACCURATE:
         error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
-        dt = find_dt(result.scenario, duration=steps * float(result.dt), method=result.method)
+        known = checks.is_concrete(result.scenario)
+        dt = f"dt={find_dt(result.scenario, duration=steps * float(result.dt), method=result.method):g}" if known else "a smaller one"
         texts.append(
             f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where {100 * TOLERANCE:g} % are tolerated: "
-            f"dt = {float(result.dt):g} s is too large for what drives this loop. Take dt={dt:g}."
+            f"dt = {float(result.dt):g} s is too large for what drives this loop. Take {dt}."
+        )
+    if status & Status.SAMPLING_TOO_SLOW:
+        texts.append(
+            f"From one period to the next the loop grows, by {float(metrics[RADIUS]):.4g} at the worst of the instants that were looked "
+            "at. Sample faster (ij.recommended_period says how fast), shorten the delay, or lower controller.K2, observer.kf or the gains "
+            "of the velocity's filter."
         )
     if status & Status.GUARD_STAYED:
         texts.append(

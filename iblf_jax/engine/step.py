@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,8 +25,8 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.mechanism import Mechanism
-from iblf_jax.simulation import accuracy, integrators, stability
-from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation import accuracy, integrators, sampling, stability
+from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample
 
@@ -49,6 +50,8 @@ class Inputs(NamedTuple):
     dt: jax.Array
     steps: jax.Array
     """(), a float: whole numbers are no leaves of a scalar program."""
+    noise: Any = ()
+    """Of a sampled loop, the key of each run's noise (`sampling.noise_key`)."""
     direction: Any = ()
     """Tangents of leaves, where a step takes them as data."""
 
@@ -96,7 +99,7 @@ def sample_status(sample: Sample) -> jax.Array:
 
 def is_sound(state: LoopState) -> jax.Array:
     """Whether a state is finite and slow enough to be a robot's, () bool."""
-    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)])
+    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(moving(state))])
     return jnp.all(finite) & jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT)
 
 
@@ -111,12 +114,14 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     Args:
       inputs: of the run.
       method: the integrator.
-      jacobian: the closed loop's at the start, by the numbers that `accuracy` watches.
+      jacobian: what a `Probe` has found at the start.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
     blank = _begun(inputs.folds, _blank_sample(inputs, state))
-    there = jax.lax.stop_gradient(state)
-    estimate = accuracy.begin(method, jax.lax.stop_gradient(jacobian), there)
+    there, jacobian = jax.lax.stop_gradient((state, jacobian))
+    if inputs.scenario.sampling is not None:
+        jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), there, jacobian)
+    estimate = accuracy.begin(method, jacobian, there)
     return Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(zero), zero, there), estimate)
 
 
@@ -153,6 +158,8 @@ class Advanced(NamedTuple):
     sample: Sample
     accumulators: tuple
     """Of the folds, before the sample."""
+    state: LoopState
+    """At the instant, after what is due there."""
 
 
 def _as_it_is(function: Callable) -> Callable:
@@ -181,32 +188,46 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
       loop: stands for `closed_loop.evaluate`.
     """
     scenario, dt, steps = inputs.scenario, inputs.dt, inputs.steps
-    t, moving = index.astype(dt.dtype) * dt, index.astype(dt.dtype) < steps
-    covered = jnp.where(moving, dt, jnp.zeros_like(dt))
-    at = form.piece(loop)
-    stepped = integrators.step(method, lambda t, state: at(scenario, t, state, covered), t, carry.state, dt, rolled=form.rolled)
+    t, goes_on = index.astype(dt.dtype) * dt, index.astype(dt.dtype) < steps
+    covered = jnp.where(goes_on, dt, jnp.zeros_like(dt))
+    at, state = form.piece(loop), carry.state
+    if scenario.sampling is None:
+        stepped = integrators.step(method, lambda t, state: at(scenario, t, state, covered), t, state, dt, rolled=form.rolled)
+    else:
+        now = sampling.instant(scenario.sampling, dt, index)
+        state = sampled_if_due(scenario, t, state, now, inputs.noise)
+        order = integrators.tableau(method).order
+        a, b = sampling.arriving(scenario.sampling, dt, now, state.held.commands, order)
 
-    def folded_in(inputs, carry, index, moving, stepped):
+        def between(since, moved):
+            return at(scenario, t + since, still(state, moved), covered, a + b * (since / dt))
+
+        stepped = integrators.step(method, between, jnp.zeros_like(dt), moving(state), dt, rolled=form.rolled)
+        stepped = stepped._replace(state=still(state, stepped.state))
+
+    def folded_in(inputs, carry, index, goes_on, stepped):
         folds, dt, sample = inputs.folds, inputs.dt, stepped.first
         begun = _begun_at(index, folds, sample, carry.accumulators)
         accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
         here = Nearest(near, sample.t, jax.lax.stop_gradient(carry.state))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
-        estimate = accuracy.observed(carry.accuracy, method, dt, index, stepped.slopes, sample.upper - sample.lower)
+        width, held = sample.upper - sample.lower, scenario.sampling is not None
+        estimate = accuracy.observed(carry.accuracy, method, dt, index, stepped.slopes, width, held)
 
         status = carry.status | sample_status(sample)
         sound = is_sound(stepped.state) & (status & int(Status.NOT_FINITE) == 0)
-        state = keep_if(sound & moving, stepped.state, carry.state)
-        status |= flag(~sound & moving, Status.NOT_FINITE)
-        return Advanced(Carry(state, accumulators, status, nearest, estimate), sample, begun)
+        after = keep_if(sound & goes_on, stepped.state, carry.state)
+        status |= flag(~sound & goes_on, Status.NOT_FINITE)
+        return Advanced(Carry(after, accumulators, status, nearest, estimate), sample, begun, carry.state)
 
-    return form.piece(folded_in)(inputs, carry, index, moving, stepped)
+    return form.piece(folded_in)(inputs, carry._replace(state=state), index, goes_on, stepped)
 
 
 def recorded(folds: Any, begun: tuple, sample: Sample, state: LoopState):
     """What a run keeps of an instant: the sample, and the states of law and observer."""
-    return {name: getattr(sample, name) for name in SIGNALS}, state.controller, state.observer
+    states = (state.controller, state.observer, state.actuator, state.held.measured if state.held else ())
+    return {name: getattr(sample, name) for name in SIGNALS}, *states
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,7 +246,7 @@ class TimeStep:
     def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, form: Form):
         """The carry after the step, and what is recorded."""
         found = advance(inputs, carry, index, self.method, form)
-        return found.carry, self.record(inputs.folds, found.accumulators, found.sample, carry.state) if self.record else ()
+        return found.carry, self.record(inputs.folds, found.accumulators, found.sample, found.state) if self.record else ()
 
 
 class Probed(NamedTuple):
@@ -251,7 +272,7 @@ class Probe:
     def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
-        watched, whole, x = accuracy.places(start), ravel_pytree(start)[1], carry.state
+        watched, whole, x = accuracy.places(start), ravel_pytree(surroundings(start))[1], carry.state
         iteration = index - watched.size
         rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
@@ -259,7 +280,7 @@ class Probe:
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
-            return ravel_pytree(form.piece(evaluate)(inputs.scenario, carry.time, whole(y), inputs.dt)[0])[0]
+            return ravel_pytree(change(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece))[0]
 
         w, growth = stability.along(rate_at, x, direction), carry.growth
         if len(watched) < x.size:
@@ -273,18 +294,21 @@ def probe_steps(scenario: Scenario) -> int:
     """Steps of a `Probe`."""
     state = initial_state(scenario)
     watched = accuracy.places(state).size
-    return watched + (0 if watched == ravel_pytree(state)[0].size else stability.POWER_ITERATIONS)
+    return watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
 
 
-def fastest_mode(probed: Probed) -> jax.Array:
-    """The mode that a `Probe` has found, () [1/s]."""
+def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
+    """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
+    if scenario.sampling is not None:
+        size = ravel_pytree(moving(initial_state(scenario)))[0].size
+        return stability.growth_rate_by(probed.jacobian[:size, :size])
     complete = len(probed.jacobian) == probed.state.size
     return stability.growth_rate_by(probed.jacobian) if complete else stability.growth_rate(probed.growth)
 
 
 def probed(time: jax.Array, state: LoopState) -> Probed:
     """The carry of a `Probe`."""
-    x, watched = ravel_pytree(state)[0], accuracy.places(state).size
+    x, watched = ravel_pytree(surroundings(state))[0], accuracy.places(state).size
     return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype)))
 
 
@@ -316,9 +340,15 @@ def verdict(inputs: Inputs, method: str, carry: Carry, kicked: accuracy.Unseen, 
       instants: what a `Probe` has found at some of them.
     """
     estimate = accuracy.between_stages(carry.accuracy, kicked)
-    modes = jax.vmap(fastest_mode)(instants)
+    modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     status = carry.status | flag(inputs.dt * mode > integrators.tableau(method).stability, Status.STEP_TOO_LARGE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
-    metrics = accuracy.results(estimate) | finished(inputs.folds, carry.accumulators)
+    metrics = accuracy.results(estimate)
+    if inputs.scenario.sampling is not None:
+        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(instants.jacobian)
+        radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
+        metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
+        status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)
+    metrics |= finished(inputs.folds, carry.accumulators)
     return Outcome(None, metrics, status, mode)

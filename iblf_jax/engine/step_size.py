@@ -11,7 +11,7 @@ import dataclasses
 import math
 import warnings
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +19,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks
-from iblf_jax.core.status import VELOCITY_LIMIT
+from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import STEP_SIZE_CHUNK
+from iblf_jax.engine.step import Run
+from iblf_jax.engine.transformable import run_now
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import step as one_step
@@ -121,7 +123,7 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
 
 
 @jax.jit
-def _along_reference(scenario: Scenario, times: jax.Array) -> LoopState:
+def along_reference(scenario: Scenario, times: jax.Array) -> LoopState:
     """States of a loop that follows its reference exactly, time axis first."""
 
     def at(t):
@@ -133,7 +135,7 @@ def _along_reference(scenario: Scenario, times: jax.Array) -> LoopState:
 
 def fastest_along(scenario: Scenario, times: np.ndarray) -> float:
     """The fastest mode at the start and along the reference at some times [1/s]; infinite where the loop has no finite derivative."""
-    states = _along_reference(scenario, jnp.asarray(times, scenario.initial.q.dtype))
+    states = along_reference(scenario, jnp.asarray(times, scenario.initial.q.dtype))
     along = [(t, jax.tree.map(lambda x, i=i: x[i], states)) for i, t in enumerate(times)]
     return max(_mode(scenario, t, state) for t, state in [(0.0, initial_state(scenario)), *along])
 
@@ -167,6 +169,8 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     order = tableau(method).order
     scenario = canonical(scenario)
     duration = checks.positive_number("duration", duration, "s")
+    if scenario.sampling is not None:
+        return _find_part(scenario, duration, method)
     mode = fastest_along(scenario, np.linspace(0.0, duration, LOOKS))
     if not np.isfinite(mode):
         raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
@@ -188,3 +192,27 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         stacklevel=3,
     )
     return for_modes
+
+
+def _find_part(scenario: Scenario, duration: float, method: str) -> float:
+    """As `find_dt` where the law is sampled: the largest part of a period, 1, 2 or 5 times a power of ten of them, that will do."""
+    sampling: Any = scenario.sampling
+    period, noise = float(sampling.period), jnp.zeros((4,))
+    periods = max(math.ceil(duration / period - 1e-9), 1)
+    parts, before, poor_before, coarser = 1, None, 0, period
+    while periods * parts <= MOST_TRIED:
+        dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
+        found = run_now(scenario, (), dt, noise, Run(periods * parts, method, parts))
+        q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
+        poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
+        if before is not None and not poor_before and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL:
+            return coarser
+        before, poor_before, coarser, parts = q, poor, float(dt), _next_round(parts)
+    warnings.warn(f"No step down to {coarser:g} s makes this run accurate: the loop may magnify every error.", stacklevel=4)
+    return coarser
+
+
+def _next_round(parts: int) -> int:
+    """The next of 1, 2, 5, 10, 20 ..."""
+    lead = int(str(parts)[0])
+    return parts // lead * {1: 2, 2: 5, 5: 10}[lead]

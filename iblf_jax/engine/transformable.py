@@ -54,14 +54,16 @@ run_now = jax.jit(execute.run_one, static_argnames=("run", "backend"))
 """A run of which all numbers are known."""
 
 
-def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto") -> Outcome:
+def run_transformable(
+    scenario: Scenario, folds: Any, dt: jax.Array, noise: jax.Array | None, run: Run, *, backend: str = "auto"
+) -> Outcome:
     """One run that may be batched and differentiated from outside.
 
     Args:
-      scenario, folds, dt, run: as `execute.run_one`.
+      scenario, folds, dt, noise, run: as `execute.run_one`.
       backend: what its derivatives are computed on: "xla" for plain JAX, else kernels where they can be built.
     """
-    leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run))
+    leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run, noise))
     name, reason = execute.automatic()
     runs = Runs(treedef, run._replace(mechanism=mechanism_of(scenario)), name, (False,) * len(leaves))
     return _differentiable(runs)(*leaves) if backend != "xla" and reason is None else _plain(runs, *leaves)
@@ -116,8 +118,8 @@ def _put(leaves: tuple, places: tuple[int, ...], moved: Sequence[jax.Array]) -> 
 def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
-        scenario, folds, dt, *_ = jax.tree.unflatten(runs.treedef, leaves)
-        return run_now(scenario, folds, dt, runs.run._replace(mechanism=mechanism_of(scenario)))
+        inputs = jax.tree.unflatten(runs.treedef, leaves)
+        return run_now(inputs.scenario, inputs.folds, inputs.dt, inputs.noise, runs.run._replace(mechanism=mechanism_of(inputs.scenario)))
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.files.values import (
@@ -41,6 +41,9 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     controllers.Controller: ("controllers", controllers.MEMBERS),
     barriers.Barrier: ("barriers", barriers.MEMBERS),
     observers.Observer: ("observers", observers.MEMBERS),
+    sensors.Sensor: ("sensors", sensors.MEMBERS),
+    sensors.Velocity: ("sensors", sensors.VELOCITIES),
+    actuators.Actuator: ("actuators", actuators.MEMBERS),
 }
 """Contract -> the module that holds the family, and the family's members by name."""
 

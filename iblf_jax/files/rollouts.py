@@ -31,7 +31,12 @@ from iblf_jax.simulation.signals import SIGNALS
 if TYPE_CHECKING:
     import xarray
 
-STATES = {"controller_state": "state of the law, in its own unit", "observer_state": "state of the observer, in its own unit"}
+STATES = {
+    "controller_state": "state of the law, in its own unit",
+    "observer_state": "state of the observer, in its own unit",
+    "actuator_state": "state of the actuator, in its own unit",
+    "measured": "what the sensor told last, positions [rad] and velocities [rad/s]",
+}
 """Recorded state -> description."""
 
 ENDINGS = (".nc", ".npz")

@@ -1,7 +1,8 @@
 """The contract of a disturbance observer.
 
 An observer knows the model, measures q and q', is told the torque that was applied, and gives f_hat, an estimate of the
-lumped uncertain term f of (2.1).  Its state is part of the loop's state and is integrated with the plant.
+lumped uncertain term f of (2.1).  Its state is part of the loop's state and is integrated with the plant; in a sampled loop it goes from
+one period to the next.
 """
 
 from __future__ import annotations
@@ -17,7 +18,11 @@ State = Any
 
 
 class Observer(Protocol):
-    """What the package asks of an observer."""
+    """What the package asks of an observer.
+
+    It may also have `advance(t, q, dq, tau, model, state, period)`, its state a period [s] later if what it measures and the torque stay as
+    they are, for sampled loops; they take a step of Euler where there is none.
+    """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there."""

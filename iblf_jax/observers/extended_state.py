@@ -55,6 +55,11 @@ class ExtendedState:
             got = [name for name, there in named.items() if there]
             raise checks.fail("ExtendedState", got, "either `bandwidth`, or both `l1` and `l2`", "Such as ExtendedState(bandwidth=40.0).")
 
+    @property
+    def _gains(self) -> tuple[jax.Array, jax.Array]:
+        """l1 [1/s] and l2 [1/s^2], (n,)."""
+        return (self.l1, self.l2) if self.bandwidth is None else (2.0 * self.bandwidth, self.bandwidth**2)
+
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> ExtendedStateValues:
         """The measured momentum, and no estimate yet."""
         return ExtendedStateValues(matvec(model.mass_matrix(q), dq), jnp.zeros_like(q))
@@ -67,7 +72,41 @@ class ExtendedState:
         self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: ExtendedStateValues
     ) -> ExtendedStateValues:
         """p_hat' and f_hat'."""
-        l1, l2 = (self.l1, self.l2) if self.bandwidth is None else (2.0 * self.bandwidth, self.bandwidth**2)
+        l1, l2 = self._gains
         innovation = matvec(model.mass_matrix(q), dq) - state.p_hat
         drift = energy_gradient(model, q, dq) - model.gravity(q)
         return ExtendedStateValues(tau + drift + state.f_hat + l1 * innovation, l2 * innovation)
+
+    def advance(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: ExtendedStateValues, period: jax.Array
+    ) -> ExtendedStateValues:
+        """p_hat and f_hat a period later, exact: with z = (p_hat, f_hat), z' = A z + b, so z moves by A^-1 (exp(A period) - 1) z'.
+
+        exp(A T) = exp(-w T) [C + S (A + w)],  w = l1 / 2,  S = sinh(d T) / d,  C = cosh(d T),  d^2 = w^2 - l2.
+        """
+        l1, l2 = self._gains
+        rate = self.derivative(t, q, dq, tau, model, state)
+        w = 0.5 * l1
+        fade = jnp.exp(-w * period)
+        if self.bandwidth is None:
+            square = (w * w - l2) * period**2
+            C, S = _even_cosh(square), period * _even_sinh(square)
+        else:
+            C, S = jnp.ones_like(w), period * jnp.ones_like(w)
+        # (exp(A T) - 1) z', and then A^-1 of it: A = [[-l1, 1], [-l2, 0]].
+        p = fade * (C * rate.p_hat + S * (rate.f_hat - w * rate.p_hat)) - rate.p_hat
+        f = fade * (C * rate.f_hat + S * (w * rate.f_hat - l2 * rate.p_hat)) - rate.f_hat
+        moved_p = -f / l2
+        return ExtendedStateValues(state.p_hat + moved_p, state.f_hat + p + l1 * moved_p)
+
+
+def _even_cosh(square: jax.Array) -> jax.Array:
+    """Cosh of a root, real or not, by its square."""
+    root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
+    return jnp.where(jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.cosh(root), jnp.cos(root)))
+
+
+def _even_sinh(square: jax.Array) -> jax.Array:
+    """Sinh of a root divided by it, real or not, by its square."""
+    root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
+    return jnp.where(jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.sinh(root), jnp.sin(root)) / root)

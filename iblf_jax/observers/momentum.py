@@ -7,7 +7,7 @@ import jax
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.observers.printed import STARTS, initial_eta, kf_advice
+from iblf_jax.observers.printed import STARTS, held_eta, initial_eta, kf_advice
 from iblf_jax.robots import Robot, energy_gradient
 
 
@@ -49,3 +49,9 @@ class Momentum:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
         return -self.kf * (f_hat + tau + energy_gradient(model, q, dq) - model.gravity(q))
+
+    def advance(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array, period: jax.Array
+    ) -> jax.Array:
+        """Eta a period later, (n,) [N m]: exact, as (3.11) is linear in eta."""
+        return held_eta(self, t, q, dq, tau, model, state, period)

@@ -24,3 +24,9 @@ class NoObserver:
     def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: tuple[()]) -> tuple[()]:
         """No state, no rate."""
         return ()
+
+    def advance(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: tuple[()], period: jax.Array
+    ) -> tuple[()]:
+        """No state."""
+        return ()

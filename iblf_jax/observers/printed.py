@@ -53,6 +53,12 @@ class Printed:
         f_hat = self.estimate(t, q, dq, model, state)
         return -self.kf * (f_hat + tau - model.coriolis(q, dq, dq) - model.gravity(q))
 
+    def advance(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array, period: jax.Array
+    ) -> jax.Array:
+        """Eta a period later, (n,) [N m]: exact, as (3.11) is linear in eta."""
+        return held_eta(self, t, q, dq, tau, model, state, period)
+
 
 def kf_advice(kf: jax.Array) -> list[str]:
     """What to tell a user whose kf is below the condition of Theorem 2; nothing for traced values."""
@@ -60,6 +66,12 @@ def kf_advice(kf: jax.Array) -> list[str]:
         return []
     need = "Theorem 2 needs kf > 1/2 on every joint (3.17), and kf > 1 where f changes (3.25)"
     return [f"observer.kf = {kf}: {need}; below it nothing is claimed. Raise kf."]
+
+
+def held_eta(observer, t, q, dq, tau, model: Robot, state: jax.Array, period: jax.Array) -> jax.Array:
+    """Eta a period later where all else is held, (n,) [N m]: eta' = kf (eta* - eta), so eta* - eta falls by exp(-kf period)."""
+    rate = observer.derivative(t, q, dq, tau, model, state)
+    return state - jnp.expm1(-observer.kf * period) / observer.kf * rate
 
 
 def initial_eta(observer, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:

@@ -14,6 +14,10 @@ at the start.  So the error of the positions is about
 
     max_k max(|L_q|, |L_q + R L_y|).
 
+Where the law is sampled its torque jumps from step to step, and no difference of steps says anything: there a step's own error is told by
+its stages alone.  For x' = A x those of rk4 have k_3 - k_2 = (dt A / 2) (k_2 - k_1), which says how large |dt A| is, and the step's error
+is dt |k_3 - k_2| |dt A|^2 / 30; again ten times that is taken.  J is what the map from a period to the next is as a rate.
+
 What the stages of a step cannot see, a reference or a disturbance that goes through whole periods between them, is looked for on its own
 (`between_stages`).  Against runs at a sixteenth of the step the estimate is a third to thirty times the error where that matters, above
 1e-4 of the tube, and larger below.
@@ -30,8 +34,8 @@ import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.robots import at_time
-from iblf_jax.simulation.closed_loop import LoopState
-from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.closed_loop import LoopState, surroundings
+from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST
 
@@ -65,16 +69,19 @@ class Accuracy(NamedTuple):
 
 
 def _watched(state: LoopState, of: LoopState | None = None) -> list:
-    """The leaves of `of`, `state` if not given, that stand where `state` has positions, velocities and the observer's floating-point state.
+    """The leaves of `of`, `state` if not given, that stand where `state` has positions, velocities and the floating-point state of
+    observer and actuator.
 
     What a law has learnt is left out.
     """
-    parts = [jax.tree.leaves((x.q, x.dq, x.observer)) for x in (state, of or state)]
+    parts = [jax.tree.leaves((x.q, x.dq, x.observer, x.actuator)) for x in (state, of or state)]
     return [x for kind, x in zip(*parts, strict=True) if jnp.issubdtype(kind.dtype, jnp.floating)]
 
 
 def places(state: LoopState) -> np.ndarray:
-    """Where the numbers that are watched, m of them, stand in the whole state, flat."""
+    """Where the numbers that are watched, m of them, stand in what `closed_loop.surroundings` gives, flat; all of a sampled loop."""
+    if state.held:
+        return np.arange(sum(x.size for x in jax.tree.leaves(surroundings(state))))
     leaves, structure = jax.tree.flatten(state)
     ends = np.cumsum([0, *(x.size for x in leaves)])
     numbered = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
@@ -100,6 +107,8 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     n = state.q.size
     table = tableau(method)
     none = jnp.zeros((2 * n,), jacobian.dtype)
+    if state.held:
+        return Accuracy((none,), none, response(jacobian, n)[:, :n], none[:n], none[0])
     pending = (none,) * ((len(table.differences) - 1) // (2 if table.halfway else 1))
     return Accuracy(pending, none, response(jacobian, n), none[:n], none[0])
 
@@ -110,7 +119,9 @@ def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
 
 
-def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, slopes: list[LoopState], width: jax.Array) -> Accuracy:
+def observed(
+    accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, slopes: list[LoopState], width: jax.Array, held: bool = False
+) -> Accuracy:
     """The estimate after one more instant.
 
     Args:
@@ -120,8 +131,11 @@ def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, s
       index: number of the instant, () int.
       slopes: of the stages of the step from it.
       width: of the tube, (n,) [rad].
+      held: whether the torque is, as in a sampled loop.
     """
     table, n = tableau(method), width.size
+    if held:
+        return _observed_within(accuracy, table, dt, slopes, width)
     weights, each = table.differences[::-1], 2 if table.halfway else 1
     width = jax.lax.stop_gradient(width)
     here = _rate(accuracy, slopes[0])
@@ -135,6 +149,23 @@ def observed(accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, s
     size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
     relative = jnp.maximum(accuracy.relative, jnp.max(size / width))
     return Accuracy(tuple(pending), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
+
+
+def _observed_within(accuracy: Accuracy, table: Tableau, dt: jax.Array, slopes: list[LoopState], width: jax.Array) -> Accuracy:
+    """As `observed`, from the stages of one step; a method of one stage is held against the step before."""
+    n = width.size
+    rates = [_rate(accuracy, slope._replace(observer=(), actuator=())) for slope in slopes]
+    if table.halfway:
+        early, late = (jax.tree.map(jnp.subtract, slopes[i + 1], slopes[i]) for i in (0, table.halfway - 1))
+        sizes = [sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part))) for part in (early, late)]
+        fast = jnp.minimum(2.0 * sizes[1] / jnp.maximum(sizes[0], jnp.finfo(dt.dtype).tiny), 2.0)
+        error = (rates[table.halfway] - rates[table.halfway - 1]) * fast**2 / 3.0
+    else:
+        error = (rates[-1] - (rates[0] if len(rates) > 1 else accuracy.pending[0])) / 2.0
+    drift = (1.0 - SLOWEST * dt) * accuracy.drift + dt * jnp.abs(error)
+    size = jnp.maximum(drift[:n], drift[n:])
+    relative = jnp.maximum(accuracy.relative, jnp.max(size / jax.lax.stop_gradient(width)))
+    return Accuracy((rates[0],), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
 class Unseen(NamedTuple):
@@ -182,7 +213,9 @@ def unseen(scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Arra
     spread = jnp.asarray(np.arange(INSTANTS) * 0.6180339887498949 % 1.0, dt.dtype)
     indices = jnp.floor(spread * jnp.asarray(steps, spread.dtype)).astype(jnp.int32)
     missed, push, width = jax.vmap(at)(indices)
-    return Unseen(jnp.max(missed, axis=0), jnp.max(push, axis=0), jnp.min(width, axis=0))
+    missed = jnp.max(missed, axis=0)
+    # A sampled law reads them at its samples: what they do between is no error of the step.
+    return Unseen(missed if scenario.sampling is None else jnp.zeros_like(missed), jnp.max(push, axis=0), jnp.min(width, axis=0))
 
 
 def kicked(scenario: Scenario, found: Unseen) -> Unseen:

@@ -1,25 +1,55 @@
-"""The closed loop: the one place where plant, law and observer meet.
+"""The closed loop: the one place where plant, sensor, law, observer and actuator meet.
 
-    state  x = (q, q', state of the law, state of the observer)
+    state  x = (q, q', state of the law, state of the observer, state of the actuator)
     q" = M^-1 (tau + disturbance + friction - C q' - G)                 with the plant's M, C, G, friction at time t
     f  = M0 q" + C0 q' + G0 - tau                                       what the observer should have estimated      (2.1)
     V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde                                                             (3.12)
 
 `evaluate` gives the rate of the state and everything that can be looked at; where only the rate is used (the inner stages of an
 integrator) the compiler drops the rest.
+
+Where the law is sampled (`Sampling`), `sampled` runs sensor, law and observer at the start of a period, and the rate is that of what moves
+between: q, q' and the actuator.  Then alpha, V1 and f_hat of a sample are what the law said last.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.actuators import Ideal
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.robots import at_time, friction_torque
+from iblf_jax.sensors import Measurement
+from iblf_jax.simulation.sampling import Instant, normals
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
+
+
+class Said(NamedTuple):
+    """What a law says at an instant, besides its torque."""
+
+    alpha: jax.Array
+    V1: jax.Array
+    f_hat: jax.Array
+    guard_active: jax.Array
+    saturated: jax.Array
+
+
+class Held(NamedTuple):
+    """What a sampled loop keeps from sample to sample, besides the states of law and observer."""
+
+    commands: jax.Array
+    """Newest first, (queue + 1, n) [N m]."""
+    sensor: Any
+    """State of the sensor."""
+    measured: Measurement
+    """What the sensor told last."""
+    said: Said
 
 
 class LoopState(NamedTuple):
@@ -29,16 +59,115 @@ class LoopState(NamedTuple):
     dq: jax.Array
     controller: Any
     observer: Any
+    actuator: Any = ()
+    held: Any = ()
+    """A `Held` where the law is sampled."""
 
 
 def initial_state(scenario: Scenario) -> LoopState:
-    """The state at t = 0."""
-    q, dq = scenario.initial.q, scenario.initial.dq
-    return LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), scenario.observer.init(q, dq, scenario.model))
+    """The state at t = 0; torques that are under way then are those that hold the model still."""
+    q, dq, n = scenario.initial.q, scenario.initial.dq, scenario.n
+    state = LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), scenario.observer.init(q, dq, scenario.model))
+    if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
+        return state
+    still = scenario.model.gravity(q)
+    state = state._replace(actuator=scenario.actuator.init(still))
+    if scenario.sampling is None:
+        return state
+    zero, no = jnp.zeros_like(q), jnp.zeros((n,), bool)
+    commands = jnp.repeat(still[None], scenario.sampling.queue + 1, axis=0)
+    sensor = scenario.sensor.init(q, dq, scenario.sampling.period)
+    return state._replace(held=Held(commands, sensor, Measurement(q, dq), Said(zero, zero, zero, no, no)))
+
+
+def moving(state: LoopState) -> LoopState:
+    """What an integrator moves: all of the state, or what is not held between samples."""
+    return state if state.held == () else state._replace(controller=(), observer=(), held=())
+
+
+def still(state: LoopState, moved: LoopState) -> LoopState:
+    """The state, with what has moved."""
+    return moved if state.held == () else state._replace(q=moved.q, dq=moved.dq, actuator=moved.actuator)
+
+
+@jax.jit
+def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Array) -> LoopState:
+    """The state after sensor, law and observer have run.
+
+    Args:
+      scenario: with a sampling.
+      t: start of the period, () [s].
+      state: at t.
+      normal: what the sensor draws, (draws, n).
+    """
+    sampling: Any = scenario.sampling
+    held = state.held
+    measured, sensor = scenario.sensor.measure(state.q, state.dq, normal, sampling.period, held.sensor)
+    q, dq, observer = measured.q, measured.dq, scenario.observer
+    f_hat = observer.estimate(t, q, dq, scenario.model, state.observer)
+    command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
+    after = _advanced(sampling, observer, (t, q, dq, command.tau, scenario.model, state.observer))
+    commands = jnp.concatenate([command.tau[None], held.commands[:-1]])
+    said = Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated)
+    controller = jax.tree.map(lambda x, dx: x + sampling.period * dx, state.controller, rate)
+    return state._replace(controller=controller, observer=after, held=Held(commands, sensor, measured, said))
+
+
+def _advanced(sampling: Any, observer: Any, told: tuple) -> Any:
+    """The observer's state at the start of the next period."""
+    if sampling.observer == "exact" and hasattr(observer, "advance"):
+        return observer.advance(*told, sampling.period)
+    return jax.tree.map(lambda x, dx: x + sampling.period * dx, told[-1], observer.derivative(*told))
+
+
+def sampled_if_due(scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array) -> LoopState:
+    """The state after an instant's sample, if it is the start of a period."""
+    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
+    return jax.lax.cond(now.phase == 0, lambda state: sampled(scenario, t, state, normal), lambda state: state, state)
+
+
+class Surroundings(NamedTuple):
+    """What may be moved a little in a sampled loop to see what it does: the plant, its torque, and what its law remembers."""
+
+    plant: LoopState
+    torque: jax.Array
+    memory: Any
+
+
+def surroundings(state: LoopState) -> Any:
+    """What decides how a loop goes on: its state, or the `Surroundings` of a sampled one."""
+    if state.held == ():
+        return state
+    return Surroundings(moving(state), state.held.commands[0], (state.controller, state.observer, state.held.sensor))
+
+
+def change(scenario: Scenario, t: jax.Array, around: Any, dt: jax.Array | None = None, piece: Callable = lambda function: function) -> Any:
+    """How what `surroundings` gives changes: its rate, or of a sampled loop the plant's rate, the next command and what is remembered then.
+
+    Rounding is left out (`unrounded`): it has no derivative that says anything.
+
+    Args:
+      scenario: what runs.
+      t: time, () [s].
+      around: at t.
+      dt: of the step, () [s]: nothing depends on it, but what is called alike is traced once.
+      piece: what is made of a function that is compiled on its own.
+    """
+    if not isinstance(around, Surroundings):
+        return piece(evaluate)(scenario, t, around, *(() if dt is None else (dt,)))[0]
+    scenario = dataclasses.replace(scenario, sensor=getattr(scenario.sensor, "unrounded", scenario.sensor))
+    state = still(initial_state(scenario), around.plant)
+    controller, observer, sensor = around.memory
+    state = state._replace(controller=controller, observer=observer, held=state.held._replace(sensor=sensor))
+    after = piece(sampled)(scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype))
+    rate = piece(evaluate)(scenario, t, state, 0.0 if dt is None else dt, around.torque)[0]
+    return Surroundings(rate, after.held.commands[0], (after.controller, after.observer, after.held.sensor))
 
 
 @jax.jit  # so that it is traced once for all the places that call it, and `lowering` sees that they call one function
-def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0) -> tuple[LoopState, Sample]:
+def evaluate(
+    scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0, torque: jax.Array | None = None
+) -> tuple[LoopState, Sample]:
     """The rate of the state and the sample at time t.
 
     Args:
@@ -46,27 +175,37 @@ def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array |
       t: time, () [s].
       state: state at t.
       dt: the time that the sample stands for, () [s].
+      torque: what arrives at the actuator, (n,) [N m], where the law is sampled; the last command if not given.
     """
-    plant, model, observer = at_time(scenario.plant, t), scenario.model, scenario.observer
+    plant, model = at_time(scenario.plant, t), scenario.model
     q, dq = state.q, state.dq
     tube = scenario.setting.tube(t)
 
-    f_hat = observer.estimate(t, q, dq, model, state.observer)
-    command, controller_rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
-    observer_rate = observer.derivative(t, q, dq, command.tau, model, state.observer)
-    pushed = command.tau + scenario.disturbance.torque(t, q, dq, plant, model) + friction_torque(plant, dq)
+    if scenario.sampling is None:
+        f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
+        command, controller_rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
+        asked, said = command.tau, Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated)
+    else:
+        asked, said = state.held.commands[0] if torque is None else torque, state.held.said
+    delivered = scenario.actuator.deliver(asked, dq, state.actuator)
+    tau = delivered.tau
+    pushed = tau + scenario.disturbance.torque(t, q, dq, plant, model) + friction_torque(plant, dq)
     ddq = solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
+    rate = LoopState(dq, ddq, (), (), delivered.rate)
+    if scenario.sampling is None:
+        told = scenario.observer.derivative(t, q, dq, asked, model, state.observer)
+        rate = rate._replace(controller=controller_rate, observer=told)
 
     M0, G0 = model.mass_matrix(q), model.gravity(q)
-    f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - command.tau
-    e2, f_tilde = dq - command.alpha, f - f_hat
-    V = jnp.sum(command.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
+    f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
+    e2, f_tilde = dq - said.alpha, f - said.f_hat
+    V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
     sample = Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
         q=q,
         dq=dq,
-        tau=command.tau,
+        tau=tau,
         e1=q - tube.q_d,
         e2=e2,
         xi=tube.xi(q),
@@ -74,15 +213,15 @@ def evaluate(scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array |
         dq_d=tube.dq_d,
         lower=tube.lower,
         upper=tube.upper,
-        alpha=command.alpha,
+        alpha=said.alpha,
         gravity=G0,
         disturbance=f,
-        disturbance_estimate=f_hat,
+        disturbance_estimate=said.f_hat,
         V=V,
-        guard_active=command.guard_active,
-        saturated=command.saturated,
+        guard_active=said.guard_active,
+        saturated=said.saturated | delivered.limited,
     )
-    return LoopState(dq, ddq, controller_rate, observer_rate), sample
+    return rate, sample
 
 
 def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:

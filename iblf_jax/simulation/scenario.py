@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.actuators import Actuator
+from iblf_jax.actuators import Ideal as IdealActuator
 from iblf_jax.bounds import Bounds, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.core import checks
@@ -27,6 +29,9 @@ from iblf_jax.observers import NoObserver, Observer
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
 from iblf_jax.robots._base import mass_matrix_at
+from iblf_jax.sensors import Ideal as IdealSensor
+from iblf_jax.sensors import Sensor
+from iblf_jax.simulation.sampling import Sampling, with_room
 
 
 @component
@@ -49,13 +54,15 @@ PARTS = (
     ("controller", Controller, "iblf_jax.controllers has them; iblf_jax.testing.check_law looks at your own.", ()),
     ("observer", Observer, "iblf_jax.observers has them; NoObserver() for none.", ()),
     ("disturbance", Disturbance, "iblf_jax.disturbances has them; Nothing() for none.", ()),
+    ("sensor", Sensor, "iblf_jax.sensors has them; Ideal() for none.", ()),
+    ("actuator", Actuator, "iblf_jax.actuators has them; Ideal() for none.", ()),
 )
 """Field, protocol, remedy and what may be missing, for each part of a scenario that may be a user's own."""
 
 
 @component
 class Scenario:
-    """Plant, model, reference, bounds, disturbance, law, observer and start of a run.
+    """Plant, model, reference, bounds, disturbance, law, observer and start of a run; and how the law is sampled, told and driven.
 
     Leaves that hold one number a joint may be given as a scalar; they are repeated for the plant's n joints.
 
@@ -68,9 +75,12 @@ class Scenario:
       observer: what estimates f, any of `iblf_jax.observers`; `NoObserver()` if not given.
       disturbance: what acts on the plant and the law does not know, any of `iblf_jax.disturbances`; `Nothing()` if not given.
       model: the robot that law and observer know; the plant itself if not given.
+      sampling: when law and observer run, a `Sampling`; at every instant if not given.
+      sensor: what they are told of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others need a sampling.
+      actuator: what becomes of the torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
 
     Raises:
-      ValueError: if a leaf has the wrong number of joints, or model and plant differ in theirs.
+      ValueError: if a leaf has the wrong number of joints, model and plant differ in theirs, or a sensor comes without a sampling.
     """
 
     plant: Robot
@@ -81,6 +91,9 @@ class Scenario:
     observer: Observer = NoObserver()
     disturbance: Disturbance = Nothing()
     model: Robot = None  # type: ignore[assignment]
+    sampling: Sampling | None = None
+    sensor: Sensor = IdealSensor()
+    actuator: Actuator = IdealActuator()
 
     def check(self) -> None:
         """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""
@@ -92,6 +105,11 @@ class Scenario:
             raise checks.fail("Scenario.initial", self.initial, "an Initial", "Such as Initial(q=[0.8, 0.8]).")
         if not isinstance(self.bounds, Bounds):
             raise checks.fail("Scenario.bounds", self.bounds, "a Bounds", "Such as Bounds(lower=Constant(0.1), upper=Constant(0.9)).")
+        if not isinstance(self.sampling, Sampling | None):
+            raise checks.fail("Scenario.sampling", self.sampling, "a Sampling, or None", "Such as ij.Sampling(period=2e-3).")
+        if self.sampling is None and not isinstance(self.sensor, IdealSensor):
+            remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
+            raise checks.fail("Scenario.sensor", type(self.sensor).__name__, "an Ideal sensor where no law is sampled", remedy)
         if self.model.n != self.plant.n:
             raise checks.fail("Scenario.model", f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has")
         for field in dataclasses.fields(self):
@@ -117,8 +135,8 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
 
     Args:
       scenario: what to change; it stays as it is.
-      parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance, initial; each as `Scenario` takes it, so
-        that one number stands for one number a joint.  Numbers take the scenario's floating-point type.
+      parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance, initial, sampling, sensor, actuator; each as
+        `Scenario` takes it, so that one number stands for one number a joint.  Numbers take the scenario's floating-point type.
 
     Returns:
       A new Scenario; it runs like any other, and compiles where the structure is new.
@@ -201,6 +219,7 @@ def canonical(scenario: Scenario) -> Scenario:
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
     keep_programs()
     check_values(scenario)
+    scenario = with_room(scenario)
     dtype = _shared_dtype(scenario)
     scenario = _typed(scenario, dtype)
     if checks.is_concrete(scenario):

@@ -6,23 +6,33 @@ without any physics behind them.  So every run measures its fastest mode, at its
 (there the barrier is stiffest) and at its end, and says when the step was too large.
 
 Derivatives of the loop are central differences of its rate: the rate is compiled as it is, its derivative would take thrice as long.
+
+Where the law is sampled, what counts is the map from one period to the next.  Its derivative follows from those of plant and law: the
+plant's state goes with exp(A t), A its rate's derivative, while the torque is held.  The loop is stable only while the spectral radius of
+that map, of all that is remembered, is below 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.linalg import matmul_in_order
-from iblf_jax.simulation.closed_loop import LoopState, rate
+from iblf_jax.simulation.closed_loop import LoopState, change, moving, surroundings
 from iblf_jax.simulation.scenario import Scenario
 
 POWER_ITERATIONS, AVERAGED = 48, 16
 """Steps of the power iteration, and how many of the last are averaged over: a power of two, and a third of the steps."""
+TAYLOR, HALVINGS = 8, 8
+"""Terms of a matrix exponential, and how often its argument is halved before: exact to rounding for |A| t up to 30."""
+SQUARINGS = 20
+"""Of a map, for its spectral radius."""
+RADIUS = "sampling_radius"
+"""Name of what a sampled run says of this, beside its metrics."""
 SLOWEST = 1.0
 """1/s.  A loop slower than this still follows a reference."""
 
@@ -80,10 +90,82 @@ def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
 
 @jax.jit
 def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
-    """The closed loop's Jacobian at (t, state), (m, m) [1/s]."""
-    x, whole = ravel_pytree(state)
+    """The derivative of `closed_loop.change` at (t, state), (m, m): the closed loop's Jacobian [1/s] where the law is not sampled."""
+    x, whole = ravel_pytree(surroundings(state))
 
     def rate_at(y):
-        return ravel_pytree(rate(scenario, t, whole(y)))[0]
+        return ravel_pytree(change(scenario, t, whole(y)))[0]
 
     return jax.lax.map(lambda unit: along(rate_at, x, unit), jnp.eye(x.size, dtype=x.dtype)).T
+
+
+def exponential(A: jax.Array) -> jax.Array:
+    """The exponential of a matrix, (m, m)."""
+    unit = jnp.eye(len(A), dtype=A.dtype)
+    small = A / 2.0**HALVINGS
+
+    def next_term(k, total):
+        return unit + matmul_in_order(small, total) / (TAYLOR - k).astype(A.dtype)
+
+    total = jax.lax.fori_loop(0, TAYLOR, next_term, unit)
+    return jax.lax.fori_loop(0, HALVINGS, lambda _, x: matmul_in_order(x, x), total)
+
+
+def spectral_radius(A: jax.Array) -> jax.Array:
+    """The largest size of an eigenvalue, () [1]: |A^m|^(1/m) for m = 2^SQUARINGS."""
+    tiny = jnp.finfo(A.dtype).tiny
+
+    def squared(k, found):
+        power, logarithm = found
+        size = jnp.maximum(jnp.max(jnp.abs(power)), tiny)
+        power = power / size
+        return matmul_in_order(power, power), logarithm + jnp.log(size) / 2.0 ** k.astype(A.dtype)
+
+    _, logarithm = jax.lax.fori_loop(0, SQUARINGS, squared, (A, jnp.zeros((), A.dtype)))
+    return jnp.exp(logarithm)
+
+
+def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
+    """The derivative of a sampled loop's state a period later by its state: plant, what is remembered, commands under way; (m, m) [1].
+
+    Args:
+      scenario: with a sampling.
+      state: of the loop, for its structure.
+      derivative: of `closed_loop.change` by `closed_loop.surroundings`, (M, M).
+    """
+    sampling: Any = scenario.sampling
+    n = scenario.n
+    plant, size, queue = ravel_pytree(moving(state))[0].size, len(derivative), sampling.queue
+    A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + n]
+    knows = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
+    law, memory = derivative[plant : plant + n, knows], derivative[plant + n :, knows]
+
+    def flow(t: jax.Array) -> jax.Array:
+        """The plant's state after t by its state and by a torque that is held."""
+        return exponential(jnp.block([[A, B], [jnp.zeros((n, plant + n), A.dtype)]]) * t)
+
+    whole = jnp.floor(sampling.delay / sampling.period + 1e-9)
+    late = jnp.maximum(sampling.delay - whole * sampling.period, 0.0)
+    before, after = jax.lax.map(flow, jnp.stack([late, sampling.period - late]))[:, :plant]
+    then, after = after[:, plant:], after[:, :plant]
+    by_state, before = jnp.split(matmul_in_order(after, before), [plant], axis=1)
+    # Commands: the new one first, then those under way.
+    each = [jnp.where(whole == k, then, 0.0) + jnp.where(whole == k - 1, before, 0.0) for k in range(queue + 1)]
+    remembered = size - plant - n
+    moved = jnp.concatenate([by_state, jnp.zeros((plant, remembered), A.dtype)], axis=1) + matmul_in_order(each[0], law)
+    rows = [
+        jnp.concatenate([moved, *each[1:]], axis=1),
+        jnp.concatenate([memory, jnp.zeros((remembered, queue * n), A.dtype)], axis=1),
+    ]
+    if queue:
+        rows.append(jnp.concatenate([law, jnp.zeros((n, queue * n), A.dtype)], axis=1))
+        kept = jnp.eye((queue - 1) * n, queue * n, dtype=A.dtype)
+        rows.append(jnp.concatenate([jnp.zeros(((queue - 1) * n, plant + remembered), A.dtype), kept], axis=1))
+    return jnp.concatenate(rows)
+
+
+def per_time(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
+    """What a period map is as a rate, (m, m) [1/s]: how errors of a sampled loop grow or fade."""
+    sampling: Any = scenario.sampling
+    found = period_map(scenario, state, derivative)
+    return (found - jnp.eye(len(found), dtype=found.dtype)) / sampling.period

@@ -27,6 +27,7 @@ from iblf_jax.engine import plan
 from iblf_jax.engine.execute import chosen_backend, run_batch
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.step import Run
+from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
 
@@ -79,7 +80,8 @@ def _draws(study_run: StudyRun, shared: StudyInputs, lanes: Lanes):
 
     def one(lane: Lanes):
         made, drawn, admissible = draw(shared.cases, study_run.targets, lane.index, lane.points, lane.u)
-        return merge(shared.cases.scenario, lane.points, made), drawn, admissible
+        varied = merge(shared.cases.scenario, lane.points, made) | noise_of(shared.cases.scenario, shared.cases.key, lane.index)
+        return varied, drawn, admissible
 
     # Without the barrier XLA works the random numbers into every operation of the run: 18 s to compile instead of 5.
     return jax.lax.optimization_barrier(jax.vmap(one)(lanes))

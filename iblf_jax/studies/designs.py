@@ -24,9 +24,7 @@ MOST_SOBOL = (21201, 2**30)
 
 def check_seed(seed: Any) -> int:
     """A seed as a Python int in [0, 2^32), or a ValueError."""
-    if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
-        raise checks.fail("seed", seed, "a whole number from 0 to 2**32 - 1")
-    return int(seed)
+    return checks.seed("seed", seed)
 
 
 def check_sampler(sampler: str, runs: int, replicates: Any) -> int:

@@ -20,6 +20,7 @@ from iblf_jax.core.progress import bar
 from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold
+from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import distributed
 from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
@@ -58,8 +59,8 @@ def monte_carlo(
 
     Args:
       scenario: what to run, of n joints.
-      perturbations: path -> `factor`, `offset` or `value` of a distribution.  A vector leaf gets an independent draw for each entry;
-        `robot.` paths change plant and model alike.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution; there may be none where a sensor has noise.  A vector leaf
+        gets an independent draw for each entry; `robot.` paths change plant and model alike.
       runs: number of runs N.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s]; `recommended_dt(scenario, perturbations=...)` says which will do.
@@ -85,7 +86,7 @@ def monte_carlo(
     how = checked_how(chunk, memory, devices)
     runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
     replicates = check_sampler(sampler, runs, replicates)
-    if isinstance(perturbations, Mapping) and not perturbations:
+    if isinstance(perturbations, Mapping) and not perturbations and not (isinstance(scenario, Scenario) and has_noise(scenario)):
         raise checks.fail(
             "perturbations", perturbations, "at least one perturbation", "Without any all runs are the same: use ij.simulate."
         )

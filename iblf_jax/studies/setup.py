@@ -15,6 +15,7 @@ from iblf_jax.core import checks
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
+from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import Results, StudyInputs, StudyRun, _execute, block_size, with_chosen_backend
 from iblf_jax.studies.designs import check_seed, split, unit_points
@@ -82,6 +83,7 @@ def prepare(
     tableau(method)
     steps = checks.whole_steps(duration, dt)
     seed, scenario = check_seed(seed), canonical(scenario)
+    check_step(scenario, dt)
     targets, by_path = targets_of(scenario, perturbations)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario.n)

@@ -28,6 +28,7 @@ from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
+from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import Results, block_size, run_blocks
@@ -310,6 +311,7 @@ class Study:
             paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
             shared.folds,
             shared.dt,
+            noise_of(self.scenario, shared.cases.key, self.setup.lanes(np.asarray([i])).index[0]).get(NOISE_NAME),
             steps=study_run.steps,
             method=study_run.method,
             record_every=record_every,

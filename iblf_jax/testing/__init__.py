@@ -18,6 +18,8 @@ They compute in float64 whatever the session's setting is, and leave the setting
 
 from iblf_jax.testing._contract import ContractError as ContractError
 from iblf_jax.testing.barriers import check_barrier as check_barrier
+from iblf_jax.testing.devices import check_actuator as check_actuator
+from iblf_jax.testing.devices import check_sensor as check_sensor
 from iblf_jax.testing.laws import check_law as check_law
 from iblf_jax.testing.metrics import check_fold as check_fold
 from iblf_jax.testing.objectives import check_objective as check_objective
@@ -29,6 +31,7 @@ from iblf_jax.testing.world import check_side as check_side
 
 __all__ = [
     "ContractError",
+    "check_actuator",
     "check_barrier",
     "check_disturbance",
     "check_fold",
@@ -37,5 +40,6 @@ __all__ = [
     "check_observer",
     "check_reference",
     "check_robot",
+    "check_sensor",
     "check_side",
 ]

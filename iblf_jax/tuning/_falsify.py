@@ -35,6 +35,7 @@ from iblf_jax.engine.step import Run
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.designs import check_seed
@@ -134,6 +135,7 @@ def falsify(
     tableau(method)
     checks.one_of("backend", backend, BACKENDS)
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
+    check_step(scenario, dt)
     starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
     checks.fits("iterations", iterations, 8 * starts)
     cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype

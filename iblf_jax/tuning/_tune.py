@@ -18,6 +18,7 @@ from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS, differentiates_forward
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.sampling import check_step, has_noise
 from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MOST_RUNS, check_seed
 from iblf_jax.studies.distributions import Perturbation
@@ -222,9 +223,10 @@ def build(
     checks.one_of("backend", timing.get("backend", "auto"), BACKENDS)
     steps = checks.whole_steps(timing["duration"], timing["dt"])
     seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs, most=MOST_RUNS), canonical(scenario)
+    check_step(scenario, float(timing["dt"]))
     dtype = scenario.initial.q.dtype
     targets, by_path = targets_of(scenario, {} if perturbations is None else perturbations)
-    if not targets and runs > 1:
+    if not targets and runs > 1 and not has_noise(scenario):
         raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
     blocks, box = layout(scenario, parameters, float(timing["dt"]), timing["method"])
     checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)

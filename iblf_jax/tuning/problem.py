@@ -33,6 +33,7 @@ from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
 from iblf_jax.tuning.objectives import Objective
@@ -148,10 +149,11 @@ def _fold(formulation: Formulation, shared: ProblemInputs) -> tuple[Quantities, 
 def _varied(formulation: Formulation, shared: ProblemInputs, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
     """Path -> value for one run."""
     point = {path: x.astype(shared.dt.dtype) for path, x in values_at(formulation.blocks, z).items()}
+    noise = noise_of(shared.cases.scenario, shared.cases.key, index)
     if not formulation.targets:
-        return point
+        return point | noise
     made, _, _ = draw(shared.cases, formulation.targets, index, point, {})
-    return merge(shared.cases.scenario, point, made)
+    return merge(shared.cases.scenario, point, made) | noise
 
 
 def _of_lanes(formulation: Formulation, shared: ProblemInputs, lanes: Lane):
@@ -249,7 +251,11 @@ def slope(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Sl
     fold = _fold(formulation, shared)
     one, overlap = partial(_varied, formulation, shared), partial(same_place, shared.cases.scenario)
     jacobian = jax.vmap(jax.vmap(jax.jacfwd(one), in_axes=(None, 0)))(lanes.z, lanes.index)
-    moving = {path: x for path, x in _flat(jacobian).items() if any(overlap(path, block.path) for block in formulation.blocks)}
+    moving = {
+        path: x
+        for path, x in _flat(jacobian).items()
+        if path != NOISE_NAME and any(overlap(path, block.path) for block in formulation.blocks)
+    }
     tied = [b.path for b in formulation.blocks if b.size == 1 and not any(overlap(b.path, t.path) for t in formulation.targets)]
     varied = _flat(_of_lanes(formulation, shared, lanes))
     run = Run(formulation.steps, formulation.method, mechanism=formulation.mechanism)
@@ -265,9 +271,10 @@ def gradient(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) ->
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
 
     def one_run(lane: Lane, index):
-        scenario = with_parameters(shared.cases.scenario, _varied(formulation, shared, lane.z, index))
-        fold = _fold(formulation, shared)
-        outcome = run_for_reverse(scenario, fold, shared.dt, Run(formulation.steps, formulation.method))
+        values = _varied(formulation, shared, lane.z, index)
+        noise = values.pop(NOISE_NAME, None)
+        scenario, fold = with_parameters(shared.cases.scenario, values), _fold(formulation, shared)
+        outcome = run_for_reverse(scenario, fold, shared.dt, Run(formulation.steps, formulation.method), noise)
         return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
 
     def loss(z, lane: Lane):

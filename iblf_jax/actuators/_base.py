@@ -1,0 +1,42 @@
+"""The contract of an actuator: it is told a torque, and gives another.
+
+Its state is integrated with the plant.  Friction is the plant's, delay the sampled loop's (`Sampling`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+State = Any
+"""A pytree of arrays of floats; `()` for an actuator without memory."""
+
+
+class Delivered(NamedTuple):
+    """What an actuator does at one instant; torque and flag are (n,)."""
+
+    tau: jax.Array
+    """Torque on the joint [N m]."""
+    limited: jax.Array
+    """bool: a limit was at work."""
+    rate: State
+    """Rate of its state."""
+
+
+class Actuator(Protocol):
+    """What the package asks of an actuator."""
+
+    def init(self, tau: jax.Array) -> State:
+        """State at the start, where it delivers the torque `tau`, (n,) [N m]."""
+        ...
+
+    def deliver(self, asked: jax.Array, dq: jax.Array, state: State) -> Delivered:
+        """What it delivers.
+
+        Args:
+          asked: the torque that it is told, (n,) [N m].
+          dq: velocity of the joints, (n,) [rad/s].
+          state: its own.
+        """
+        ...

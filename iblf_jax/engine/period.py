@@ -1,0 +1,112 @@
+"""At which period a sampled loop gets too slow: where its map from one period to the next stops being a contraction.
+
+The map's derivative is looked at where the run starts and along the reference; its spectral radius, the largest of these, grows past 1 at
+some period.  A sample of that search is a number, so nothing is compiled again but where more commands are under way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.engine.step_size import LOOKS, along_reference, round_down
+from iblf_jax.simulation.closed_loop import LoopState, initial_state, sampled
+from iblf_jax.simulation.sampling import Sampling, under_way, with_room
+from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.stability import jacobian, period_map
+
+SHORTEST, LONGEST = 1e-5, 0.2
+"""Periods between which is looked [s]."""
+FACTOR = 2 ** (1 / 3)
+"""Between two that are tried; then the interval is halved."""
+HALVINGS = 8
+MOST_UNDER_WAY = 6
+"""Commands under way at the shortest period that is tried."""
+
+
+def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
+    """The largest spectral radius of the map from a period to the next, at the start and along the reference [1].
+
+    Args:
+      scenario: canonical, with a sampling.
+      period: that it has instead of its own [s].
+      times: along the reference [s].
+    """
+    sampling: Any = scenario.sampling
+    dtype = scenario.initial.q.dtype
+    changed = dataclasses.replace(sampling, period=jnp.asarray(period, dtype), queue=under_way(float(sampling.delay), period))
+    maps = np.asarray(_maps(dataclasses.replace(scenario, sampling=changed), jnp.asarray(times, dtype)), float)
+    return float(np.max(np.abs(np.linalg.eigvals(maps)))) if np.all(np.isfinite(maps)) else np.inf
+
+
+@jax.jit
+def _maps(scenario: Scenario, times: jax.Array) -> jax.Array:
+    """The maps' derivatives, (T + 1, m, m)."""
+    zero = jnp.zeros_like(scenario.initial.q[0])
+
+    def at(t: jax.Array, state: LoopState) -> jax.Array:
+        # The torque of the instant is the one that the law commands there.
+        state = sampled(scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype))
+        return period_map(scenario, state, jacobian(scenario, t, state))
+
+    along = along_reference(scenario, times)
+    states = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), along)
+    return jax.vmap(at)(jnp.concatenate([zero[None], times]), states)
+
+
+def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0) -> float:
+    """A round period [s] that a law may run at: the loop would still be stable at `margin` times it.
+
+        rho( d x(t_(k+1)) / d x(t_k) ) < radius,   x: plant, sensor, law, observer, actuator, commands under way
+
+    at the start and along the reference, for every period up to margin times the one that is returned.  That is necessary, not
+    sufficient: it says nothing of noise, nor of how far the bounds are.  Rounded down to 1, 2 or 5 times a power of ten.
+
+    Args:
+      scenario: what is to run; its own period does not matter, its delay [s], sensor and actuator do.
+      duration: of the reference that is looked at [s].
+      radius: spectral radius that counts as too slow [1], of every period up to the limit.
+      margin: how much longer a period may be before the loop is that slow, >= 1 [1].
+
+    Returns:
+      The period [s].
+
+    Raises:
+      ValueError: bad arguments, or a loop that is too slow at every period from 10 us on (its delay is too long, say).
+
+    Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapter 3.
+    """
+    duration, radius = checks.positive_number("duration", duration, "s"), checks.positive_number("radius", radius, "1")
+    margin = checks.positive_number("margin", margin, "1")
+    if margin < 1.0:
+        raise checks.fail("margin", margin, "a number from 1 on")
+    if isinstance(scenario, Scenario) and scenario.sampling is None:
+        scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))
+    scenario = with_room(canonical(scenario))
+    if not checks.is_concrete(scenario):
+        raise checks.fail("scenario", "traced values", "numbers", "Call it outside of jit, vmap and grad.")
+    times = np.linspace(0.0, duration, LOOKS)
+    limit = _limit(scenario, times, radius)
+    if limit is None:
+        raise checks.fail("scenario", "a loop that is unstable at every period", "one that some period keeps stable", "Shorten its delay.")
+    return round_down(limit / margin)
+
+
+def _limit(scenario: Scenario, times: np.ndarray, radius: float) -> float | None:
+    """The shortest period at which the loop is too slow; LONGEST if none is, None if all are."""
+    sampling: Any = scenario.sampling
+    low, high = None, max(SHORTEST, float(sampling.delay) / MOST_UNDER_WAY)
+    while high <= LONGEST and radius_at(scenario, high, times) < radius:
+        low, high = high, high * FACTOR
+    if low is None or high > LONGEST:
+        return low
+    for _ in range(HALVINGS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if radius_at(scenario, middle, times) < radius else (low, middle)
+    return low

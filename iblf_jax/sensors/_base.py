@@ -1,0 +1,75 @@
+"""The contracts of a sensor, and of the way in which one that reads positions comes to velocities.
+
+A sensor is read once a period, at its start.  What it draws are standard normal numbers, which the loop gives it: they depend on seed, run,
+sample and joint alone.  Torque is never measured.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+State = Any
+"""A pytree of arrays of floats; `()` for a sensor without memory."""
+
+
+class Measurement(NamedTuple):
+    """What law and observer are told."""
+
+    q: jax.Array
+    """Position, (n,) [rad]."""
+    dq: jax.Array
+    """Velocity, (n,) [rad/s]."""
+
+
+class Sensor(Protocol):
+    """What the package asks of a sensor.
+
+    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on it.
+    """
+
+    @property
+    def draws(self) -> int:
+        """How many normal numbers a joint it takes for a sample."""
+        ...
+
+    def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
+        """State before the first sample, given q [rad] and dq [rad/s] there and the period, () [s]."""
+        ...
+
+    def measure(self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State) -> tuple[Measurement, State]:
+        """What is measured, and the next state.
+
+        Args:
+          q, dq: position [rad] and velocity [rad/s] as they are, (n,).
+          normal: independent standard normal numbers, (draws, n).
+          period: () [s].
+          state: of the sample before.
+        """
+        ...
+
+
+class Velocity(Protocol):
+    """How a velocity follows from measured positions."""
+
+    @property
+    def draws(self) -> int:
+        """How many normal numbers a joint it takes for a sample."""
+        ...
+
+    def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> State:
+        """State before the first sample, as if the joint had come to y [rad] with the velocity dq [rad/s]."""
+        ...
+
+    def estimate(self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State) -> tuple[jax.Array, State]:
+        """The velocity, (n,) [rad/s], and the next state.
+
+        Args:
+          y: measured position, (n,) [rad].
+          dq: velocity as it is, (n,) [rad/s], for what measures it.
+          normal: independent standard normal numbers, (draws, n).
+          period: () [s].
+          state: of the sample before.
+        """
+        ...

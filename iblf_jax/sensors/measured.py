@@ -1,0 +1,31 @@
+"""A velocity that is measured, by a tachometer say."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from iblf_jax.core.pytree import Leaf, component, leaf
+
+
+@component
+class Measured:
+    """V = q' + noise w,   w standard normal.
+
+    Args:
+      noise: standard deviation, () or (n,) [rad/s], >= 0; 0 if not given.
+
+    Source: none; the construction is common.
+    """
+
+    noise: Leaf = leaf("rad/s", sign="nonnegative", default=0.0)
+    draws: ClassVar[int] = 1
+
+    def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> tuple[()]:
+        """No state."""
+        return ()
+
+    def estimate(self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+        """The velocity and its noise, (n,) [rad/s]."""
+        return dq + self.noise * normal[0], ()

@@ -1,0 +1,219 @@
+"""When a law runs that is sampled: its period, when its torque arrives, and the noise of what it is told.
+
+Time goes in steps dt, of which a period holds m.  Instant k is the start of a sample where k is a multiple of m.  A command arrives `delay`
+after its sample's start, wherever that lies in a step: the torque of such a step is the line in time that has the integral, and the
+integral of the integral, of the one that jumps there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+
+if TYPE_CHECKING:
+    from iblf_jax.simulation.scenario import Scenario
+
+OBSERVER_STEPS = ("exact", "euler")
+NEARLY = 1e-6
+"""Steps.  A delay that is so near to a whole number of steps is one."""
+WORD = 1 << 16
+"""The generator works on words of 16 bits, whose products every backend's whole numbers hold."""
+
+
+@component
+class Sampling:
+    """Law and observer run once a period on what was measured at its start; their torque is held, and arrives `delay` later.
+
+        y_k = sensor(x(t_k)),   (tau_k, z_(k+1)) = law(t_k, y_k, z_k),   tau(t) = tau_k for t_k + delay <= t < t_(k+1) + delay
+
+    Until the first command arrives the torque is G0(q(0)) of the model.  Which instants are samples has no derivative by the period, the
+    torque has one by the delay, unless that is 0.
+
+    Args:
+      period: () [s], > 0; a whole number of steps dt.
+      delay: () [s], >= 0, of any length; 0 if not given.
+      observer: how an observer goes to the next period: "exact" for a held torque, or a step of "euler"; "exact" if not given.
+      queue: how many commands may be under way at once; as many as the delay needs if not given.  A study that makes it longer needs more.
+
+    Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 2 and 3.
+    """
+
+    period: Leaf = leaf("s", sign="positive", shape="scalar")
+    delay: Leaf = leaf("s", sign="nonnegative", shape="scalar", default=0.0)
+    observer: str = static(default="exact")
+    queue: int = static(default=None)
+
+    def check(self) -> None:
+        """Raises ValueError for an unknown step of the observer or a queue that is too short."""
+        checks.one_of("Sampling.observer", self.observer, OBSERVER_STEPS)
+        concrete = checks.is_concrete(self)
+        least = self.needed if concrete else 0
+        if self.queue is None:
+            if not concrete:
+                raise checks.fail("Sampling.queue", None, "a whole number, where period or delay is traced", "Such as queue=1.")
+            object.__setattr__(self, "queue", least)
+        object.__setattr__(self, "queue", checks.positive_integer("Sampling.queue", self.queue, least=0))
+        if self.queue < least:
+            raise checks.fail("Sampling.queue", self.queue, f"at least {least}, for a delay of {float(self.delay):g} s")
+
+    @property
+    def needed(self) -> int:
+        """Commands that are under way at once."""
+        return under_way(float(self.delay), float(self.period))
+
+
+def under_way(delay: float, period: float) -> int:
+    """Commands that are under way at once, the one that arrives with a sample included; [s]."""
+    return math.floor(delay / period + NEARLY) + 1 if delay > 0 else 0
+
+
+class Instant(NamedTuple):
+    """Where an instant lies between samples."""
+
+    sample: jax.Array
+    """Number of the last sample, () int."""
+    phase: jax.Array
+    """Steps since its start, () int."""
+
+
+def instant(sampling: Sampling, dt: jax.Array, index: jax.Array) -> Instant:
+    """Where the instant with this number lies."""
+    steps = jnp.maximum(jnp.round(sampling.period / dt), 1.0).astype(index.dtype)
+    sample = jax.lax.div(index, steps)
+    return Instant(sample, index - sample * steps)
+
+
+def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array, order: int) -> tuple[jax.Array, jax.Array]:
+    """The torque of a step, a + b s with s from 0 to 1, (n,) each [N m].
+
+    Args:
+      sampling: the period and the delay.
+      dt: of the step, () [s].
+      now: its start.
+      commands: newest first, (queue + 1, n) [N m].
+      order: of the integrator; one of the first order sees the start of a step alone, and is given the mean.
+    """
+    if sampling.queue == 0:
+        return _if_nothing_is_missing(sampling, sampling.delay, commands[0]), jnp.zeros_like(commands[0])
+    delay = sampling.delay / dt
+    whole = jnp.round(delay)
+    delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < NEARLY, whole - delay, 0.0))
+    steps, phase = jnp.maximum(jnp.round(sampling.period / dt), 1.0), now.phase.astype(dt.dtype)
+    # The command at work before this step, counted from the newest, and where in the step the next one takes over.
+    age = jnp.maximum(jnp.floor(jax.lax.stop_gradient(delay - phase) / steps) + 1.0, 0.0)
+    place = delay - phase - (age - 1.0) * steps
+    change = (age > 0) & (place < 1.0)
+    old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
+    jump, left = jnp.where(change, new - old, 0.0), jnp.where(change, 1.0 - place, 1.0)
+    a, b = jump * left * (1.0 - 3.0 * (1.0 - left)), 6.0 * jump * left * (1.0 - left)
+    a, b = (a, b) if order > 1 else (a + 0.5 * b, jnp.zeros_like(b))
+    return _if_nothing_is_missing(sampling, age, old + a), b
+
+
+def _if_nothing_is_missing(sampling: Sampling, age: jax.Array, torque: jax.Array) -> jax.Array:
+    """The torque; no number where a command has left the queue before it arrived."""
+    return jnp.where(age <= sampling.queue, torque, jnp.nan)
+
+
+def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:
+    """The command at a place that is a number."""
+    found = commands[0]
+    for k in range(1, len(commands)):
+        found = jnp.where(place >= k, commands[k], found)
+    return found
+
+
+def with_room(scenario: Scenario) -> Scenario:
+    """The scenario with a queue that is long enough for its delay, whatever it was when the sampling was made."""
+    sampling = scenario.sampling
+    if sampling is None or not checks.is_concrete(sampling) or sampling.queue >= sampling.needed:
+        return scenario
+    return dataclasses.replace(scenario, sampling=dataclasses.replace(sampling, queue=sampling.needed))
+
+
+def check_step(scenario: Scenario, dt: float) -> None:
+    """Raises ValueError where a period is no whole number of steps dt [s]."""
+    sampling = scenario.sampling
+    if sampling is None or not checks.is_concrete(sampling):
+        return
+    period = float(sampling.period)
+    steps = period / dt
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-4 * steps:
+        fitting = period / max(math.ceil(steps - 1e-9), 1)
+        raise checks.fail("dt", dt, f"a whole number of steps in sampling.period = {period:g} s", f"Take dt={fitting:.6g}.")
+
+
+# ------------------------------------------------------------------------------------------------------------------- noise
+
+
+def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
+    """Four words of 16 bits, as floats, for the noise of one run of a study whose seed gave `key`; (4,) float32."""
+    own = jax.random.fold_in(jax.random.fold_in(key, run), NOISE)
+    return jax.random.bits(own, (4,), jnp.uint16).astype(jnp.float32)
+
+
+def has_noise(scenario: Scenario) -> bool:
+    """Whether its sensor draws any."""
+    return scenario.sampling is not None and scenario.sensor.draws > 0
+
+
+def noise_of(scenario: Scenario, key: jax.Array, run: int | jax.Array) -> dict[str, jax.Array]:
+    """What a study's run replaces besides its leaves: the key of its noise, if it has any."""
+    return {NOISE_NAME: noise_key(key, run)} if has_noise(scenario) else {}
+
+
+NOISE_NAME = "noise"
+"""Name of the key among what runs replace; no leaf of a scenario has it."""
+NOISE = 0x6E6F6973
+"""Tells the numbers of the noise from those of the draws."""
+ROUNDS = 10
+MULTIPLIERS = (0x6A09, 0x5BB7)
+"""Odd, below 2^15."""
+WEYL = (0x9E37, 0xBB67)
+
+
+def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
+    """Independent standard normal numbers of one sample, (draws, n): they depend on nothing but key, sample and place.
+
+    A counter-based generator: ten rounds of products, their halves crossed and joined with the key, as in Philox; then Box and Muller.
+    JAX's own does not lower to scalar programs.
+
+    Args:
+      key: of the run, four words of 16 bits.
+      sample: its number, () int.
+      draws: how many a joint.
+      n: joints.
+    """
+    words = [w.astype(jnp.int32) for w in key]
+    count = draws * n
+    flat: list[jax.Array] = []
+    for pair in range((count + 1) // 2):
+        flat += _pair(words, sample.astype(jnp.int32), pair, key.dtype)
+    return jnp.stack(flat[:count]).reshape(draws, n) if count else jnp.zeros((0, n), key.dtype)
+
+
+def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax.Array]:
+    """Two of them."""
+    low = WORD - 1
+    x = [sample & low, _upper(sample) & low, key[2] ^ pair, key[3]]
+    k = [key[0], key[1]]
+    for _ in range(ROUNDS):
+        a, b = MULTIPLIERS[0] * x[0], MULTIPLIERS[1] * x[2]
+        x = [_upper(b) ^ x[1] ^ k[0], b & low, _upper(a) ^ x[3] ^ k[1], a & low]
+        k = [(k[0] + WEYL[0]) & low, (k[1] + WEYL[1]) & low]
+    first, second = ((x[i].astype(dtype) * WORD + x[i + 1].astype(dtype) + 0.5) / (WORD * WORD) for i in (0, 2))
+    size, angle = jnp.sqrt(-2.0 * jnp.log(first)), 2.0 * np.pi * second
+    return [size * jnp.cos(angle), size * jnp.sin(angle)]
+
+
+def _upper(x: jax.Array) -> jax.Array:
+    """The bits of a whole number above its lowest word."""
+    return jax.lax.div(x, jnp.asarray(WORD, x.dtype))

@@ -1,0 +1,304 @@
+"""The loop of a robot: sampled, told by sensors, delayed, driven.  Held against programs of SciPy that share nothing with the package
+but the law, the observer's equations and the arm."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.engine.period import radius_at
+from iblf_jax.simulation.sampling import noise_key, normals
+from iblf_jax.simulation.scenario import canonical
+
+PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+SLOW = ij.with_parameters(PAPER, {"controller.K2": 4.0, "observer.kf": 4.0})
+"""Slow enough for a filter and a drive in the loop."""
+MOTOR = ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0, limit=[15.0, 5.0], stall=[14.0, 6.0], no_load_speed=[6.0, 8.0])
+OFFSET = np.array([1e-3, -2e-3])
+ENCODER = ij.sensors.Encoder(counts=65536, offset=OFFSET, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+
+
+class Independent:
+    """A sampled loop by DOP853, from one change of the torque to the next."""
+
+    def __init__(self, scenario):
+        self.scenario = scenario
+        plant, model, setting = scenario.plant, scenario.model, scenario.setting
+
+        @jax.jit
+        def law(t, q, dq, eta):
+            f_hat = eta + scenario.observer.kf * (model.mass_matrix(q) @ dq)
+            command, _ = scenario.controller.command(t, q, dq, f_hat, setting, ())
+            # (3.11), corrected, whose rate is linear in eta
+            rest = command.tau - model.coriolis(q, dq, dq) - model.gravity(q) + scenario.observer.kf * (model.mass_matrix(q) @ dq)
+            moved = jax.jvp(model.mass_matrix, (q,), (dq,))[1] @ dq
+            a = jnp.exp(-scenario.observer.kf * scenario.sampling.period)
+            return command.tau, a * eta - (1 - a) * (rest + moved)
+
+        @jax.jit
+        def acceleration(t, q, dq, tau):
+            push = scenario.disturbance.torque(t, q, dq, plant, model)
+            return jnp.linalg.solve(plant.mass_matrix(q), tau + push - plant.coriolis(q, dq, dq) - plant.gravity(q))
+
+        self.law, self.acceleration = law, acceleration
+
+    def told(self, q, dq):
+        return q, dq
+
+    def delivered(self, asked, y, dq):
+        """Torque on the joint, and the rate of the drive's state y."""
+        return asked, np.zeros(2)
+
+    def run(self, duration, grid):
+        s = self.scenario
+        T, delay = float(s.sampling.period), float(s.sampling.delay)
+        q0 = np.asarray(s.initial.q)
+        x, eta = np.concatenate([q0, np.zeros(2), np.asarray(s.model.gravity(q0))]), np.zeros(2)
+        commands, states, torques = [(-1.0, x[4:])], [], []
+        for k in range(round(duration / T)):
+            t = k * T
+            u, eta = self.law(t, *self.told(x[:2], x[2:4]), eta)
+            commands.append((t + delay, np.asarray(u)))
+            cuts = [t, *(c for c, _ in commands if t + 1e-12 < c < t + T - 1e-12), t + T]
+            for a, b in itertools.pairwise(cuts):
+                asked = [u for c, u in commands if c <= a + 1e-12][-1]
+
+                def rate(t, x, asked=asked):
+                    tau, dy = self.delivered(asked, x[4:], x[2:4])
+                    return np.concatenate([x[2:4], self.acceleration(t, x[:2], x[2:4], tau), dy])
+
+                inside = grid[(grid >= a - 1e-12) & (grid < b - 1e-12)]
+                found = solve_ivp(rate, (a, b), x, method="DOP853", rtol=1e-11, atol=1e-12, t_eval=np.append(inside, b).clip(a, b))
+                states += list(found.y.T[: len(inside)])
+                torques += [self.delivered(asked, y[4:], y[2:4])[0] for y in states[-len(inside) :]] if len(inside) else []
+                x = found.y[:, -1]
+        return np.array(states), np.array(torques)
+
+
+class WithEncoder(Independent):
+    """An encoder without noise and a filtered difference, and a drive with a lag."""
+
+    def __init__(self, scenario):
+        super().__init__(scenario)
+        self.before, self.v = None, np.zeros(2)
+
+    def told(self, q, dq):
+        step = 2 * np.pi / 65536
+        y = step * np.round((q + OFFSET) / step)
+        T = float(self.scenario.sampling.period)
+        a = np.exp(-700.0 * T)
+        self.v = a * self.v + (1 - a) * (y - (y if self.before is None else self.before)) / T
+        self.before = y
+        return y, self.v
+
+    def delivered(self, asked, y, dq):
+        return y, 600.0 * (asked - y)
+
+
+class WithDrive(Independent):
+    """The drive `MOTOR`, with all its limits."""
+
+    def delivered(self, asked, y, dq):
+        line = np.maximum(np.array([14.0, 6.0]) * (1 - np.abs(dq) / [6.0, 8.0]), 0)
+        return np.clip(y, -line, line), np.clip(600.0 * (np.clip(asked, [-15.0, -5.0], [15.0, 5.0]) - y), -900.0, 900.0)
+
+
+def agree(scenario, program, duration=0.3, dt=5e-4, q=1e-7, tau=1e-5):
+    run = ij.simulate(scenario, duration=duration, dt=dt)
+    states, torques = program(scenario).run(duration, np.arange(round(duration / dt)) * dt)
+    assert np.max(np.abs(run.q[:-1] - states[:, :2])) < q
+    assert np.max(np.abs(run.dq[:-1] - states[:, 2:4])) < 100 * q
+    assert np.max(np.abs(run.tau[:-1] - torques)) < tau
+    return run
+
+
+@pytest.mark.parametrize("delay", [0.0, 1e-3, 2e-3])
+def test_a_sampled_loop_is_that_of_an_independent_program(delay):
+    agree(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3 if delay == 1e-3 else 2e-3, delay=min(delay, 1e-3))), Independent)
+
+
+def test_a_delay_may_be_of_any_length():
+    """The torque inside the step in which it changes is the mean of two; positions are those of the jump."""
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=2.7e-3))
+    run = ij.simulate(scenario, duration=0.3, dt=5e-4)
+    states, _ = Independent(scenario).run(0.3, np.arange(600) * 5e-4)
+    assert np.max(np.abs(run.q[:-1] - states[:, :2])) < 1e-7
+
+
+def test_an_encoder_and_a_lag_are_those_of_an_independent_program():
+    actuator = ij.actuators.Motor(bandwidth=600.0)
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=1e-3), sensor=ENCODER, actuator=actuator)
+    run = agree(scenario, WithEncoder, dt=1.25e-4, tau=2e-6)
+    assert run.metrics.relative_numerical_error < 1e-5
+    assert np.any(run.measured.q != run.q)
+
+
+def test_a_drive_with_limits_is_that_of_an_independent_program():
+    """A limit that sets in within a step costs some accuracy."""
+    run = agree(ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3), actuator=MOTOR), WithDrive, dt=2.5e-4, q=1e-6, tau=1e-2)
+    assert int(run.status) & int(Status.TORQUE_SATURATED)
+
+
+def test_a_short_period_is_the_continuous_loop():
+    continuous = ij.simulate(SLOW, duration=0.2, dt=2.5e-4).q
+    errors = []
+    for period in (1e-3, 5e-4, 2.5e-4):
+        run = ij.simulate(ij.with_parts(SLOW, sampling=ij.Sampling(period=period)), duration=0.2, dt=2.5e-4)
+        errors.append(float(np.max(np.abs(run.q - continuous))))
+    assert 1.7 < errors[0] / errors[1] < 2.3 and 1.7 < errors[1] / errors[2] < 2.3
+
+
+@pytest.mark.parametrize(
+    "velocity", [ij.sensors.FilteredDifference(cutoff=700.0), ij.sensors.Tracking(bandwidth=500.0), ij.sensors.Measured(noise=0.01)]
+)
+def test_batches_are_single_runs_and_backends_agree(velocity):
+    sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=velocity)
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
+    study = ij.monte_carlo(scenario, {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}, runs=3, duration=0.1, dt=5e-4, seed=4)
+    run = study.replay(2)
+    assert np.allclose(run.metrics.rmse, study.metrics["rmse"][2], rtol=1e-12)
+    again = np.sqrt(np.mean(run.e1**2, axis=0))
+    assert np.allclose(again, study.metrics["rmse"][2], rtol=1e-2), "the trajectory has the run's own noise"
+    first = ij.simulate(scenario, duration=0.1, dt=5e-4, seed=4)
+    other = ij.simulate(scenario, duration=0.1, dt=5e-4, seed=5)
+    lone = ij.monte_carlo(scenario, {}, runs=2, duration=0.1, dt=5e-4, seed=4)
+    assert np.any(first.measured.dq != other.measured.dq) and np.any(lone.metrics["rmse"][0] != lone.metrics["rmse"][1])
+    assert np.allclose(lone.metrics["rmse"][0], first.metrics.rmse, rtol=1e-9)
+    by_xla = ij.simulate(scenario, duration=0.1, dt=5e-4, seed=4, backend="xla")
+    assert np.allclose(by_xla.q, first.q, atol=1e-12)
+
+
+def test_noise_is_white_and_normal():
+    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(3), i))(jnp.arange(100))
+    draw = jax.jit(jax.vmap(jax.vmap(lambda key, k: normals(key, k, 2, 2), in_axes=(None, 0)), in_axes=(0, None)))
+    x = np.asarray(draw(keys, jnp.arange(4000))).reshape(100, 4000, 4)
+    far = 5 / np.sqrt(x.size)
+    assert abs(x.mean()) < far and abs(x.std() - 1) < far and abs(np.mean(x**4) - 3) < 10 * far
+    for a, b in ((x[:, 1:], x[:, :-1]), (x[1:], x[:-1]), (x[..., 1:], x[..., :-1])):
+        assert abs(np.mean(a * b)) < far and abs(np.mean((a**2 - 1) * (b**2 - 1))) < 3 * far
+
+
+def test_derivatives_are_differences():
+    sensor = ij.sensors.Encoder(noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+    scenario = ij.with_parts(
+        SLOW, sampling=ij.Sampling(period=1e-3, delay=7e-4), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=800.0)
+    )
+    scenario = canonical(scenario)
+
+    def loss(values):
+        changed = ij.with_parameters(scenario, values)
+        return jnp.sum(ij.simulate(changed, duration=0.1, dt=5e-4, record_every=200, seed=2).metrics.ise)
+
+    for path, step in (("controller.K2", 1e-4), ("sampling.delay", 1e-7), ("actuator.bandwidth", 1e-2), ("sensor.velocity.cutoff", 1e-2)):
+        here = ij.paths.get(scenario, path)
+        unit = jnp.ones_like(here)
+        slope = jax.grad(lambda x, path=path, unit=unit: loss({path: x * unit}))(jnp.ravel(here)[0])
+        ends = [float(loss({path: here + sign * step * unit})) for sign in (1, -1)]
+        assert np.isclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=2e-4), path
+
+
+def test_rounding_is_left_out_of_derivatives():
+    encoder = ij.sensors.Encoder(counts=100, velocity=ij.sensors.Measured())
+    slope = jax.grad(lambda q: encoder.measure(q, q, jnp.zeros((1, 2)), jnp.asarray(1e-3), ())[0].q.sum())(jnp.array([0.3, 0.4]))
+    assert np.array_equal(slope, [1.0, 1.0])
+
+
+def test_the_radius_is_that_of_the_map():
+    """Against differences of whole periods, by an independent program of the same loop."""
+    scenario = canonical(ij.with_parts(PAPER, sampling=ij.Sampling(period=2e-3, delay=1e-3)))
+    program = Independent(scenario)
+    q0, n = np.asarray(scenario.initial.q), 8
+
+    def after(z):
+        q, dq, eta, old = z[:2], z[2:4], z[4:6], z[6:]
+        u, eta = program.law(0.0, q, dq, eta)
+        x = z[:4]
+        for a, b, tau in ((0.0, 1e-3, old), (1e-3, 2e-3, np.asarray(u))):
+            rate = lambda t, x, tau=tau: np.concatenate([x[2:], program.acceleration(t, x[:2], x[2:], tau)])  # noqa: E731
+            x = solve_ivp(rate, (a, b), x, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+        return np.concatenate([x, eta, u])
+
+    eta, dq = np.zeros(2), np.zeros(2)
+    u, _ = program.law(0.0, q0, dq, eta)
+    z = np.concatenate([q0, dq, eta, u])
+    step = 1e-6 * np.eye(n)
+    J = np.array([(after(z + e) - after(z - e)) / 2e-6 for e in step]).T
+    found = radius_at(scenario, 2e-3, np.zeros(0))
+    assert np.isclose(found, np.max(np.abs(np.linalg.eigvals(J))), rtol=1e-4)
+
+
+def test_what_is_sampled_too_slowly_says_so():
+    fine, late, slow = (
+        ij.with_parts(PAPER, sampling=ij.Sampling(period=period, delay=delay)) for period, delay in ((2e-3, 0.0), (2e-3, 2e-3), (4e-3, 0.0))
+    )
+    assert ij.simulate(fine, duration=0.5, dt=5e-4).ok
+    for bad in (late, slow):
+        with pytest.warns(ij.engine.simulate.SimulationWarning, match="recommended_period"):
+            run = ij.simulate(bad, duration=0.5, dt=5e-4)
+        assert int(run.status) & int(Status.SAMPLING_TOO_SLOW) and int(run.status) & int(Status.BOUND_VIOLATED)
+    assert ij.recommended_period(PAPER) == 5e-4
+    assert ij.recommended_period(SLOW) > 1e-3
+
+
+def test_nothing_is_claimed_of_a_sampled_loop():
+    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3))
+    certificate = ij.certify(scenario, duration=0.2, dt=1e-3)
+    assert certificate.verdict == "not applicable"
+    claimed = [line for line in certificate.lines if line.counts]
+    assert claimed and all(line.verdict == "not applicable" and "sampled" in line.note for line in claimed)
+    assert 0 <= certificate["V2, sampled less continuous"].value < 0.1
+    assert -0.01 < certificate["margin, sampled less continuous"].value < 0.01
+
+
+def test_parts_go_through_files(tmp_path):
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=2.5e-3), sensor=ENCODER, actuator=MOTOR)
+    ij.save_scenario(scenario, tmp_path / "lab.toml")
+    loaded = ij.load_scenario(tmp_path / "lab.toml")
+    assert jax.tree.structure(loaded) == jax.tree.structure(scenario) and loaded.sampling.queue == 3
+    assert np.array_equal(ij.simulate(loaded, duration=0.02, dt=5e-4).q, ij.simulate(scenario, duration=0.02, dt=5e-4).q)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ij.Sampling(period=0.0), "Sampling.period"),
+        (lambda: ij.Sampling(period=1e-3, delay=-1e-3), "Sampling.delay"),
+        (lambda: ij.Sampling(period=1e-3, delay=3e-3, queue=1), "at least 4"),
+        (lambda: ij.Sampling(period=1e-3, observer="rk4"), "exact"),
+        (lambda: ij.sensors.Encoder(counts=0, velocity=ij.sensors.Measured()), "Encoder.counts"),
+        (lambda: ij.sensors.Encoder(velocity=3.0), "Encoder.velocity"),
+        (lambda: ij.actuators.Motor(rate_limit=1.0), "bandwidth"),
+        (lambda: ij.actuators.Motor(stall=1.0), "no_load_speed"),
+        (lambda: ij.with_parts(PAPER, sensor=ENCODER), "Sampling"),
+        (lambda: ij.with_parts(PAPER, sampling=2e-3), "Sampling"),
+        (lambda: ij.simulate(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3)), duration=0.1, dt=4e-4), r"Take dt=0.000333"),
+    ],
+)
+def test_bad_parts_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_a_study_may_not_lengthen_the_delay_beyond_the_queue():
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=1e-3))
+    study = ij.monte_carlo(scenario, {"sampling.delay": ij.value(ij.uniform(2.1e-3, 2.9e-3))}, runs=2, duration=0.05, dt=5e-4)
+    assert np.all(np.asarray(study.status) & int(Status.NOT_FINITE))
+    roomy = dataclasses.replace(scenario, sampling=dataclasses.replace(scenario.sampling, queue=3))
+    study = ij.monte_carlo(roomy, {"sampling.delay": ij.value(ij.uniform(2.1e-3, 2.9e-3))}, runs=2, duration=0.05, dt=5e-4)
+    assert not np.any(np.asarray(study.status) & int(Status.NOT_FINITE))
+
+
+def test_tuning_hears_the_noise():
+    sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
+    objective = ij.objectives.tracking() + 0.1 * ij.objectives.torque_rate()
+    result = ij.tune(scenario, ["controller.K2"], objective, duration=0.2, dt=5e-4, runs=4, iterations=4)
+    assert float(result.tuned[0]) != 4.0 and np.isfinite(result.objective)
