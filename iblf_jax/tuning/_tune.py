@@ -42,7 +42,7 @@ from iblf_jax.tuning.problem import (
     slope,
     value,
 )
-from iblf_jax.tuning.result import TuneResult, TuneSetup
+from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
 OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
@@ -340,11 +340,15 @@ def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimi
     prices, residuals = (state["lam"][best], ()) if loop.penalised else (state["method"][name][best] for name in ("prices", "residuals"))
     if stopped == "converged" and not np.all(np.isfinite(residuals)):
         stopped = NO_SLOPE
+    elif stopped == "converged" and not loop.penalised and state["method"]["stuck"][best]:
+        stopped = STUCK
     elif stopped == "converged" and broken:
         stopped = INFEASIBLE
     # They are of where the method stands; where the requirements cannot be kept, the multipliers are those of breaking them.
     here = stopped == "converged" if loop.penalised else np.array_equal(state["best_z"][best], state["method"]["z"][best])
-    if broken or not here or stopped == NO_SLOPE:
+    if stopped == STUCK and not broken:
+        prices = np.full(len(prices), np.nan)
+    elif broken or not here or stopped == NO_SLOPE:
         prices, residuals = () if broken else np.full(len(prices), np.nan), ()
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
     history = {name: np.stack(x) for name, x in loop.history.items()}

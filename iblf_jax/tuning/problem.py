@@ -101,18 +101,18 @@ class Value(NamedTuple):
 
     loss: Any
     """L, infinite where a run was invalid."""
-    objective: Any
+    objective: Any = ()
     """L without requirements and without smoothing: what results are compared by."""
-    terms: Any
+    terms: Any = ()
     """Each unweighted term without smoothing, averaged over the runs, for a front combined as the risk says, (n_terms,)."""
-    excess: Any
+    excess: Any = ()
     """G_r from the smooth quantities, (n_requirements,)."""
-    exact_excess: Any
+    exact_excess: Any = ()
     """G_r from the exact ones."""
-    margin: Any
+    margin: Any = ()
     """The smallest margin of all runs [rad]."""
-    valid: Any
-    exact: Any
+    valid: Any = ()
+    exact: Any = ()
     """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the margin."""
 
 

@@ -31,6 +31,8 @@ from iblf_jax.tuning.robust import Risk
 
 FAR = 100.0
 """A gain that ended so many times above or below its start is worth a warning."""
+STUCK = "the steps became too small: the model of objective and requirements does not hold near these gains"
+"""Why a tuning stopped whose trust region has collapsed before the conditions of an optimum were met."""
 NEAR = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where the limit is 0)."""
 
@@ -156,6 +158,8 @@ class TuneResult:
         if self.stopped == "iterations used up":
             steps = len(self.history["evaluations"])
             lines.append(f"WARNING: not converged: give more iterations than {steps}, or several starts")
+        if self.stopped == STUCK:
+            lines.append("WARNING: no optimum: give several starts, a smaller dt, or an objective whose slope does not jump")
         first = np.concatenate([np.ravel(paths.get(self.start, path)) for path in self.values])
         last = np.concatenate([np.ravel(value) for value in self.values.values()])
         for name, before, after in zip(self._entries, first, last, strict=True):
