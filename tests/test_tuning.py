@@ -249,7 +249,7 @@ def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
 
 def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
     """With room for one piece a requirement the one that leaves is forgotten, and the optimum is found all the same."""
-    monkeypatch.setattr(newton, "MOST_PIECES", 1)
+    monkeypatch.setattr(newton, "MOST_BENT", 1)
     method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-10, limits=Pieces.of((2,), (0.0,), 2), runs=2)
     state = method.init(np.array([[3.0, -1.0]]))
     for _ in range(20):

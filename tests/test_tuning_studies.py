@@ -246,6 +246,27 @@ def test_figures(paper):
     assert front.plot().axes
 
 
+@pytest.mark.slow
+def test_the_way_of_a_tuning_across_what_is_allowed(paper):
+    """Two gains that are one number for all joints; what the limit forbids is where runs break it."""
+    gains = [ij.tunable("controller.k1", tied=True), ij.tunable("controller.K2", tied=True)]
+    wanted = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, gains, wanted, iterations=3, progress=False, **SHORT)
+    k1, K2 = np.array([1.0, 4.0]), np.array([3.0, 10.0, 40.0])
+    loss, excess = best.on_slice(*best.names, k1, K2)
+    for i, j in ((0, 0), (1, 2)):
+        run = ij.simulate(ij.with_parameters(paper, {"controller.k1": np.full(2, k1[i]), "controller.K2": np.full(2, K2[j])}), **SHORT)
+        assert excess[i, j] == pytest.approx(float(np.max(run.metrics.peak_torque)) / 12 - 1, rel=1e-9)
+        ise = float(np.sum(run.metrics.ise) / np.sum(ij.simulate(paper, **SHORT).metrics.ise))
+        assert loss[i, j] == pytest.approx(ise, rel=1e-9)
+    (axes,) = ij.plotting.paths(best, {"grid": [[1.0, 3.0], [4.0, 40.0]]}, points=5).axes
+    names = [text.get_text() for text in axes.figure.legends[0].get_texts()]
+    assert sorted(names) == ["grid, 2 values", "start", f"tune, {len(best.history['loss'])} values", "tuned"]
+    assert axes.get_xlim()[1] > 4.0 and axes.get_ylim()[1] > 40.0 and axes.get_xscale() == "log"
+    with pytest.raises(ValueError, match="names of two tuned numbers"):
+        ij.plotting.paths(best, gains=("controller.k1", "controller.o"))
+
+
 @pytest.fixture(scope="module")
 def tuned(paper, tmp_path_factory):
     """A tuning, its checkpoint and its file."""

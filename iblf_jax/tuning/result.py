@@ -250,7 +250,17 @@ class TuneResult:
         checks.fits("points", points, 8 * points * NUMBERS_A_RUN)
         factor = np.exp(np.linspace(-span, span, points))
         a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
-        changes = {first: np.repeat(a, points), second: np.tile(b, points)}
+        return a, b, self.on_slice(first, second, a, b)[0]
+
+    def on_slice(self, first: str, second: str, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Objective and largest excess of a requirement of the nominal run, (A, B) each, at values of two of `names` (A,), (B,).
+
+        The objective is infinite where a run is invalid; without requirements the excess is -inf.
+        """
+        grid = {first: np.repeat(a, len(b)), second: np.tile(b, len(a))}
+        # A name that is a whole leaf's stands for one number for all of its entries.
+        shapes = {name: np.shape(self.values[name]) if name in self.values else () for name in grid}
+        changes = {k: np.broadcast_to(x.reshape(-1, *(1,) * len(shapes[k])), (len(x), *shapes[k])) for k, x in grid.items()}
         setup, scenario = self.setup, canonical(self.scenario)
         dtype = scenario.initial.q.dtype
         folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario.n)
@@ -258,7 +268,9 @@ class TuneResult:
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), run=run, backend=setup.backend)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
         valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
-        return a, b, np.where(valid, np.asarray(values), np.inf).reshape(points, points)
+        excess = np.asarray(jax.vmap(setup.objective.excesses)(outcome.metrics["tuning_exact"]))
+        worst = np.max(excess, axis=1, initial=-np.inf)
+        return tuple(np.where(valid, x, np.inf).reshape(len(a), len(b)) for x in (np.asarray(values), worst))  # type: ignore[return-value]
 
     def plot(self, **options):
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as `plotting.tuning`."""
