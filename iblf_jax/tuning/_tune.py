@@ -109,7 +109,8 @@ def tune(
         runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
       starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch; at each
-        sharpening the better half goes on.
+        sharpening the better half goes on.  Eight are worth their price where there are several valleys, as with nine gains and more
+        under limits that bind.
       sharpenings: how many times the smoothing of the peaks in the objective's terms is divided by 4, each time once the starts have
         converged; 0 where no term is smoothed, and with adam.  Requirements are exact from the start.
       iterations: steps of the optimiser at most.
