@@ -1,6 +1,6 @@
 """Gain tuning against black-box search, on the same compiled rollout.
 
-    python benchmarks/tuning.py [--quick] [--problem NAME] [--starts 8] [--seeds 3] [--json FILE]
+    python benchmarks/tuning.py [--quick] [--problem NAME] [--starts 8] [--seeds 3] [--json FILE] [--picture FILE]
 
 The loss, without smoothing, is
 
@@ -125,6 +125,8 @@ class Search(NamedTuple):
     """Rollout-equivalents so far."""
     times: np.ndarray
     """Seconds so far."""
+    points: Any = ()
+    """z of each value, under limits."""
 
     def reached(self, goal: float) -> int | None:
         """When it came to the goal."""
@@ -285,6 +287,7 @@ class LimitedJudge:
     def __init__(self, built: _tune.Problem):
         self.built = built
         self.seen: list[float] = []
+        self.points: list[np.ndarray] = []
         self.began = time.perf_counter()
         reach = np.full(len(built.box.z), 4.0)
         self.low, self.high = np.maximum(built.box.low, built.box.z - reach), np.minimum(built.box.high, built.box.z + reach)
@@ -292,6 +295,7 @@ class LimitedJudge:
     def both(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Objective (S,), and excess (S, R); sixteen at a time, so that one shape is compiled."""
         points = np.atleast_2d(points)
+        self.points += list(points)
         parts = [np.concatenate([part, np.repeat(part[:1], 16 - len(part), 0)]) for part in np.split(points, range(16, len(points), 16))]
         found = [problem.value(self.built.shared, self.built.lanes(part), formulation=self.built.formulation) for part in parts]
         f = np.concatenate([np.where(np.asarray(x.valid), np.asarray(x.objective), 1e3) for x in found])[: len(points)]
@@ -307,7 +311,7 @@ class LimitedJudge:
     def search(self, method: str, cost: float = 1.0) -> Search:
         """What was seen."""
         spent = cost * (1.0 + np.arange(len(self.seen)))
-        return Search(method, 0, np.asarray(self.seen), spent, np.full(len(self.seen), time.perf_counter() - self.began))
+        return Search(method, 0, np.asarray(self.seen), spent, np.full(len(self.seen), time.perf_counter() - self.began), self.points)
 
 
 def _slsqp(judge: LimitedJudge, start: np.ndarray, everything: Any, steps: int) -> None:
@@ -325,8 +329,8 @@ def _slsqp(judge: LimitedJudge, start: np.ndarray, everything: Any, steps: int) 
     optimize.minimize(lambda z: at(z)[0], start, jac=lambda z: at(z)[2], method="SLSQP", bounds=bounds_, constraints=limit, options=options)
 
 
-def limited_searches(name: str, quick: bool) -> tuple[list[Search], float]:
-    """Every search of one limited problem, `tune` first, and what a value with its derivatives costs."""
+def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.TuneResult]:
+    """Every search of one limited problem, `tune` first, what a value with its derivatives costs, and what `tune` found."""
     import cma
 
     scenario, tunables, goal, timing = limited_problem(name, quick)
@@ -339,7 +343,8 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float]:
     }
     seconds = interleaved(calls, 2 if quick else 10)
     cost, began = seconds["slope"] / seconds["value"], time.perf_counter()
-    history = ij.tune(scenario, tunables, goal, iterations=4 if quick else 60, progress=False, **timing).history
+    best = ij.tune(scenario, tunables, goal, iterations=4 if quick else 60, progress=False, **timing)
+    history = best.history
     feasible = history["valid"] & np.all(history["excess"] <= 0, axis=-1)
     seen, spent = np.where(feasible, history["objective"], np.inf)[:, 0], cost * history["evaluations"]
     searches = [Search("iblf_jax tune", 0, seen, spent, np.full(len(seen), time.perf_counter() - began))]
@@ -348,6 +353,7 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float]:
 
     def exact(z: np.ndarray) -> Any:
         found = jax.tree.map(lambda x: np.asarray(x)[0], problem.slope(built.shared, built.lanes(z[None]), formulation=built.formulation))
+        judge.points.append(z.copy())
         judge.seen.append(float(found.value.objective) if np.all(found.value.exact_excess <= 0) else np.inf)
         worst = [np.flatnonzero(built.limits.owner == r)[np.argmax(found.excess[0, built.limits.owner == r])] for r in range(2)]
         return float(found.value.objective), found.value.exact_excess, found.gradient, found.slopes[0][:, worst].T
@@ -386,12 +392,15 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float]:
     pairs = list(zip(judge.low, judge.high, strict=True))
     optimize.differential_evolution(lambda x: judge.penalised(x.T), pairs, x0=z, **options)
     searches.append(judge.search("differential evolution"))
-    return searches, cost
+    return searches, cost, best
 
 
-def compare_limited(name: str, quick: bool) -> list[list[Any]]:
-    """The rows of one limited problem."""
-    searches, cost = limited_searches(name, quick)
+def compare_limited(name: str, quick: bool, picture: str | None = None) -> list[list[Any]]:
+    """The rows of one limited problem; a picture of the searches' ways to the best gains where a file is given for it."""
+    searches, cost, found = limited_searches(name, quick)
+    if picture and len(found.names) == 2:
+        ways = {s.method: np.exp(np.stack(s.points)) for s in searches[1:] if s.method in ("SLSQP, exact slopes", "CMA-ES")}
+        ij.plotting.paths(found, ways).savefig(picture)
     goal = WITHIN * min(float(s.seen.min()) for s in searches)
     rows = []
     for s in searches:
@@ -412,11 +421,12 @@ def main() -> None:
     parser.add_argument("--starts", type=int, help="starts of tune; 8 on the chain of four and 1 elsewhere if not given")
     parser.add_argument("--seeds", type=int, default=3, help="searches by CMA-ES, and by tune where it has several starts")
     parser.add_argument("--json", help="also write the table to this file")
+    parser.add_argument("--picture", help="draw the ways of the searches on the limited problem of two gains into this file")
     args = parser.parse_args()
     names = (
         [args.problem] if args.problem else ["two_link", *list(LIMITED)[:1]] if args.quick else ["two_link", "chain_4", "chain_7", *LIMITED]
     )
-    limits = [row for name in names if name in LIMITED for row in compare_limited(name, args.quick)]
+    limits = [row for name in names if name in LIMITED for row in compare_limited(name, args.quick, args.picture)]
     names = [name for name in names if name not in LIMITED]
     found = [compare(name, args.quick, args.starts or STARTS[name], 1 if args.quick else args.seeds) for name in names]
     columns = ["problem", "gains", "search", "first J", "best J", "rollouts to 0.5 %", "seconds to 0.5 %", "rollouts", "seconds"]

@@ -21,11 +21,12 @@ from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning import _tune, problem, quadratic
+from iblf_jax.tuning import _tune, newton, problem, quadratic
 from iblf_jax.tuning.newton import Newton, Pieces, planned
 from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
+from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 
 jax.config.update("jax_enable_x64", True)
@@ -246,6 +247,35 @@ def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
     assert state["done"][0] and np.all(state["residuals"][0] < 1e-3)
 
 
+def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
+    """With room for one piece a requirement the one that leaves is forgotten, and the optimum is found all the same."""
+    monkeypatch.setattr(newton, "MOST_BENT", 1)
+    method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-10, limits=Pieces.of((2,), (0.0,), 2), runs=2)
+    state = method.init(np.array([[3.0, -1.0]]))
+    for _ in range(20):
+        method.step(TwoPieces(5.0), state)
+    assert state["bends"].shape == (1, 1, 2, 2)
+    np.testing.assert_allclose(state["z"][0], np.full(2, 0.5**0.5), atol=2e-5)
+    np.testing.assert_array_equal(state["places"][0], np.argmax(state["excess"][0]))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])
+def test_a_region_that_has_collapsed_is_no_optimum(sign):
+    """|z|^2 with its gradient, and with the opposite one: nothing is foretold there, however short the step."""
+
+    def evaluate(z):
+        value = problem.Value(np.sum(z**2, axis=1))
+        return problem.Slope(value, 2 * sign * z, np.zeros((len(z), 2, 2)))
+
+    method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-6)
+    state = method.init(np.array([[3.0, -1.0]]))
+    for _ in range(40):
+        method.step(evaluate, state)
+    assert state["done"][0] and state["stuck"][0] == (sign < 0)
+    if sign > 0:
+        np.testing.assert_allclose(state["z"][0], 0.0, atol=1e-3)
+
+
 def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
     """The circle and z0 > 1.5, another requirement: between them the sum of both is least at the end of the circle."""
 
@@ -340,6 +370,7 @@ def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
     priceless = ij.tune(paper, ["controller.k1"], objectives.tracking(), iterations=1, **SHORT)
     assert any("no price on torque" in line for line in priceless.notes)
     assert any("WARNING: not converged: give more iterations than 1" in line for line in priceless.notes)
+    assert any("WARNING: no optimum: give several starts" in line for line in dataclasses.replace(priceless, stopped=STUCK).notes)
     far = dataclasses.replace(priceless, values={"controller.k1": np.array([2.0, 210.0])})
     assert [line for line in far.notes if "controller.k1[1] ended at 105 times its start" in line]
 

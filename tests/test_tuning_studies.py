@@ -11,6 +11,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.simulation.paths import get
+from iblf_jax.tuning import _pareto, _tune, problem
 from iblf_jax.tuning._pareto import Front, non_dominated
 from iblf_jax.tuning.result import TuneResult
 
@@ -91,6 +92,50 @@ def test_pareto_is_a_front(paper):
     assert float(again) == pytest.approx(a[0], rel=1e-9)
     with pytest.raises(ValueError, match="one plain term"):
         ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.peak_torque()), **SHORT)
+
+
+def area(points, corner):
+    """What a front beats, of the logarithms below a corner: the hypervolume."""
+    a, b = np.log(points[non_dominated(points)]).T
+    widths = np.diff(np.append(a, np.log(corner[0])))
+    return float(np.sum(widths * (np.log(corner[1]) - b)))
+
+
+@pytest.mark.slow
+def test_a_front_has_its_ends_and_no_gaps(paper):
+    """Beside a dense grid over both gains; a limit on the margin cuts the grid's front and this one alike."""
+    gains = [ij.tunable("controller.k1", 0.3, 60.0, tied=True), ij.tunable("controller.K2", 0.6, 60.0, tied=True)]
+    limit = ij.objectives.margin_above(0.9 * float(np.min(ij.simulate(paper, **SHORT).metrics.margin)))
+    pair = (ij.objectives.tracking(), ij.objectives.effort() + limit)
+    front = ij.pareto(paper, gains, pair, iterations=12, progress=False, **SHORT)
+    built = _tune.build(paper, gains, pair[0] + pair[1], None, 1, 0, "mean", SHORT)
+    axes = (np.linspace(low, high, 40) for low, high in zip(built.box.low, built.box.high, strict=True))
+    z = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    seen = problem.value(built.shared, built.lanes(z), formulation=built.formulation)
+    kept = np.asarray(seen.valid & (seen.margin > 0) & (seen.exact_excess[:, 0] <= 0))
+    assert 0 < np.sum(kept) < len(z)
+    grid = np.asarray(seen.terms)[kept]
+    dense = grid[non_dominated(grid)]
+    corner = 1.1 * np.maximum(dense.max(axis=0), front.objectives.max(axis=0))
+    assert area(front.objectives, corner) > 0.99 * area(dense, corner)
+    np.testing.assert_array_less(front.objectives.min(axis=0), 1.001 * dense.min(axis=0))
+    assert np.max(np.abs(np.diff(np.log(front.objectives), axis=0))) < np.log(1.5)
+    assert front.evaluations <= 8 * 12
+    metrics = ij.simulate(front.scenario(len(front) - 1), **SHORT).metrics
+    assert float(np.min(metrics.margin)) > -float(limit.limit) - 1e-12
+
+
+def test_a_front_asks_for_the_middle_of_its_largest_gap_once():
+    """What no level fills is a gap of the front, and is not asked for again."""
+    search = _pareto.Search(SimpleNamespace(box=SimpleNamespace(z=np.zeros(1))), 8, 1, 0.0)
+    search.z, search.terms, search.nodes = np.array([[0.0], [1.0], [3.0]]), np.exp([[0.0, 9.0], [1.0, 5.0], [1.5, 0.0]]), [0, 1, 2]
+    z, aims, levels = search.largest_gaps(8)
+    np.testing.assert_array_equal((z[:, 0], aims, levels), ([2.0, 0.5], [0, 0], [2.5, 7.0]))
+    search.asked = [(1, 2.5), (1, 7.0)]
+    z, aims, levels = search.largest_gaps(8)
+    np.testing.assert_array_equal((z[:, 0], aims, levels), ([0.5, 2.0], [1, 1], [0.5, 1.25]))
+    search.asked += [(0, 0.5), (0, 1.25)]
+    assert search.largest_gaps(8) is None
 
 
 def test_non_dominated():
@@ -199,6 +244,27 @@ def test_figures(paper):
         best.landscape("controller.k1[0]", "controller.o[0]")
     front = ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.effort()), points=2, iterations=2, **SHORT)
     assert front.plot().axes
+
+
+@pytest.mark.slow
+def test_the_way_of_a_tuning_across_what_is_allowed(paper):
+    """Two gains that are one number for all joints; what the limit forbids is where runs break it."""
+    gains = [ij.tunable("controller.k1", tied=True), ij.tunable("controller.K2", tied=True)]
+    wanted = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, gains, wanted, iterations=3, progress=False, **SHORT)
+    k1, K2 = np.array([1.0, 4.0]), np.array([3.0, 10.0, 40.0])
+    loss, excess = best.on_slice(*best.names, k1, K2)
+    for i, j in ((0, 0), (1, 2)):
+        run = ij.simulate(ij.with_parameters(paper, {"controller.k1": np.full(2, k1[i]), "controller.K2": np.full(2, K2[j])}), **SHORT)
+        assert excess[i, j] == pytest.approx(float(np.max(run.metrics.peak_torque)) / 12 - 1, rel=1e-9)
+        ise = float(np.sum(run.metrics.ise) / np.sum(ij.simulate(paper, **SHORT).metrics.ise))
+        assert loss[i, j] == pytest.approx(ise, rel=1e-9)
+    (axes,) = ij.plotting.paths(best, {"grid": [[1.0, 3.0], [4.0, 40.0]]}, points=5).axes
+    names = [text.get_text() for text in axes.figure.legends[0].get_texts()]
+    assert sorted(names) == ["grid, 2 values", "start", f"tune, {len(best.history['loss'])} values", "tuned"]
+    assert axes.get_xlim()[1] > 4.0 and axes.get_ylim()[1] > 40.0 and axes.get_xscale() == "log"
+    with pytest.raises(ValueError, match="names of two tuned numbers"):
+        ij.plotting.paths(best, gains=("controller.k1", "controller.o"))
 
 
 @pytest.fixture(scope="module")

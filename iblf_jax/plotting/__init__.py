@@ -26,6 +26,7 @@ from iblf_jax.plotting._studies import study_overview as study_overview
 from iblf_jax.plotting._sweeps import heat_map as heat_map
 from iblf_jax.plotting._sweeps import parallel as parallel
 from iblf_jax.plotting._tuning import pareto as pareto
+from iblf_jax.plotting._tuning import paths as paths
 from iblf_jax.plotting._tuning import tuning as tuning
 from iblf_jax.plotting.animation import animate as animate
 from iblf_jax.plotting.comparison import comparison as comparison

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -169,6 +170,67 @@ def _landscape(axes: Axes, result: TuneResult, names: tuple[str, str], points: i
         axes.set_yscale("log")
     axes.set_xlabel(plain(names[0]))
     axes.set_ylabel(plain(names[1]))
+
+
+@_style.styled()
+def paths(result: TuneResult, others: Mapping[str, Any] | None = None, *, gains: tuple[str, str] | None = None, points: int = 41) -> Figure:
+    """The way of a tuning across the gains that its requirements allow, beside the ways of other searches.
+
+    Contours are of the objective of the nominal run, on the slice through the tuned gains; what breaks a requirement there is hatched.
+
+    Args:
+      result: of `tune`.
+      others: name of a search -> the two gains that it tried, in their units, (N, 2), one after another; none if not given.
+      gains: names of the two; the first two tuned numbers if not given.
+      points: of the slice, a side.
+
+    Returns:
+      A matplotlib Figure.
+
+    Raises:
+      ValueError: an unknown name, or fewer than two tuned numbers.
+
+    Source: design of this package.
+    """
+    names = tuple(result.names[:2]) if gains is None else gains
+    fine = isinstance(names, tuple | list) and len(names) == 2 and all(name in result.names for name in names)
+    if not fine:
+        raise checks.fail("gains", gains, "the names of two tuned numbers", f"They are {', '.join(result.names)}.")
+    points = checks.positive_integer("points", points, least=2)
+    own = [result.names.index(name) for name in names]
+    trials = result.history["x"][:, result.best_start][:, own]
+    ways = {"tune": trials, **{name: np.asarray(x, float).reshape(-1, 2) for name, x in (others or {}).items()}}
+    seen = np.concatenate([*ways.values(), result.tuned[None, own]])
+    positive = bool(np.all(seen > 0))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    room = 0.08 * (np.log(high / low) if positive else high - low) + 0.05
+    axis = [np.geomspace(a * np.exp(-r), b * np.exp(r), points) if positive else np.linspace(a - r, b + r, points)
+            for a, b, r in zip(low, high, room, strict=True)]  # fmt: skip
+    loss, excess = result.on_slice(names[0], names[1], *axis)
+    figure = _style.new_figure(0.8 * _style.WIDTH, 4.4)
+    axes = figure.subplots()
+    filled = np.where(np.isfinite(loss), loss, np.nan)
+    best = float(np.nanmin(filled))
+    levels = best + (float(np.nanquantile(filled, 0.7)) - best) * np.linspace(0.0, 1.0, 14) ** 2
+    if levels[-1] > best:
+        axes.contourf(*axis, filled.T, levels=levels, cmap=_style.colour_map("cividis"), extend="max")
+    broken = np.where(np.isfinite(excess), excess, 1.0)
+    if np.any(broken > 0):
+        axes.contourf(*axis, broken.T, levels=[0.0, np.inf], colors="none", hatches=["//"])
+        axes.contour(*axis, broken.T, levels=[0.0], colors=[_style.alarm()], linewidths=1.0)
+    outlined: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": "black", "zorder": 4}
+    for i, (name, way) in enumerate(ways.items()):
+        drawn: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3.5, "color": _style.colour(i + 1)}
+        if name == "tune":
+            drawn = {"linewidth": 1.2, "marker": "o", "markersize": 4, "color": "black", **outlined}
+        axes.plot(*way.T, label=f"{name}, {len(way)} values", **drawn)
+    axes.plot(*trials[0], marker="s", linestyle="none", markersize=6, label="start", **outlined)
+    axes.plot(*result.tuned[own], marker="*", linestyle="none", markersize=13, label="tuned", **outlined)
+    axes.set(xlim=axis[0][[0, -1]], ylim=axis[1][[0, -1]], xlabel=plain(names[0]), ylabel=plain(names[1]))
+    if positive:
+        axes.set(xscale="log", yscale="log")
+    _style.legend_below(figure, of=[axes])
+    return figure
 
 
 @_style.styled()

@@ -1,17 +1,17 @@
-"""`falsify`: attack a scenario before it is believed, by gradient ascent over start, disturbance and plant within stated ends.
+"""`falsify`: attack a scenario before it is believed, by its derivatives, over start, disturbance and plant within stated ends.
 
 Random runs seldom meet the worst case: in d dimensions its corner of the set is small.  Here the uniform number u in [0, 1]^d behind
-each perturbation is the unknown, and every one of S attacks, started at random, climbs
+each perturbation is the unknown, and every one of S attacks, started at random, solves
 
-    u <- clip(u - rate sign(d margin / du), 0, 1),     margin = smallest over time and joints, smooth (`quantities.Peak`)
+    minimise  margin(u) = min over time and joints of min(q - lower, upper - q)     subject to     0 <= u <= 1
 
-with a rate that falls, all attacks in one batch, gradients by forward mode.  What comes back is the run with the smallest margin that
-was seen, so it is never better news than its own starting points.
+by the method of `newton`: the exact margin and its slope, which are those of the joint, side and instant that come nearest, a
+curvature learnt from their changes, and a trust region.  An attack that has arrived starts anew somewhere else.  All run in one batch,
+derivatives by forward mode.  What comes back is the run with the smallest margin that was seen, so it is never better news than its
+own starting points.
 
 What cannot be run is no answer: a start outside its bounds, a mass matrix that is not positive definite, a reference that leaves the
 bounds.  Attacks start at admissible points, and one that steps out goes back towards where it came from.
-
-Source: projected sign-gradient ascent, A. Madry et al., ICLR 2018.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.problem import NUMBERS_A_RUN
+from iblf_jax.tuning.newton import Newton
+from iblf_jax.tuning.parameters import Box
+from iblf_jax.tuning.problem import NUMBERS_A_RUN, Slope, Value
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.tangents import by_coordinates
 
-FIRST_RATE, LAST_RATE = 0.5, 0.02
-"""Steps in u, from the first to the last."""
+FIRST_RADIUS = 0.5
+"""Of the first step, in u."""
+TOLERANCE = 1e-4
+"""An attack has arrived where its model promises less, relative to the margin."""
 HALVINGS = 8
 """How often a step that leads out of what is admissible is halved before the attack stays where it is."""
-SMOOTHING = 1e-3
-"""rad.  Of the smallest margin over time and joints."""
-
-
 NO_ANSWER = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
 """Flags of runs that say nothing about the law: no law could keep the bounds, or the integrator is to blame."""
 
@@ -71,7 +71,7 @@ class Attack:
     status: int
     """Flags of `Status` of that run."""
     history: np.ndarray
-    """Margin of every attack at every step, (iterations + 1, starts) [rad]; NaN for runs that are no answer (`NO_ANSWER`)."""
+    """Margin of every attack's trial at every step, (iterations + 1, starts) [rad]; NaN for runs that are no answer (`NO_ANSWER`)."""
     runs: int
     """Rollouts with derivatives that were made."""
     timing: dict[str, Any]
@@ -118,8 +118,8 @@ def falsify(
       dt: time step [s].
       method: integrator.
       backend: as `tune`.
-      starts: attacks, each from its own random point, in one batch.
-      iterations: steps of each attack.
+      starts: attacks, each from its own random point, in one batch; one that has arrived starts anew from another point.
+      iterations: steps of each of them.
       seed: fixes the starting points.
       progress: a progress bar; shown where somebody watches if not given.
 
@@ -143,24 +143,27 @@ def falsify(
     run = Run(steps, method, mechanism=mechanism_of(scenario))
     push = partial(_push, cube, jnp.asarray(dt, dtype), run=run, backend=backend)
     seed = check_seed(seed)
-    u = cube.admissible_points(starts, [seed, 3])
-    last_valid, ever, best, history = u.copy(), np.zeros(starts, bool), None, []
+    searcher = Newton(Box(np.full(cube.size, 0.5), np.zeros(cube.size), np.ones(cube.size)), TOLERANCE, FIRST_RADIUS)
+    state, best, history = searcher.init(cube.admissible_points(starts, [seed, 3])), None, []
+
+    def attack(u: np.ndarray) -> Slope:
+        nonlocal best
+        margin, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
+        fine = np.isfinite(margin) & (status & int(NO_ANSWER) == 0)
+        history.append(np.where(fine, margin, np.nan))
+        s = int(np.argmin(np.where(fine, margin, np.inf)))
+        if fine[s] and (best is None or margin[s] < best[0]):
+            best = (float(margin[s]), u[s].copy(), int(status[s]))
+        return Slope(Value(np.where(fine, margin, np.inf)), slope, np.zeros((starts, cube.size, cube.size)))
+
     with bar(progress, iterations + 1, unit="steps") as shown:
-        for rate in [*np.geomspace(FIRST_RATE, LAST_RATE, iterations), None]:
-            margin, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
-            fine = np.isfinite(margin) & (status & int(NO_ANSWER) == 0)
-            history.append(np.where(fine, margin, np.nan))
-            s = int(np.argmin(np.where(fine, margin, np.inf)))
-            if fine[s] and (best is None or margin[s] < best[0]):
-                best = (float(margin[s]), u[s].copy(), int(status[s]))
-            if rate is not None:
-                stepped = np.clip(u - rate * np.sign(np.where(np.isfinite(slope), slope, 0.0)), 0.0, 1.0)
-                ahead = np.where(fine[:, None], stepped, 0.5 * (u + last_valid))
-                last_valid, ever = np.where(fine[:, None], u, last_valid), ever | fine
-                if not ever.all():  # an attack that has nowhere to go back to starts somewhere else
-                    anew = cube.admissible_points(starts, [seed, 3, len(history)])
-                    last_valid, ahead = (np.where(ever[:, None], x, anew) for x in (last_valid, ahead))
-                u = np.stack([_back(cube.refused, *pair) for pair in zip(last_valid, ahead, strict=True)])
+        for step in range(iterations + 1):
+            state["trial"] = np.stack([_back(cube.refused, *pair) for pair in zip(state["z"], state["trial"], strict=True)])
+            searcher.step(attack, state)
+            arrived = np.flatnonzero(state["done"])
+            anew = cube.admissible_points(starts, [seed, 3, step + 1]) if len(arrived) else ()
+            for s in arrived.tolist():
+                searcher.begin(state, s, anew[s])
             shown.update(1)
             shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} rad")
     if best is None:
@@ -187,11 +190,12 @@ def _back(refused: Callable[[np.ndarray], str], last_valid: np.ndarray, ahead: n
 
 @partial(jax.jit, static_argnames=("run", "backend"))
 def _push(cube: Cube, dt, u, *, run, backend):
-    """Smallest margin (S,) [rad], its gradient by u (S, d) and the status of each attack."""
+    """Smallest margin (S,) [rad], its slope by u (S, d) and the status of each attack."""
     one: Any = jnp.ones_like(dt)
-    fold = Quantities((Peak(one, "deficit", smoothing=one * SMOOTHING),))
     varied = jax.vmap(cube.values)(u)
     slopes = jax.vmap(jax.jacfwd(cube.values))(u)
-    found = by_coordinates(cube.cases.scenario, varied, slopes, (fold,), dt, run, backend=backend)
-    margin = -found.outcome.metrics["tuning_exact"][:, 0]
-    return margin, -found.tangents["tuning_smooth"][:, :, 0], found.outcome.status
+    found = by_coordinates(cube.cases.scenario, varied, slopes, (Quantities((Peak(one, "deficit"),)),), dt, run, backend=backend)
+    deficits, moved = found.outcome.metrics["tuning_pieces"], found.tangents["tuning_pieces"]
+    worst = jnp.argmax(deficits, axis=1)
+    margin = -jnp.take_along_axis(deficits, worst[:, None], axis=1)[:, 0]
+    return margin, -jnp.take_along_axis(moved, worst[:, None, None], axis=2)[:, :, 0], found.outcome.status

@@ -29,9 +29,21 @@ from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
 from iblf_jax.tuning.objectives import Objective, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, names_of, values_at
-from iblf_jax.tuning.problem import NUMBERS_A_RUN, Formulation, Lane, ProblemInputs, Slope, gradient, piece_counts, slope, value
-from iblf_jax.tuning.result import TuneResult, TuneSetup
+from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, values_at
+from iblf_jax.tuning.problem import (
+    NO_LEVEL,
+    NUMBERS_A_RUN,
+    Formulation,
+    Lane,
+    ProblemInputs,
+    Slope,
+    Value,
+    gradient,
+    piece_counts,
+    slope,
+    value,
+)
+from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
 OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
@@ -44,7 +56,7 @@ INFEASIBLE = "the requirements cannot be kept together near these gains"
 NO_SLOPE = "the objective has no finite derivative at the start"
 """Why one stopped that could not make a step."""
 SCREENED = 32
-"""Points that are looked at where the first start leaves its bounds."""
+"""Points of the whole box that are looked at where the first start leaves its bounds, and for the ends of a front."""
 
 
 def tune(
@@ -98,7 +110,8 @@ def tune(
         runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
       starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch; at each
-        sharpening the better half goes on.
+        sharpening the better half goes on.  Eight are worth their price where there are several valleys, as with nine gains and more
+        under limits that bind.
       sharpenings: how many times the smoothing of the peaks in the objective's terms is divided by 4, each time once the starts have
         converged; 0 where no term is smoothed, and with adam.  Requirements are exact from the start.
       iterations: steps of the optimiser at most.
@@ -178,7 +191,7 @@ def tune(
         report_runs,
         report_seed,
         confidence,
-        tuple(zip(*(_in_units(problem.formulation.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
+        tuple(zip(*(in_units(problem.formulation.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
     )
     return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began)
 
@@ -203,8 +216,9 @@ class Problem:
     @property
     def limits(self) -> Pieces:
         """The requirements, as `newton` sees them."""
-        own = self.formulation.pieces[len(self.shared.objective.terms) : -1]
-        return Pieces.of(own, self.formulation.shares, self.runs)
+        terms, form = len(self.shared.objective.terms), self.formulation
+        levels = terms if form.levels else 0
+        return Pieces.of((*form.pieces[terms:-1], *(1,) * levels), (*form.shares, *(0.0,) * levels), self.runs)
 
     def lanes(self, z: np.ndarray) -> Lane:
         """Lanes at z, (S, p): the same runs for all, no multipliers yet."""
@@ -212,11 +226,12 @@ class Problem:
         index = np.broadcast_to(np.arange(self.runs, dtype=np.uint32), (starts, self.runs))
         count, terms = len(self.formulation.shares), len(self.shared.objective.terms)
         weights, lam, mu = np.ones((starts, terms), dtype), np.zeros((starts, count), dtype), np.full(starts, FIRST_MU, dtype)
-        return Lane(np.asarray(z, dtype), index, weights, lam, mu)
+        level = np.full((starts, terms), NO_LEVEL, dtype)
+        return Lane(np.asarray(z, dtype), index, weights, lam, mu, level)
 
 
 def build(
-    scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, *, scalarisation="sum", mode="auto"
+    scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, *, levels: bool = False, mode="auto"
 ) -> Problem:
     """Checks what `tune` and its relatives were asked for; `timing` is duration, dt, method and, if it is not "auto", backend."""
     tableau(timing["method"])
@@ -238,7 +253,7 @@ def build(
     backend, mechanism = timing.get("backend", "auto"), mechanism_of(scenario)
     pieces = piece_counts(ones, scenario, float(timing["duration"]))
     formulation = Formulation(
-        blocks, targets, steps, timing["method"], as_risk(risk), shares, scalarisation, backend, mechanism=mechanism, pieces=pieces
+        blocks, targets, steps, timing["method"], as_risk(risk), shares, levels, backend, mechanism=mechanism, pieces=pieces
     )
     inputs = ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step)
     again = {"duration": timing["duration"], "method": timing["method"], "perturbations": perturbations, "seed": seed}
@@ -289,20 +304,29 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
     only, and the starts are those that break the requirements and the bounds least.
 
     Raises:
-      ValueError: none of them can be integrated; the message names a step that will do.
+      ValueError: as `look_around`.
     """
     if found.value.valid[0] and found.value.margin[0] > 0:
         return None
-    rng = np.random.default_rng([seed, 2])
-    low = np.where(np.isfinite(problem.box.low), problem.box.low, problem.box.z - 3 * SPREAD)
-    high = np.where(np.isfinite(problem.box.high), problem.box.high, problem.box.z + 3 * SPREAD)
-    points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
-    seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), formulation=problem.formulation))
-    broken = np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
-    if not np.any(seen.valid):
-        raise problem.too_stiff()
+    points, seen, broken = look_around(problem, seed, z)
     order = np.lexsort((seen.objective, broken, ~seen.valid))
     return points[order[: len(z)]]
+
+
+def look_around(problem: Problem, seed: int, z: np.ndarray) -> tuple[np.ndarray, Value, np.ndarray]:
+    """Some points (S, p) and SCREENED of the whole box, what they give, and by how much they break requirements and bounds.
+
+    Raises:
+      ValueError: none of them can be integrated; the message names a step that will do.
+    """
+    rng, box = np.random.default_rng([seed, 2]), problem.box
+    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * SPREAD)
+    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * SPREAD)
+    points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
+    seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), formulation=problem.formulation))
+    if not np.any(seen.valid):
+        raise problem.too_stiff()
+    return points, seen, np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
 
 
 def _show(shown: Any, loop: Loop) -> None:
@@ -312,12 +336,6 @@ def _show(shown: Any, loop: Loop) -> None:
     shown.set_postfix_str(f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin {last['margin'][s]:.3g} rad")
 
 
-def _in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
-    """Coordinates z, (..., p), as numbers in the units of their leaves."""
-    log = np.concatenate([np.full(b.size, b.log) for b in blocks])
-    return np.where(log, np.exp(np.where(log, z, 0.0)), z)
-
-
 def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
     state, blocks = loop.state, problem.formulation.blocks
     best = loop.best
@@ -325,15 +343,19 @@ def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimi
     prices, residuals = (state["lam"][best], ()) if loop.penalised else (state["method"][name][best] for name in ("prices", "residuals"))
     if stopped == "converged" and not np.all(np.isfinite(residuals)):
         stopped = NO_SLOPE
+    elif stopped == "converged" and not loop.penalised and state["method"]["stuck"][best]:
+        stopped = STUCK
     elif stopped == "converged" and broken:
         stopped = INFEASIBLE
     # They are of where the method stands; where the requirements cannot be kept, the multipliers are those of breaking them.
     here = stopped == "converged" if loop.penalised else np.array_equal(state["best_z"][best], state["method"]["z"][best])
-    if broken or not here or stopped == NO_SLOPE:
+    if stopped == STUCK and not broken:
+        prices = np.full(len(prices), np.nan)
+    elif broken or not here or stopped == NO_SLOPE:
         prices, residuals = () if broken else np.full(len(prices), np.nan), ()
     values = {path: np.asarray(x) for path, x in values_at(blocks, jnp.asarray(state["best_z"][best])).items()}
     history = {name: np.stack(x) for name, x in loop.history.items()}
-    history["x"] = _in_units(blocks, history["z"])
+    history["x"] = in_units(blocks, history["z"])
     start = problem.shared.cases.scenario
     return TuneResult(
         scenario=with_parameters(start, values),

@@ -192,6 +192,12 @@ def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
     return values
 
 
+def in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
+    """Coordinates z, (..., p), as numbers in the units of their leaves."""
+    log = np.concatenate([np.full(b.size, b.log) for b in blocks])
+    return np.where(log, np.exp(np.where(log, z, 0.0)), z)
+
+
 def names_of(blocks: tuple[Block, ...]) -> list[str]:
     """What each coordinate is called: "controller.K2[0]", or the path alone if it is tied or has one entry."""
     names = []

@@ -14,6 +14,9 @@ of optax know one loss only, with an augmented Lagrangian in it,
 
     L(z) = f(z) + sum_r psi(G_r; lam_r, mu),     psi(G; lam, mu) = (max(0, lam + mu G)^2 - lam^2) / (2 mu).
 
+For a front every term k is an objective of its own, F_k = log risk_b[term_kb].  A start minimises sum_k w_k F_k under levels of its own,
+F_k <= level_k, which are requirements of one piece each.
+
 Forward mode gives all of it at once; reverse mode, for many parameters, the gradient of L.
 """
 
@@ -53,8 +56,8 @@ class Formulation(NamedTuple):
     risk: Risk
     shares: tuple[float, ...]
     """Share of the runs that G_r is taken over, for each requirement."""
-    scalarisation: str = "sum"
-    """"sum" of weighted terms, or "log": sum of weighted logarithms."""
+    levels: bool = False
+    """Whether the terms are objectives of a front: each start has its own weights and levels of F_k."""
     backend: str = "auto"
     """What values and forward mode run on; reverse mode is plain XLA."""
     nested: bool = False
@@ -76,14 +79,19 @@ class ProblemInputs(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """What differs between starts: coordinates (p,), run numbers (B,), weights of the terms, multipliers."""
+    """What differs between starts: coordinates (p,), run numbers (B,), weights of the terms, multipliers, levels of the terms."""
 
     z: Any
     index: Any
     weights: Any
     lam: Any
     mu: Any
+    level: Any = ()
+    """For a front, (n_terms,); NO_LEVEL where there is none."""
 
+
+NO_LEVEL = 1e6
+"""A level that nothing reaches."""
 
 NUMBERS_A_RUN = 100
 """Numbers that one run of a batch holds while it is computed, roughly: its state, its stages, its folds."""
@@ -94,18 +102,18 @@ class Value(NamedTuple):
 
     loss: Any
     """L, infinite where a run was invalid."""
-    objective: Any
+    objective: Any = ()
     """L without requirements and without smoothing: what results are compared by."""
-    terms: Any
-    """Each unweighted term without smoothing, averaged over the runs, (n_terms,)."""
-    excess: Any
+    terms: Any = ()
+    """Each unweighted term without smoothing, averaged over the runs, for a front combined as the risk says, (n_terms,)."""
+    excess: Any = ()
     """G_r from the smooth quantities, (n_requirements,)."""
-    exact_excess: Any
+    exact_excess: Any = ()
     """G_r from the exact ones."""
-    margin: Any
+    margin: Any = ()
     """The smallest margin of all runs [rad]."""
-    valid: Any
-    exact: Any
+    valid: Any = ()
+    exact: Any = ()
     """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the margin."""
 
 
@@ -116,7 +124,7 @@ class Slope(NamedTuple):
     gradient: Any
     hessian: Any
     excess: Any = ()
-    """g of each piece of each requirement in each run, (B, M), one requirement after the other."""
+    """g of each piece of each requirement in each run, (B, M), one requirement after the other, levels last and in the first run alone."""
     slopes: Any = ()
     """Their slopes, (B, p, M)."""
 
@@ -177,9 +185,14 @@ def _excesses(formulation: Formulation, objective: Objective, quantities: jax.Ar
 
 
 def _objective(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
-    terms = jax.vmap(shared.objective.values)(smooth)
-    terms = jnp.log(terms) if formulation.scalarisation == "log" else terms
-    return combine(formulation.risk, terms @ lane.weights)
+    if formulation.levels:
+        return jnp.log(_each(formulation.risk, shared, smooth)) @ lane.weights
+    return combine(formulation.risk, jax.vmap(shared.objective.values)(smooth) @ lane.weights)
+
+
+def _each(risk: Risk, shared: ProblemInputs, quantities: jax.Array) -> jax.Array:
+    """Each term, its runs combined, (n_terms,), from the quantities of the runs (B, K)."""
+    return jax.vmap(partial(combine, risk), in_axes=1)(jax.vmap(shared.objective.values)(quantities))
 
 
 def _loss(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array) -> jax.Array:
@@ -195,7 +208,7 @@ def _value(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth, 
     return Value(
         jnp.where(valid, _loss(formulation, shared, lane, smooth), jnp.inf),
         _objective(formulation, shared, lane, exact),
-        jnp.mean(jax.vmap(shared.objective.values)(exact), axis=0),
+        _each(formulation.risk if formulation.levels else Risk(), shared, exact),
         _excesses(formulation, shared.objective, smooth),
         _excesses(formulation, shared.objective, exact),
         -jnp.max(exact[:, -1]),
@@ -218,12 +231,26 @@ def _slope(formulation: Formulation, shared: ProblemInputs, lane: Lane, outcome,
     hessian = jnp.einsum("bk,bkuv->uv", d_loss, N) + jnp.einsum("ubk,bvk->uv", bent, J)
     found = Slope(_value(formulation, shared, lane, smooth, exact, outcome.status), gradient, hessian)
     requirements = shared.objective.requirements
-    if not requirements:
-        return found
     own = range(len(shared.objective.terms), len(parts) - 1)
     excess = [r.excess(parts[k]) for r, k in zip(requirements, own, strict=True)]
     moved = [slopes[k] / r.scale for r, k in zip(requirements, own, strict=True)]
+    if formulation.levels:
+        over, along = _over_levels(formulation, shared, lane, smooth, J)
+        excess, moved = [*excess, over], [*moved, along]
+    if not excess:
+        return found
     return found._replace(excess=jnp.concatenate(excess, axis=1), slopes=jnp.concatenate(moved, axis=2))
+
+
+def _over_levels(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: jax.Array, J: jax.Array):
+    """F_k - level_k in the first of the runs, far below zero in the others, (B, n_terms), and their slopes, (B, p, n_terms)."""
+
+    def over(smooth):
+        return jnp.log(_each(formulation.risk, shared, smooth)) - lane.level
+
+    slopes = jnp.einsum("tbk,buk->ut", jax.jacrev(over)(smooth), J)
+    excess = jnp.full((len(smooth), len(lane.level)), -NO_LEVEL, smooth.dtype).at[0].set(over(smooth))
+    return excess, jnp.zeros((len(smooth), *slopes.shape), smooth.dtype).at[0].set(slopes)
 
 
 @partial(jax.jit, static_argnames="formulation")

@@ -31,6 +31,8 @@ from iblf_jax.tuning.robust import Risk
 
 FAR = 100.0
 """A gain that ended so many times above or below its start is worth a warning."""
+STUCK = "the steps became too small: the model of objective and requirements does not hold near these gains"
+"""Why a tuning stopped whose trust region has collapsed before the conditions of an optimum were met."""
 NEAR = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where the limit is 0)."""
 
@@ -156,6 +158,8 @@ class TuneResult:
         if self.stopped == "iterations used up":
             steps = len(self.history["evaluations"])
             lines.append(f"WARNING: not converged: give more iterations than {steps}, or several starts")
+        if self.stopped == STUCK:
+            lines.append("WARNING: no optimum: give several starts, a smaller dt, or an objective whose slope does not jump")
         first = np.concatenate([np.ravel(paths.get(self.start, path)) for path in self.values])
         last = np.concatenate([np.ravel(value) for value in self.values.values()])
         for name, before, after in zip(self._entries, first, last, strict=True):
@@ -246,7 +250,17 @@ class TuneResult:
         checks.fits("points", points, 8 * points * NUMBERS_A_RUN)
         factor = np.exp(np.linspace(-span, span, points))
         a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
-        changes = {first: np.repeat(a, points), second: np.tile(b, points)}
+        return a, b, self.on_slice(first, second, a, b)[0]
+
+    def on_slice(self, first: str, second: str, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Objective and largest excess of a requirement of the nominal run, (A, B) each, at values of two of `names` (A,), (B,).
+
+        The objective is infinite where a run is invalid; without requirements the excess is -inf.
+        """
+        grid = {first: np.repeat(a, len(b)), second: np.tile(b, len(a))}
+        # A name that is a whole leaf's stands for one number for all of its entries.
+        shapes = {name: np.shape(self.values[name]) if name in self.values else () for name in grid}
+        changes = {k: np.broadcast_to(x.reshape(-1, *(1,) * len(shapes[k])), (len(x), *shapes[k])) for k, x in grid.items()}
         setup, scenario = self.setup, canonical(self.scenario)
         dtype = scenario.initial.q.dtype
         folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario.n)
@@ -254,7 +268,9 @@ class TuneResult:
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), run=run, backend=setup.backend)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
         valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
-        return a, b, np.where(valid, np.asarray(values), np.inf).reshape(points, points)
+        excess = np.asarray(jax.vmap(setup.objective.excesses)(outcome.metrics["tuning_exact"]))
+        worst = np.max(excess, axis=1, initial=-np.inf)
+        return tuple(np.where(valid, x, np.inf).reshape(len(a), len(b)) for x in (np.asarray(values), worst))  # type: ignore[return-value]
 
     def plot(self, **options):
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as `plotting.tuning`."""
