@@ -63,23 +63,13 @@ def test_a_killed_process_ends_the_other_and_what_they_had_is_kept(compiled, tmp
 
 @pytest.mark.slow
 def test_two_processes_agree_with_one(compiled, tmp_path):
-    for process in job(compiled, tmp_path, ("--store", str(tmp_path / "sweep.zarr"))):
+    """A sweep with a store, and a study."""
+    for process in job(compiled, tmp_path, ("--store", str(tmp_path / "sweep.zarr"), "--study")):
         _, errors = process.communicate(timeout=300)
         assert process.returncode == 0, errors
-    one = cases.arrays(cases.table())
+    one = cases.arrays(cases.table()) | cases.named(cases.study())
     for i in (0, 1):
         assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), one)
-
-
-@pytest.mark.slow
-def test_a_study_over_two_processes(compiled, tmp_path):
-    for process in job(compiled, tmp_path, ("--study",)):
-        _, errors = process.communicate(timeout=300)
-        assert process.returncode == 0, errors
-    study = cases.study()
-    expected = dict(study.metrics) | study.samples | {"status": study.status}
-    for i in (0, 1):
-        assert cases.same(dict(np.load(tmp_path / f"{i}.npz")), expected)
 
 
 @pytest.mark.slow

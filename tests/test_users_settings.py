@@ -25,7 +25,6 @@ AGAIN = {
         "test_monte_carlo.py::test_number_of_runs_changes_no_run[257]",
         "test_monte_carlo.py::test_replay_is_bit_identical_and_has_the_trajectory",
         "test_lowering_math.py::test_native_functions[float64]",
-        "test_lowering_backends.py::test_native_agrees_with_the_reference[float64]",
     ],
 }
 """Name -> tests."""
