@@ -61,10 +61,11 @@ def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
     return np.concatenate([dq, ddq, -20.0 * (f_hat + tau - C @ dq - G)])
 
 
-def import_seconds() -> float:
-    """Seconds of `import iblf_jax` after `import jax`, in a fresh process; the smallest of three."""
+def import_seconds(repeats: int) -> float:
+    """Seconds of `import iblf_jax` after `import jax`, in a fresh process; the smallest of some."""
     code = "import jax, time; t = time.perf_counter(); import iblf_jax; print(time.perf_counter() - t)"
-    return min(float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout) for _ in range(3))
+    command = [sys.executable, "-c", code]
+    return min(float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) for _ in range(repeats))
 
 
 def main() -> None:
@@ -103,7 +104,7 @@ def main() -> None:
     rows = [[name, 1e3 * seconds, reference / seconds] for name, seconds in best.items()]
     report(f"One run of {duration:g} s at 1 ms, {method}, float64", ["row", "ms", "times faster"], rows, args.json)
     built = ", ".join(f"{seconds:.2f} s ({backend})" for backend, seconds in compile_times.items())
-    print(f"compile {built}; import iblf_jax above import jax {import_seconds():.2f} s")
+    print(f"compile {built}; import iblf_jax above import jax {import_seconds(min(repeats, 3)):.2f} s")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 os.environ.setdefault("MPLBACKEND", "Agg")
 # In the environment, so that notebooks, benchmarks and commands, which are processes of their own, find what tests compiled.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")  # to keep a smaller one takes longer than it saves
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 # Where in Python an operation was written stands in no program that is compiled, and costs a tenth of the tracing.
@@ -45,11 +46,11 @@ SHORT = {"duration": 0.5, "dt": 1e-3}
 
 
 XLA_FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-"""Half of the tests' time was LLVM's, spent on making loops faster that run for milliseconds.  XLA is asked for the same programs; it
-writes the machine's code plainly, operation by operation and on one thread.  `test_users_settings.py` runs tests as users compile; so do
-the release tests, and all of them with TEST_XLA_FLAGS="" in the environment."""
+"""Half of the tests' time was the compilers', spent on making loops faster that run for milliseconds.  XLA is asked for the same programs;
+it writes the machine's code plainly, operation by operation and on one thread.  So does the compiler of kernels (`plain_compiler`).
+`test_users_settings.py` runs tests as users compile; so do the release tests, and all of them with TEST_AS_USERS=1 in the environment."""
 
-MEMORY = 2 * 2**30
+MEMORY = 3 * 2**30
 """Bytes of a process from which what it has compiled is let go after a test: what is needed again comes from the cache on disk."""
 
 
@@ -66,15 +67,18 @@ def memory() -> dict[str, int]:
 
 
 def pytest_configure(config):
-    """What XLA is told, by this process and those that it starts, and what JAX refuses.
+    """What compilers are told, by this process and those that it starts, and what JAX refuses.
 
     In the default run an array of another type is a slip, not a promotion; with the slow tests it is as in a user's session.  Ranks are
     promoted in both: the package broadcasts leading axes throughout.
     """
-    # A worker's environment is its parent's, which has been here: the tester's own flags are kept apart.
+    # A worker's environment is its parent's, which has been here: the tester's own words are kept apart.
     own = os.environ.setdefault("TESTER_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
-    ours = os.environ.get("TEST_XLA_FLAGS", "" if config.option.markexpr == "release" else XLA_FLAGS)
-    os.environ["XLA_FLAGS"] = f"{ours} {own}".strip()  # read when the first program is compiled, and the last of two flags wins
+    compiler = os.environ.setdefault("TESTER_CXX", os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), ""))
+    plain = config.option.markexpr != "release" and not os.environ.get("TEST_AS_USERS")
+    os.environ["XLA_FLAGS"] = f"{XLA_FLAGS if plain else ''} {own}".strip()  # read at the first program, and the last of two flags wins
+    if compiler:
+        os.environ["CXX"] = str(ROOT / "tests" / "plain_compiler") if plain else compiler
     if "not slow" in config.option.markexpr:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
 

@@ -86,6 +86,11 @@ def arrays(dataset):
     return {str(name): np.asarray(dataset[name]) for name in dataset.variables}
 
 
+def named(found):
+    """The arrays of a study, by names that no sweep has."""
+    return {f"study {name}": np.asarray(x) for name, x in (dict(found.metrics) | found.samples | {"status": found.status}).items()}
+
+
 def same(a, b):
     """Whether two mappings of arrays have the same names and bits."""
     return set(a) == set(b) and all(
@@ -196,7 +201,7 @@ def main() -> None:
     parser.add_argument("--job", nargs=3)
     parser.add_argument("--slow", type=float, default=0.0, help="sleep so long after each unit")
     parser.add_argument("--die-after", type=int, help="kill this process after so many units")
-    parser.add_argument("--study", action="store_true")
+    parser.add_argument("--study", action="store_true", help="the study, beside the sweep if there is a store")
     args = parser.parse_args()
     import jax
 
@@ -206,11 +211,9 @@ def main() -> None:
     if args.job:
         ij.distributed.initialize(args.job[0], int(args.job[1]), int(args.job[2]), heartbeat=5, start=60)
     _hinder(args)
+    data = {} if args.study and not args.store else arrays(table(**({"store": args.store} if args.store else {})))
     if args.study:
-        found = study()
-        data = dict(found.metrics) | found.samples | {"status": found.status}
-    else:
-        data = arrays(table(**({"store": args.store} if args.store else {})))
+        data |= named(study())
     np.savez(args.out, **data)
     print("done")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,13 @@ from iblf_jax.simulation.integrators import TABLEAUS, Tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
 
-DRAWS = {"controller.K2": jnp.asarray([[20.0, 20.0], [30.0, 25.0], [12.0, 14.0]])}
+DRAWS = {"controller.Kp": jnp.asarray([[60.0, 60.0], [80.0, 50.0], [40.0, 70.0]])}
+
+
+@pytest.fixture(scope="module")
+def short_loop(paper):
+    """Where only the way counts in which a loop is executed: it compiles sooner than the paper's."""
+    return ij.with_parts(paper, controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0), observer=ij.observers.NoObserver())
 
 
 def inputs_of(scenario, steps=50, dt=1e-3):
@@ -25,9 +33,13 @@ def inputs_of(scenario, steps=50, dt=1e-3):
     return Inputs(scenario, as_folds(None, step.dtype), step, jnp.asarray(float(steps)))
 
 
+@partial(jax.jit, static_argnames=("run", "shape", "executor"))
+def all_run(inputs, varied, run, shape, executor):
+    return run_all(executor, Batch.of(inputs, varied, *([shape] if shape else [])), run)
+
+
 def outcome(inputs, run, shape=None, varied=None, executor=scan):
-    batch = Batch.of(inputs, varied, *([shape] if shape else []))
-    return jax.tree.map(np.asarray, jax.jit(lambda: run_all(executor, batch, run))())
+    return jax.tree.map(np.asarray, all_run(inputs, varied, run, shape, executor))
 
 
 def assert_same(one, other):
@@ -38,14 +50,14 @@ def assert_same(one, other):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "run", [Run(50, "rk4", 7), Run(50, "heun", 1), Run(50, "euler")], ids=lambda run: f"{run.method}-{run.record_every}"
+    "run", [Run(50, "heun", 7), Run(50, "euler", 1), Run(50, "euler")], ids=lambda run: f"{run.method}-{run.record_every}"
 )
-def test_every_shape_is_the_same_run(paper, run):
+def test_every_shape_is_the_same_run(short_loop, run):
     """Runs together and in turn, as one machine function, in parts and left to XLA; alone and in a batch."""
-    inputs = inputs_of(ij.with_parameters(paper, {"initial.dq": [0.3, -0.2]}))
+    inputs = inputs_of(ij.with_parameters(short_loop, {"initial.dq": [0.3, -0.2]}))
     alone = outcome(inputs, run)
     together = outcome(inputs, run, varied=DRAWS)
-    first = outcome(inputs._replace(scenario=ij.with_parameters(inputs.scenario, {"controller.K2": DRAWS["controller.K2"][0]})), run)
+    first = outcome(inputs._replace(scenario=ij.with_parameters(inputs.scenario, {"controller.Kp": DRAWS["controller.Kp"][0]})), run)
     assert_same(jax.tree.map(lambda x: x[0], together), first)
     for shape in (plan.Shape("together", "parts", False), plan.Shape("in turn", "parts", True), plan.Shape("together", "none", True)):
         assert_same(outcome(inputs, run, shape, DRAWS), together)
@@ -56,12 +68,12 @@ def test_every_shape_is_the_same_run(paper, run):
 
 
 @pytest.mark.slow
-def test_any_explicit_method_is_a_row_of_the_table(paper, monkeypatch):
+def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
     """Kutta's 3/8 rule, whose last stages look back at all slopes before them: written out, as a loop, and as a scalar program."""
     rows = ((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0))
     kutta = Tableau((0.0, 1 / 3, 2 / 3, 1.0), rows, (1 / 8, 3 / 8, 3 / 8, 1 / 8), 4, 2.785, (1.0, -3.0, 3.0, -1.0))
     monkeypatch.setitem(TABLEAUS, "kutta", kutta)
-    inputs, run = inputs_of(paper), Run(50, "kutta", 10)
+    inputs, run = inputs_of(short_loop), Run(50, "kutta", 10)
     written_out, rolled = (outcome(inputs, run, plan.Shape("together", "none", loop)) for loop in (False, True))
     lowered = outcome(inputs, run, varied={"initial.q": inputs.scenario.initial.q[None]}, executor=execute.executor_named("xla"))
     assert_same(written_out, rolled)

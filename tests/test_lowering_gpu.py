@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_lowering import DT, MEMBERS, STANDARD, evaluate, with_member
+from test_lowering import DT, MEMBERS, STANDARD, carry_of, evaluate, with_member
 from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
 from iblf_jax.engine import execute, gpu, plan
-from iblf_jax.engine.batch import Batch, begin
+from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
-from iblf_jax.engine.executors import lowered_on, program_of, scan
+from iblf_jax.engine.executors import lowered_on, program_of
 from iblf_jax.engine.step import Inputs, Run, TimeStep
 from iblf_jax.lowering import nvrtc
 from iblf_jax.lowering.emit_c import CUDA, source
@@ -48,8 +48,8 @@ def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
     scenario = canonical(ij.astype(scenario, dtype))
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), folds)
     varied = {path: jnp.asarray(x, dtype) for path, x in varied.items()}
-    of = Batch.of(Inputs(scenario, folds, *jnp.asarray([DT, 1e3], dtype)), varied)
-    carry, _ = begin(scan, of, method)
+    inputs = Inputs(scenario, folds, *jnp.asarray([DT, 1e3], dtype))
+    of, carry = Batch.of(inputs, varied), carry_of(inputs, varied, method)
     program, _ = program_of(TimeStep(method), of, carry)
     shared = jnp.concatenate([jnp.ravel(x) for x in of.leaves.shared])
     lane = pack(of.leaves.lane, Shapes.of(of.leaves.lane, 1), dtype, of.runs).floats

@@ -482,13 +482,9 @@ def killed_until_done(path, compiled, table, kills, seed):
 
 
 @pytest.mark.slow
-def test_three_kills(tmp_path, compiled, table):
-    killed_until_done(tmp_path / "sweep.zarr", compiled, table, 3, seed=1)
-
-
-@pytest.mark.slow
-def test_twenty_kills(tmp_path, compiled, table):
-    killed_until_done(tmp_path / "sweep.zarr", compiled, table, 20, seed=2)
+@pytest.mark.parametrize("kills", [8, pytest.param(20, marks=pytest.mark.release)])
+def test_many_kills(tmp_path, compiled, table, kills):
+    killed_until_done(tmp_path / "sweep.zarr", compiled, table, kills, seed=kills)
 
 
 @pytest.mark.slow

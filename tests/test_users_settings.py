@@ -1,7 +1,7 @@
-"""What other tests find holds as users compile too: the tests' own XLA_FLAGS (conftest.py) leave out what LLVM optimises.
+"""What other tests find holds as users compile too: the tests' own settings (conftest.py) leave out what compilers optimise.
 
 An optimiser may add up in another order in another batch, and fails on functions of its own; so these are the tests of the reference data,
-of bit-identity, and of the ways in which XLA is given a loop.
+of bit-identity, of the functions of kernels, and of the ways in which XLA is given a loop.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ AGAIN = {
         "test_monte_carlo.py::test_chunk_changes_nothing[1]",
         "test_monte_carlo.py::test_number_of_runs_changes_no_run[257]",
         "test_monte_carlo.py::test_replay_is_bit_identical_and_has_the_trajectory",
+        "test_lowering_math.py::test_native_functions[float64]",
     ],
 }
 """Name -> tests."""
@@ -32,7 +33,9 @@ SETTINGS = "test_users_settings.py::test_the_testers_own_flags_come_last"
 
 def test_the_testers_own_flags_come_last():
     flags, own = os.environ["XLA_FLAGS"], os.environ["TESTER_XLA_FLAGS"]
-    assert flags == f"{os.environ.get('TEST_XLA_FLAGS', conftest.XLA_FLAGS)} {own}".strip()
+    as_users = bool(os.environ.get("TEST_AS_USERS"))
+    assert flags == f"{'' if as_users else conftest.XLA_FLAGS} {own}".strip()
+    assert (os.environ.get("CXX") == str(ROOT / "tests" / "plain_compiler")) == bool(os.environ["TESTER_CXX"] and not as_users)
 
 
 @pytest.mark.slow
@@ -41,6 +44,6 @@ def test_the_same_as_users_compile(what):
     plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
     command = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-m", "not release", *names]
-    done = subprocess.run(command, cwd=ROOT, env=plain | {"TEST_XLA_FLAGS": ""}, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=ROOT, env=plain | {"TEST_AS_USERS": "1"}, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout[-3000:]
     assert f"{len(names)} passed" in done.stdout
