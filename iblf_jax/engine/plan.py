@@ -34,11 +34,11 @@ LONGEST_ONE_RUN = {"native": 60_000, "xla": 2500}
 """Nodes up to which one run is lowered unasked, by executor: a longer one gains less by it than it takes to compile.  A run of
 `presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 on scan; its first result takes 11 s of a busy processor there, 30 where
 the kernel has to be built, and 24 on scan."""
-LIMITS = LoweringLimits(choices=64, table=4096, tables=50_000, scan=64, written_out=1000, power=64)
+LIMITS = LoweringLimits(choices=64, table=4096, tables=50_000, scan=64, written_out=1000, under_condition=64, power=64)
 """What is lowered at all, on native, where a step of the paper's scenario takes 90 ns: a choice among 64 entries takes 9 ns, one among 256
 entries 70; twelve tables of 4096 numbers take 18 ns and 2 s to lower and build, 48 of them 100 ns and 7 s; a scan of 64 rounds with a sine
 in each takes 140 ns, and one of 256 takes 6 s to build.  To call the loop of three joints, 1,000 nodes, takes 4 % of a step's time; of
-four joints 2 %, and the step builds in two thirds of the time."""
+four joints 2 %, and the step builds in two thirds of the time.  A call costs about as much as 30 nodes."""
 XLA_DEAR, XLA_STORED = 8, 8
 """What an operation costs on CPU where a cheap one costs 1, and the cost from which a number with several uses is stored: XLA would
 compute it again for each use."""

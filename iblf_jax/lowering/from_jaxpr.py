@@ -50,7 +50,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         elif name in INLINED:
             results = closed(b, eqn.params[INLINED[name]], operands)
         elif name in CONTROL:
-            results = CONTROL[name](b, eqn, operands)
+            results = CONTROL[name](b, eqn, operands, uses[id(eqn)])
         elif name in RULES:
             for v in eqn.outvars:
                 _check_float(b, v.aval.dtype, eqn)
@@ -89,7 +89,7 @@ def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
     return interpret(b, inner, consts, operands)
 
 
-def _scan(b: Builder, eqn, operands):
+def _scan(b: Builder, eqn, operands, used):
     params = eqn.params
     length, n_const, n_carry = params["length"], params["num_consts"], params["num_carry"]
     if length > b.limits.scan:
@@ -108,22 +108,31 @@ def _scan(b: Builder, eqn, operands):
     return [*carry, *ys]
 
 
-def _cond(b: Builder, eqn, operands):
+def _cond(b: Builder, eqn, operands, used):
     index, *rest = operands
     branches = eqn.params["branches"]
     which = int(index)
     value = b.value(which)
     if value is not None:
         return closed(b, branches[min(max(int(value), 0), len(branches) - 1)], rest)
-    results = closed(b, branches[-1], rest)
+    results = _last(b, branches, which, rest, used)
     for i in reversed(range(len(branches) - 1)):
         is_flag = b.nodes[which].kind == "b"
         condition = b.emit("not", which, kind="b") if is_flag else b.emit("le", which, b.constant(i, "i"), kind="b")
-        results = [choose(b, condition, yes, no) for yes, no in zip(closed(b, branches[i], rest), results, strict=True)]
+        others = closed(b, branches[i], rest)
+        results = [None if no is None else choose(b, condition, yes, no) for yes, no in zip(others, results, strict=True)]
     return results
 
 
-def _while(b: Builder, eqn, operands):
+def _last(b: Builder, branches: Sequence[Any], which: int, operands: Sequence[Ids], used: tuple[bool, ...]) -> list[Ids | None]:
+    """The used results of the last branch, which may be computed where it is taken alone if all runs take it together."""
+    if not b.is_shared(which):
+        return list(closed(b, branches[-1], operands))
+    taken = which if b.nodes[which].kind == "b" else b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
+    return apply(b, branches[-1], operands, used, [used], closed, taken)
+
+
+def _while(b: Builder, eqn, operands, used):
     raise UnsupportedError("a while loop inside a step has no fixed length")
 
 

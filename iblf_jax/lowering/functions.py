@@ -3,6 +3,9 @@
 The closed loop is such a function: a step evaluates it once a stage of the integrator.  A compiler that sees it once has a quarter of the
 text to read, and its time grows faster than that.
 
+A branch that all runs take or leave together, as only time decides (the law of a sampled loop), is such a function too, and called where it
+is taken; what its other side gives is chosen afterwards.
+
 A call computes what moves with the state.  What leaves and time alone decide stays with the caller, which computes it as seldom as its
 class allows; so does what not every caller asks for (the sample, which the first stage alone gives): it is written out there, on numbers
 that the call hands over.
@@ -60,7 +63,9 @@ class Split(NamedTuple):
     function: Program
 
 
-def apply(b: Builder, jaxpr: Any, operands: Sequence[Ids], used: Uses, all_uses: Sequence[Uses], read: Callable) -> list[Ids | None]:
+def apply(
+    b: Builder, jaxpr: Any, operands: Sequence[Ids], used: Uses, all_uses: Sequence[Uses], read: Callable, condition: int | None = None
+) -> list[Ids | None]:
     """The results of an inner function that are used.
 
     Args:
@@ -70,18 +75,19 @@ def apply(b: Builder, jaxpr: Any, operands: Sequence[Ids], used: Uses, all_uses:
       used: which results this call's are used.
       all_uses: `used` of every call that the caller makes.
       read: function (builder, jaxpr, operands) -> results.
+      condition: where it holds, the same for all runs, the results are wanted; everywhere if not given.
     """
     flat = [int(i) for x in operands for i in x.ravel()]
     called = Called(jaxpr, _pattern(b, flat), tuple(x.shape for x in operands), b.dtype, b.sparse, b.limits, read)
     template, split = _template(called), None
-    if _moving(template.program) > b.limits.written_out:
+    if _moving(template.program) > (b.limits.written_out if condition is None else b.limits.under_condition):
         split = _split(called, *(tuple(map(which, zip(*all_uses, strict=True))) for which in (all, any)))
 
     program = split.program if split else template.program
     known = {i: flat[node.value] for i, node in enumerate(program.nodes) if node.op in INPUTS}
     if split:
         _write(b, program, known, split.given)
-        call = b.call(split.function, [known[i] for i in split.given])
+        call = b.call(split.function, [known[i] for i in split.given], condition)
         known |= {i: b.result(call, k) for k, i in enumerate(split.handed)}
     _write(b, program, known, _samples(program, template.results, used))
     return [_new(known, program, places) if yes else None for places, yes in zip(template.results, used, strict=True)]
@@ -104,7 +110,7 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
 
 @lru_cache(maxsize=16)
 def _template(called: Called) -> Template:
-    b = Builder(called.dtype, sparse=called.sparse, limits=called.limits._replace(written_out=math.inf))
+    b = Builder(called.dtype, sparse=called.sparse, limits=called.limits._replace(written_out=math.inf, under_condition=math.inf))
 
     def node_of(kind, value, *known):
         if value is None:

@@ -67,6 +67,11 @@ def places(nodes: Iterable[Node], floats: str, others: str, begin: tuple[int, in
     return found, (used[floats], used[others])
 
 
+def given_to(call: Node) -> tuple[int, ...]:
+    """What the function of a call is given."""
+    return call.args if call.kind == "call" else call.args[1:]
+
+
 class Calls:
     """The functions that a program calls, and where the numbers are that go in and out.
 
@@ -103,7 +108,7 @@ class Calls:
             return None
 
         for function in self.functions:
-            arguments = list(zip(*(nodes[i].args for i in calls if nodes[i].value is function), strict=True))
+            arguments = list(zip(*(given_to(nodes[i]) for i in calls if nodes[i].value is function), strict=True))
             known = [where_it_is(set(each)) for each in arguments]
             self.put.append([k for k, name in enumerate(known) if name is None])
             own = iter(places([nodes[arguments[k][0]] for k in self.put[-1]], "p", "q")[0])
@@ -127,10 +132,12 @@ class Calls:
     def statement(self, call: int, args: Sequence[str]) -> list[str]:
         """A call."""
         node = self.nodes[call]
+        condition, args = (None, args) if node.kind == "call" else (args[0], args[1:])
         k = next(k for k, function in enumerate(self.functions) if function is node.value)
         given = {"F": list[str](), "I": list[str]()}
         for place in self.put[k]:
-            given[c_type(self.nodes[node.args[place]])].append(args[place])
+            given[c_type(self.nodes[given_to(node)[place]])].append(args[place])
         arrays = [f"  {t} {name}{call}[{len(given[t]) + 1}] = {{{', '.join(given[t])}}};" for t, name in (("F", "p"), ("I", "q"))]
         floats, others = self.begins[call]
-        return [*arrays, f"  function_{k}(constants, once, p{call}, q{call}, r + {floats}, s + {others});"]
+        made = [*arrays, f"  function_{k}(constants, once, p{call}, q{call}, r + {floats}, s + {others});"]
+        return made if condition is None else [f"  if (AT({condition}, 0)) {{", *made, "  }"]

@@ -33,6 +33,7 @@ def written_out(program: Program) -> Program:
     def rule(b: Builder, node, args, i):
         if node.op == "call":
             function, new = node.value, list[int]()
+            args = args if node.kind == "call" else args[1:]
             for inner in function.nodes:
                 new.append(args[inner.value] if inner.op == "argument" else b.again(inner, [new[a] for a in inner.args]))
             found[i] = [new[s] for s in function.samples]

@@ -53,7 +53,8 @@ class Node(NamedTuple):
     """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a constant, an input's index, or the
     numbers among which a "lookup" chooses by its whole-numbered argument (the nearest end, outside).
 
-    A "call" is no number: it has the results of a function, a program whose "samples" they are; a "result" is one of them.
+    A "call" is no number: it has the results of a function, a program whose "samples" they are; a "result" is one of them.  One of the
+    kind "call if" is made where its first argument, the same for all runs, holds; elsewhere its results are no numbers either.
     """
 
     op: str
@@ -85,6 +86,8 @@ class LoweringLimits(NamedTuple):
     """Steps up to which an inner scan is unrolled."""
     written_out: float = math.inf
     """Nodes up to which a function is written out wherever it is called."""
+    under_condition: float = math.inf
+    """Nodes up to which a branch that all runs take together is written out."""
     power: float = math.inf
     """Whole exponents up to which a power is made of products."""
 
@@ -160,9 +163,10 @@ class Builder:
         """The node of table[index], for an index that only the run knows."""
         return self._add(Node("lookup", (index,), "f", table), tuple(x.hex() for x in table))
 
-    def call(self, function: Program, args: Sequence[int]) -> int:
-        """The node of a call of a function."""
-        return self._add(Node("call", tuple(args), "call", function), id(function))
+    def call(self, function: Program, args: Sequence[int], condition: int | None = None) -> int:
+        """The node of a call of a function, made where the condition holds if there is one."""
+        args, kind = (tuple(args), "call") if condition is None else ((condition, *args), "call if")
+        return self._add(Node("call", args, kind, function), id(function))
 
     def result(self, call: int, number: int) -> int:
         """The node of one of its results."""
@@ -178,13 +182,20 @@ class Builder:
         if node.op == "lookup":
             return self.lookup(node.value, *args)
         if node.op == "call":
-            return self.call(node.value, args)
+            return self.call(node.value, args) if node.kind == "call" else self.call(node.value, args[1:], args[0])
         return self.result(args[0], node.value) if node.op == "result" else self.emit(node.op, *args, kind=node.kind)
 
     def moves(self, node: int) -> bool:
         """Whether a node is of class LANE|TIME."""
+        return self._class(node) == LANE | TIME
+
+    def is_shared(self, node: int) -> bool:
+        """Whether a node is the same for all runs."""
+        return not self._class(node) & LANE
+
+    def _class(self, node: int) -> int:
         extend_classes(self._classes, self.nodes, self.still)
-        return self._classes[node] == LANE | TIME
+        return self._classes[node]
 
     def _is_finite_constant(self, node: int) -> bool:
         return self.nodes[node].op == "const" and math.isfinite(self.nodes[node].value)
