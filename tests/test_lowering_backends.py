@@ -112,7 +112,7 @@ def test_a_spline_is_looked_up(backend):
 def test_native_records_what_simulate_records():
     steps, every = 50, 7
     found = batch(steps=steps, record_every=every)
-    arrays, controller, observer = found.records
+    arrays, controller, observer, actuator, measured = found.records
     scenario = ij.presets.zhang_yan_2024()
     for i in range(2):
         changed = ij.with_parameters(scenario, {k: v[i] for k, v in draws(5).items()})
@@ -120,7 +120,7 @@ def test_native_records_what_simulate_records():
         for name, values in arrays.items():
             np.testing.assert_allclose(values[i], getattr(run, name), rtol=1e-9, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(observer[i], run.observer_state, rtol=1e-9, atol=1e-9)
-    assert controller == ()
+    assert controller == () and actuator == () and measured == ()
 
 
 @pytest.mark.slow

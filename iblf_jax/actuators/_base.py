@@ -25,7 +25,10 @@ class Delivered(NamedTuple):
 
 
 class Actuator(Protocol):
-    """What the package asks of an actuator."""
+    """What the package asks of an actuator.
+
+    One with limits also has `unlimited`, the same without them: how fast a loop is, is measured on it.
+    """
 
     def init(self, tau: jax.Array) -> State:
         """State at the start, where it delivers the torque `tau`, (n,) [N m]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -41,6 +42,11 @@ class Motor:
             raise checks.fail(f"Motor.{name}", None, "stall and no_load_speed together, or neither")
         if self.rate_limit is not None and self.bandwidth is None:
             raise checks.fail("Motor.bandwidth", None, "a bandwidth, as there is a rate_limit", "Such as bandwidth=1000.0.")
+
+    @property
+    def unlimited(self) -> Motor:
+        """The same without limits."""
+        return dataclasses.replace(self, limit=None, rate_limit=None, stall=None, no_load_speed=None)
 
     def init(self, tau: jax.Array) -> Any:
         """The torque that it delivers, (n,) [N m]; no state without a lag."""

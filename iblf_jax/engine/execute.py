@@ -180,14 +180,14 @@ def run_batch(
     return with_fallback(backend, run_on, on_scan)
 
 
-def run_one(scenario: Scenario, folds: Any, dt: jax.Array, noise: jax.Array | None, run: Run, *, backend: str = "auto") -> Outcome:
+def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
     """One run; call it inside `jit`, and do not batch or differentiate it from outside.
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
-      noise: key of a sampled loop's noise.
       backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native where there is a compiler.  What
         is long or does not lower is, on "auto" and "xla", on scan, without a warning.
+      noise: key of a sampled loop's noise.
     """
     inputs = inputs_of(scenario, folds, dt, run, noise)
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)

@@ -107,9 +107,9 @@ def simulate_unchecked(
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_now(scenario, folds, dt, noise, run._replace(mechanism=mechanism_of(scenario)), backend=backend)
+        outcome = run_now(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend, noise=noise)
     else:
-        outcome = run_transformable(scenario, folds, dt, noise, run, backend=backend)
+        outcome = run_transformable(scenario, folds, dt, run, backend=backend, noise=noise)
     arrays, controller_state, observer_state, actuator_state, measured = outcome.records
     return Rollout(
         scenario=scenario,

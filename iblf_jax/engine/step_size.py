@@ -202,7 +202,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
     parts, before, poor_before, coarser = 1, None, 0, period
     while periods * parts <= MOST_TRIED:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        found = run_now(scenario, (), dt, noise, Run(periods * parts, method, parts))
+        found = run_now(scenario, (), dt, Run(periods * parts, method, parts), noise=noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
         if before is not None and not poor_before and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL:

@@ -54,13 +54,11 @@ run_now = jax.jit(execute.run_one, static_argnames=("run", "backend"))
 """A run of which all numbers are known."""
 
 
-def run_transformable(
-    scenario: Scenario, folds: Any, dt: jax.Array, noise: jax.Array | None, run: Run, *, backend: str = "auto"
-) -> Outcome:
+def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
     """One run that may be batched and differentiated from outside.
 
     Args:
-      scenario, folds, dt, noise, run: as `execute.run_one`.
+      scenario, folds, dt, run, noise: as `execute.run_one`.
       backend: what its derivatives are computed on: "xla" for plain JAX, else kernels where they can be built.
     """
     leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run, noise))
@@ -119,7 +117,8 @@ def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
-        return run_now(inputs.scenario, inputs.folds, inputs.dt, inputs.noise, runs.run._replace(mechanism=mechanism_of(inputs.scenario)))
+        run = runs.run._replace(mechanism=mechanism_of(inputs.scenario))
+        return run_now(inputs.scenario, inputs.folds, inputs.dt, run, noise=inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 

@@ -144,7 +144,7 @@ def surroundings(state: LoopState) -> Any:
 def change(scenario: Scenario, t: jax.Array, around: Any, dt: jax.Array | None = None, piece: Callable = lambda function: function) -> Any:
     """How what `surroundings` gives changes: its rate, or of a sampled loop the plant's rate, the next command and what is remembered then.
 
-    Rounding is left out (`unrounded`): it has no derivative that says anything.
+    Rounding of a sensor (`unrounded`) and limits of an actuator (`unlimited`) are left out: their derivatives are 0, as without a law.
 
     Args:
       scenario: what runs.
@@ -155,7 +155,9 @@ def change(scenario: Scenario, t: jax.Array, around: Any, dt: jax.Array | None =
     """
     if not isinstance(around, Surroundings):
         return piece(evaluate)(scenario, t, around, *(() if dt is None else (dt,)))[0]
-    scenario = dataclasses.replace(scenario, sensor=getattr(scenario.sensor, "unrounded", scenario.sensor))
+    sensor, actuator = scenario.sensor, scenario.actuator
+    sensor, actuator = getattr(sensor, "unrounded", sensor), getattr(actuator, "unlimited", actuator)
+    scenario = dataclasses.replace(scenario, sensor=sensor, actuator=actuator)
     state = still(initial_state(scenario), around.plant)
     controller, observer, sensor = around.memory
     state = state._replace(controller=controller, observer=observer, held=state.held._replace(sensor=sensor))

@@ -90,14 +90,14 @@ class Rollout(_Signals):
     """Largest measured mode of the closed loop, () [1/s]; dt times this decides whether the step was too large."""
     dt: jax.Array
     """Time step, () [s]."""
-    actuator_state: Any
-    """State of the actuator, time axis first; `()` if it has none."""
-    measured: Any
-    """What the sensor told last, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where the law is not sampled."""
     method: str = dataclasses.field(metadata={"static": True})
     """The integrator."""
     steps: int | None = dataclasses.field(default=None, metadata={"static": True})
     """Steps that were made, recorded or not; None if it is not known whether there were more than up to the last sample."""
+    actuator_state: Any = ()
+    """State of the actuator, time axis first; `()` if it has none."""
+    measured: Any = ()
+    """What the sensor told last, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where the law is not sampled."""
 
     @property
     def ok(self) -> bool:
