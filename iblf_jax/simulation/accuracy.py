@@ -162,8 +162,8 @@ def _observed_within(accuracy: Accuracy, table: Tableau, dt: jax.Array, slopes: 
         error = (rates[table.halfway] - rates[table.halfway - 1]) * fast**2 / 3.0
     else:
         error = (rates[-1] - (rates[0] if len(rates) > 1 else accuracy.pending[0])) / 2.0
-    drift = (1.0 - SLOWEST * dt) * accuracy.drift + dt * jnp.abs(error)
-    size = jnp.maximum(drift[:n], drift[n:])
+    drift = (1.0 - SLOWEST * dt) * accuracy.drift + dt * error
+    size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
     relative = jnp.maximum(accuracy.relative, jnp.max(size / jax.lax.stop_gradient(width)))
     return Accuracy((rates[0],), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 OBSERVER_STEPS = ("exact", "euler")
 NEARLY = 1e-6
 """Steps.  A delay that is so near to a whole number of steps is one."""
+WHOLE = 1e-4
+"""How far, relatively, a period may be from a whole number of steps."""
 WORD = 1 << 16
 """The generator works on words of 16 bits, whose products every backend's whole numbers hold."""
 
@@ -102,10 +104,11 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
       order: of the integrator; one of the first order sees the start of a step alone, and is given the mean.
     """
     if sampling.queue == 0:
-        return _if_nothing_is_missing(sampling, sampling.delay, commands[0]), jnp.zeros_like(commands[0])
+        return _if_possible(sampling, dt, sampling.delay, commands[0]), jnp.zeros_like(commands[0])
     delay = sampling.delay / dt
     whole = jnp.round(delay)
-    delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < NEARLY, whole - delay, 0.0))
+    near = NEARLY + 4.0 * jnp.finfo(dt.dtype).eps * delay
+    delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0))
     steps, phase = jnp.maximum(jnp.round(sampling.period / dt), 1.0), now.phase.astype(dt.dtype)
     # The command at work before this step, counted from the newest, and where in the step the next one takes over.
     age = jnp.maximum(jnp.floor(jax.lax.stop_gradient(delay - phase) / steps) + 1.0, 0.0)
@@ -115,12 +118,13 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
     jump, left = jnp.where(change, new - old, 0.0), jnp.where(change, 1.0 - place, 1.0)
     a, b = jump * left * (1.0 - 3.0 * (1.0 - left)), 6.0 * jump * left * (1.0 - left)
     a, b = (a, b) if order > 1 else (a + 0.5 * b, jnp.zeros_like(b))
-    return _if_nothing_is_missing(sampling, age, old + a), b
+    return _if_possible(sampling, dt, age, old + a), b
 
 
-def _if_nothing_is_missing(sampling: Sampling, age: jax.Array, torque: jax.Array) -> jax.Array:
-    """The torque; no number where a command has left the queue before it arrived."""
-    return jnp.where(age <= sampling.queue, torque, jnp.nan)
+def _if_possible(sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array) -> jax.Array:
+    """The torque; no number where a command has left the queue before it arrived, or a period is no whole number of steps."""
+    steps = sampling.period / dt
+    return jnp.where((age <= sampling.queue) & (jnp.abs(steps - jnp.round(steps)) <= WHOLE * steps), torque, jnp.nan)
 
 
 def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:
@@ -146,7 +150,7 @@ def check_step(scenario: Scenario, dt: float) -> None:
         return
     period = float(sampling.period)
     steps = period / dt
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-4 * steps:
+    if round(steps) < 1 or abs(steps - round(steps)) > WHOLE * steps:
         fitting = period / max(math.ceil(steps - 1e-9), 1)
         raise checks.fail("dt", dt, f"a whole number of steps in sampling.period = {period:g} s", f"Take dt={fitting:.6g}.")
 
