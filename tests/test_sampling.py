@@ -17,6 +17,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine.period import radius_at
 from iblf_jax.simulation.sampling import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.tuning.parameters import layout
 
 PAPER = ij.presets.zhang_yan_2024(reading="corrected")
 SLOW = ij.with_parameters(PAPER, {"controller.K2": 4.0, "observer.kf": 4.0})
@@ -279,6 +280,7 @@ def test_parts_go_through_files(tmp_path):
         (lambda: ij.actuators.Motor(stall=1.0), "no_load_speed"),
         (lambda: ij.with_parts(PAPER, sensor=ENCODER), "Sampling"),
         (lambda: ij.with_parts(PAPER, sampling=2e-3), "Sampling"),
+        (lambda: ij.vector_field(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3))), "at every instant"),
         (lambda: ij.simulate(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3)), duration=0.1, dt=4e-4), r"Take dt=0.000333"),
     ],
 )
@@ -302,3 +304,7 @@ def test_tuning_hears_the_noise():
     objective = ij.objectives.tracking() + 0.1 * ij.objectives.torque_rate()
     result = ij.tune(scenario, ["controller.K2"], objective, duration=0.2, dt=5e-4, runs=4, iterations=4)
     assert float(result.tuned[0]) != 4.0 and np.isfinite(result.objective)
+    _, box = layout(canonical(scenario), ["controller.K2"], 5e-4, "rk4")
+    high = np.exp(np.max(box.high))
+    assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 0.9 * high})), 1e-3, np.linspace(0, 6, 7)) < 1.0
+    assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 1.1 * high})), 1e-3, np.linspace(0, 6, 7)) >= 1.0

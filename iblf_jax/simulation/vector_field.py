@@ -135,11 +135,15 @@ def vector_field(scenario: Scenario) -> VectorField:
       A `VectorField`: called for the rate; `start`, `names`, `pack`, `unpack` and `sample` for the rest.
 
     Raises:
-      ValueError: as `simulate`, for a scenario that cannot run; the message names the field, the value and the remedy.
+      ValueError: as `simulate`, for a scenario that cannot run, or a law that is sampled; the message names the field, the value and the
+        remedy.
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
-    return VectorField(canonical(scenario))
+    field = VectorField(canonical(scenario))
+    if field.scenario.sampling is not None:
+        raise checks.fail("scenario.sampling", "a sampled law", "a law that runs at every instant", "Its torque jumps: use ij.simulate.")
+    return field
 
 
 def _layout(scenario: Scenario) -> LoopState:

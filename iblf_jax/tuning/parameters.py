@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.integrators import tableau
@@ -156,12 +157,15 @@ def _default_low(path: str, sign: str | None) -> float:
 
 
 def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: float, method: str) -> np.ndarray:
-    """The largest multiple of the start, at most MOST, with which SHARE of the stability range is kept."""
+    """The largest multiple of the start, at most MOST, with which SHARE of the stability range is kept, or a sampled loop stays stable."""
     if not item.path.startswith(("controller.", "observer.")) or not np.all(value > 0):
         return np.full(value.shape, np.inf)
 
     def fits(factor: float) -> bool:
-        mode = fastest_along(with_parameters(scenario, {item.path: jnp.asarray(value * factor)}), np.linspace(0.0, 6.0, 7))
+        changed, times = with_parameters(scenario, {item.path: jnp.asarray(value * factor)}), np.linspace(0.0, 6.0, 7)
+        if changed.sampling is not None:
+            return radius_at(changed, float(changed.sampling.period), times) < 1.0
+        mode = fastest_along(changed, times)
         return dt * mode <= SHARE * tableau(method).stability
 
     if not fits(1.0):
