@@ -14,7 +14,7 @@ from iblf_jax import actuators, sensors
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
-from iblf_jax.certificates.retrace import believed
+from iblf_jax.certificates.retrace import believed, grid
 from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
 from iblf_jax.core import checks
 from iblf_jax.engine.plan import CERTIFY_RECORDED
@@ -139,8 +139,7 @@ def _one(run: Rollout) -> Certificate:
 
 def _sampled(run: Rollout) -> Certificate:
     """That of a run whose law is sampled: nothing is claimed of it, and it is held against the continuous run instead."""
-    scenario, steps = run.scenario, run.steps if run.steps is not None else round(float(run.t[-1]) / float(run.dt))
-    every = max(round(float(run.t[1] - run.t[0]) / float(run.dt)), 1) if len(run.t) > 1 else 1
+    scenario, (every, steps) = run.scenario, grid(run)
     ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SimulationWarning)
@@ -149,8 +148,7 @@ def _sampled(run: Rollout) -> Certificate:
     certificate = _one(beside)
     nothing: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time"))
     lines = tuple(dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **nothing) for line in certificate.lines)
-    count = min(len(run.V), len(beside.V))
-    excess, margins = run.V[:count] - beside.V[:count], [_margins(x) for x in (run, beside)]
+    excess, margins = run.V - beside.V, [_margins(x) for x in (run, beside)]
     k, joint = int(np.argmax(excess)), int(np.argmin(margins[0] - margins[1]))
     measured = (
         Line("V2, sampled less continuous", "(3.12)", "max over t of V2 of this run less V2 of the continuous one", NOT_APPLICABLE,

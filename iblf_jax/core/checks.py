@@ -295,10 +295,10 @@ class NoSuchEntryError(IndexError, ValueError):
     """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's own protocols look for."""
 
 
-def seed(name: str, value: Any) -> int:
+def seed(value: Any) -> int:
     """A seed as a Python int in [0, 2^32), or a ValueError."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer) or not 0 <= value < 2**32:
-        raise fail(name, value, "a whole number from 0 to 2**32 - 1")
+        raise fail("seed", value, "a whole number from 0 to 2**32 - 1")
     return int(value)
 
 

@@ -90,7 +90,7 @@ def simulate(
     if steps // record_every > MOST_SAMPLES:
         remedy = f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all the same."
         raise checks.fail("record_every", record_every, f"at most {MOST_SAMPLES} recorded samples of {steps} steps", remedy)
-    scenario, seed = canonical(scenario), checks.seed("seed", seed)
+    scenario, seed = canonical(scenario), checks.seed(seed)
     check_step(scenario, dt)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario.n)

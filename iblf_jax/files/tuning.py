@@ -46,7 +46,7 @@ from iblf_jax.simulation import metrics
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies import distributions
-from iblf_jax.studies.designs import MOST_RUNS, check_seed
+from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Distribution, Perturbation
 from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.statistics import check_confidence
@@ -253,7 +253,7 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     for name in ("runs", "report_runs"):
         checks.positive_integer(name, getattr(setup, name), most=MOST_RUNS)
     for name in ("seed", "report_seed"):
-        check_seed(getattr(setup, name))
+        checks.seed(getattr(setup, name))
     targets_of(start, setup.perturbations)
     words = {name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")}
     names = tuple(checks.word("names", name, "a string") for name in data["names"])

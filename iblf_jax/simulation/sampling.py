@@ -86,9 +86,14 @@ class Instant(NamedTuple):
     """Steps since its start, () int."""
 
 
+def _steps(sampling: Sampling, dt: jax.Array) -> jax.Array:
+    """Steps of a period, () [1]."""
+    return jnp.maximum(jnp.round(sampling.period / dt), 1.0)
+
+
 def instant(sampling: Sampling, dt: jax.Array, index: jax.Array) -> Instant:
     """Where the instant with this number lies."""
-    steps = jnp.maximum(jnp.round(sampling.period / dt), 1.0).astype(index.dtype)
+    steps = _steps(sampling, dt).astype(index.dtype)
     sample = jax.lax.div(index, steps)
     return Instant(sample, index - sample * steps)
 
@@ -109,7 +114,7 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
     whole = jnp.round(delay)
     near = NEARLY + 4.0 * jnp.finfo(dt.dtype).eps * delay
     delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0))
-    steps, phase = jnp.maximum(jnp.round(sampling.period / dt), 1.0), now.phase.astype(dt.dtype)
+    steps, phase = _steps(sampling, dt), now.phase.astype(dt.dtype)
     # The command at work before this step, counted from the newest, and where in the step the next one takes over.
     age = jnp.maximum(jnp.floor(jax.lax.stop_gradient(delay - phase) / steps) + 1.0, 0.0)
     place = delay - phase - (age - 1.0) * steps
@@ -124,7 +129,7 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
 def _if_possible(sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array) -> jax.Array:
     """The torque; no number where a command has left the queue before it arrived, or a period is no whole number of steps."""
     steps = sampling.period / dt
-    return jnp.where((age <= sampling.queue) & (jnp.abs(steps - jnp.round(steps)) <= WHOLE * steps), torque, jnp.nan)
+    return jnp.where((age <= sampling.queue) & (jnp.abs(steps - _steps(sampling, dt)) <= WHOLE * steps), torque, jnp.nan)
 
 
 def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:

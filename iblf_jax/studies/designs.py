@@ -22,11 +22,6 @@ MOST_SOBOL = (21201, 2**30)
 """Dimensions and points that SciPy's Sobol sequence has."""
 
 
-def check_seed(seed: Any) -> int:
-    """A seed as a Python int in [0, 2^32), or a ValueError."""
-    return checks.seed("seed", seed)
-
-
 def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
     """The number of replicates; ValueError for a sampler, a number of runs and replicates that do not fit together."""
     checks.one_of("sampler", sampler, SAMPLERS)

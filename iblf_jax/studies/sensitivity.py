@@ -29,7 +29,7 @@ from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import block_size, checked_how, run_blocks
-from iblf_jax.studies.designs import MOST_SOBOL, check_seed, split
+from iblf_jax.studies.designs import MOST_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.setup import StudySetup, prepare
@@ -133,7 +133,7 @@ def sensitivity(
     if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail("perturbations", perturbations, "at least one perturbation")
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
-    setup = prepare(scenario, perturbations, 1, check_seed(seed), metrics=metrics, backend=backend, **timing)
+    setup = prepare(scenario, perturbations, 1, checks.seed(seed), metrics=metrics, backend=backend, **timing)
     shapes = sample_size(setup.study_run.targets, setup.shared.cases.perturbations)
     names = [path + "".join(f"[{i}]" for i in place) for path, shape in shapes.items() for place in np.ndindex(shape)]
     checks.fits("points", points, (len(names) + 2) * (setup.bytes_a_case + 3 * 8.0 * len(names)))

@@ -18,7 +18,7 @@ from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import Results, StudyInputs, StudyRun, _execute, block_size, with_chosen_backend
-from iblf_jax.studies.designs import check_seed, split, unit_points
+from iblf_jax.studies.designs import split, unit_points
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Lanes, sample_size, targets_of
 
@@ -82,7 +82,7 @@ def prepare(
     """Checks the arguments that studies share and puts together what their blocks need."""
     tableau(method)
     steps = checks.whole_steps(duration, dt)
-    seed, scenario = check_seed(seed), canonical(scenario)
+    seed, scenario = checks.seed(seed), canonical(scenario)
     check_step(scenario, dt)
     targets, by_path = targets_of(scenario, perturbations)
     dtype = scenario.initial.q.dtype

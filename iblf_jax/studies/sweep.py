@@ -26,7 +26,7 @@ from iblf_jax.studies import config as configuration
 from iblf_jax.studies import distributed
 from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
 from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
-from iblf_jax.studies.designs import MOST_RUNS, check_sampler, check_seed
+from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.points import make_points
@@ -120,7 +120,7 @@ def sweep(
         raise checks.fail("grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate.")
     unit = None if unit is None else checks.positive_integer("unit", unit)
     store = None if store is None else checks.file_path("store", store, "a folder")
-    where = make_points(canonical(scenario), grid, design, points, check_seed(seed))
+    where = make_points(canonical(scenario), grid, design, points, checks.seed(seed))
     options: dict[str, Any] = {"metrics": metrics, "backend": backend, "sampler": sampler, "replicates": replicates, "points": where.values}
     setup = prepare(scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options)
     checks.fits("runs at all points", setup.cases, setup.bytes_a_case)

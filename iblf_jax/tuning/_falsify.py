@@ -38,7 +38,6 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
-from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.parameters import Box
@@ -142,7 +141,7 @@ def falsify(
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     run = Run(steps, method, mechanism=mechanism_of(scenario))
     push = partial(_push, cube, jnp.asarray(dt, dtype), run=run, backend=backend)
-    seed = check_seed(seed)
+    seed = checks.seed(seed)
     searcher = Newton(Box(np.full(cube.size, 0.5), np.zeros(cube.size), np.ones(cube.size)), TOLERANCE, FIRST_RADIUS)
     state, best, history = searcher.init(cube.admissible_points(starts, [seed, 3])), None, []
 

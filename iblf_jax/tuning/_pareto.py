@@ -35,7 +35,6 @@ from iblf_jax.core.progress import bar
 from iblf_jax.engine.plan import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning._tune import Problem, build, look_around, make_method
 from iblf_jax.tuning.objectives import Objective
@@ -149,7 +148,7 @@ def pareto(
     Source: head of this module.
     """
     began = time.perf_counter()
-    points, seed = checks.positive_integer("points", points, least=2), check_seed(seed)
+    points, seed = checks.positive_integer("points", points, least=2), checks.seed(seed)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
     tolerance, pair = checks.positive_number("tolerance", tolerance, "1", zero=True), _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}

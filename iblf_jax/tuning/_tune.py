@@ -20,7 +20,7 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import check_step, has_noise
 from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
-from iblf_jax.studies.designs import MOST_RUNS, check_seed
+from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, targets_of
 from iblf_jax.studies.recommended import recommended_dt
@@ -145,8 +145,8 @@ def tune(
     sharpenings = checks.positive_integer("sharpenings", sharpenings, least=0, most=MOST_SHARPENINGS)
     tolerance = checks.positive_number("tolerance", tolerance, "1", zero=True)
     learning_rate = checks.positive_number("learning_rate", learning_rate, "1")
-    confidence, resample, seed = check_confidence(confidence), checks.flag("resample", resample), check_seed(seed)
-    report_seed = (seed + 1) % 2**32 if report_seed is None else check_seed(report_seed)
+    confidence, resample, seed = check_confidence(confidence), checks.flag("resample", resample), checks.seed(seed)
+    report_seed = (seed + 1) % 2**32 if report_seed is None else checks.seed(report_seed)
     checkpoint = None if checkpoint is None else checks.file_to_write("checkpoint", checkpoint)
     if callback is not None and not callable(callback):
         raise checks.fail("callback", callback, "a function that is called with the loop after each step")
@@ -237,7 +237,7 @@ def build(
     tableau(timing["method"])
     checks.one_of("backend", timing.get("backend", "auto"), BACKENDS)
     steps = checks.whole_steps(timing["duration"], timing["dt"])
-    seed, runs, scenario = check_seed(seed), checks.positive_integer("runs", runs, most=MOST_RUNS), canonical(scenario)
+    seed, runs, scenario = checks.seed(seed), checks.positive_integer("runs", runs, most=MOST_RUNS), canonical(scenario)
     check_step(scenario, float(timing["dt"]))
     dtype = scenario.initial.q.dtype
     targets, by_path = targets_of(scenario, {} if perturbations is None else perturbations)

@@ -21,7 +21,6 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.designs import check_seed
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.objectives import Objective, has_price_on_torque
 from iblf_jax.tuning.problem import NUMBERS_A_RUN
@@ -208,7 +207,7 @@ class TuneResult:
         Source: `iblf_jax.tuning.report`.
         """
         setup = self.setup
-        seed = setup.report_seed if seed is None else check_seed(seed)
+        seed = setup.report_seed if seed is None else checks.seed(seed)
         if setup.perturbations and seed == setup.seed:
             raise checks.fail("seed", seed, "another seed than the tuning's", "Held-out runs must be fresh.")
         timing = {"duration": setup.duration, "dt": setup.dt, "method": setup.method}
