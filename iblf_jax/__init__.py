@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from iblf_jax.certificates import Certificate as Certificate
     from iblf_jax.certificates import Counterexample as Counterexample
     from iblf_jax.certificates import certify as certify
+    from iblf_jax.deployment.cosimulate import cosimulate as cosimulate
     from iblf_jax.engine.period import recommended_period as recommended_period
     from iblf_jax.files.tuning import load_tuning as load_tuning
     from iblf_jax.files.tuning import save_tuning as save_tuning
@@ -94,6 +95,7 @@ _ON_FIRST_USE = {
     "certify": ("iblf_jax.certificates", "certify"),
     "compare": ("iblf_jax.studies.compare", "compare"),
     "Comparison": ("iblf_jax.studies.comparison", "Comparison"),
+    "cosimulate": ("iblf_jax.deployment.cosimulate", "cosimulate"),
     "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "distributed": ("iblf_jax.studies.distributed", None),

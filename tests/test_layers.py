@@ -32,7 +32,7 @@ ONLY_IN = {
     "matplotlib": ("plotting",),
     "optax": ("tuning",),
     "argparse": ("cli",),
-    "mujoco": ("robots",),
+    "mujoco": ("robots", "deployment"),
     "xarray": ("files", "studies", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""

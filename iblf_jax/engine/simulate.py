@@ -97,7 +97,7 @@ def simulate(
     step_size, noise = jnp.asarray(dt, dtype), noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
     result = simulate_unchecked(scenario, folds, step_size, noise, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
-        _report(result, steps, throw)
+        report(result, steps, throw)
     return result
 
 
@@ -127,7 +127,7 @@ def simulate_unchecked(
     )
 
 
-def _report(result: Rollout, steps: int, throw: bool) -> None:
+def report(result: Rollout, steps: int, throw: bool) -> None:
     """Raises or warns, with the physics in the message, if a run failed."""
     status = Status(int(result.status))
     if status & Status.INFEASIBLE_REFERENCE:
@@ -161,7 +161,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to dt = {limit:.3g} s only; "
             f"dt = {float(result.dt):g} s was asked for. Take dt={comfortable_dt(mode):g}, or lower controller.K2 or observer.kf."
         )
-    elif status & Status.NOT_FINITE:
+    elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
     elif status & Status.INACCURATE:
         error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))

@@ -193,19 +193,32 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
     at, state = form.piece(loop), carry.state
     if scenario.sampling is None:
         stepped = integrators.step(method, lambda t, state: at(scenario, t, state, covered), t, state, dt, rolled=form.rolled)
+        pieces = [(dt, stepped.slopes)]
     else:
         now = sampling.instant(scenario.sampling, dt, index)
         state = sampled_if_due(scenario, t, state, now, inputs.noise)
-        order = integrators.tableau(method).order
-        a, b = sampling.arriving(scenario.sampling, dt, now, state.held.commands, order)
+        arriving = sampling.arriving(scenario.sampling, dt, now, state.held.commands)
+        until = arriving.place * dt
 
-        def between(since, moved):
-            return at(scenario, t + since, still(state, moved), covered, a + b * (since / dt))
+        def moved_by(torque, since, moved, length):
+            def between(since, moved):
+                return at(scenario, t + since, still(state, moved), covered, torque)
 
-        stepped = integrators.step(method, between, jnp.zeros_like(dt), moving(state), dt, rolled=form.rolled)
-        stepped = stepped._replace(state=still(state, stepped.state))
+            return integrators.step(method, between, since, moved, length, rolled=form.rolled)
 
-    def folded_in(inputs, carry, index, goes_on, stepped):
+        def rest(moved):
+            after = moved_by(arriving.next, until, moved, dt - until)
+            return after.state, after.slopes
+
+        stepped = moved_by(arriving.torque, jnp.zeros_like(dt), moving(state), until)
+        pieces, after = [(until, stepped.slopes)], stepped.state
+        if scenario.sampling.queue:
+            none = jax.tree.map(jnp.zeros_like, stepped.slopes)
+            after, slopes = jax.lax.cond(arriving.changes, rest, lambda moved: (moved, none), after)
+            pieces.append((dt - until, slopes))
+        stepped = stepped._replace(state=still(state, after))
+
+    def folded_in(inputs, carry, index, goes_on, stepped, pieces):
         folds, dt, sample = inputs.folds, inputs.dt, stepped.first
         begun = _begun_at(index, folds, sample, carry.accumulators)
         accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
@@ -213,7 +226,7 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         here = Nearest(near, sample.t, jax.lax.stop_gradient(carry.state))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
         width, held = sample.upper - sample.lower, scenario.sampling is not None
-        estimate = accuracy.observed(carry.accuracy, method, dt, index, stepped.slopes, width, held)
+        estimate = accuracy.observed(carry.accuracy, method, dt, index, pieces, width, held)
 
         status = carry.status | sample_status(sample)
         sound = is_sound(stepped.state) & (status & int(Status.NOT_FINITE) == 0)
@@ -221,7 +234,7 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         status |= flag(~sound & goes_on, Status.NOT_FINITE)
         return Advanced(Carry(after, accumulators, status, nearest, estimate), sample, begun, carry.state)
 
-    return form.piece(folded_in)(inputs, carry._replace(state=state), index, goes_on, stepped)
+    return form.piece(folded_in)(inputs, carry._replace(state=state), index, goes_on, stepped, pieces)
 
 
 def recorded(folds: Any, begun: tuple, sample: Sample, state: LoopState):
@@ -327,6 +340,13 @@ def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
     for fold, acc in zip(folds, accumulators, strict=True):
         found |= fold.finish(acc)
     return found
+
+
+def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
+    """The results of all folds over a run that is over, its samples with time first."""
+    first = jax.tree.map(lambda x: x[0], samples)
+    update = lambda acc, sample: (tuple(fold.update(a, sample) for fold, a in zip(folds, acc, strict=True)), None)  # noqa: E731
+    return finished(folds, jax.lax.scan(update, _begun(folds, first), samples)[0])
 
 
 def verdict(inputs: Inputs, method: str, carry: Carry, kicked: accuracy.Unseen, instants: Probed) -> Outcome:

@@ -108,7 +108,7 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
 
             (coarse, fine), (slopes, widths, xis) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
             width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], slopes)
-            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, of_coarse, width)
+            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, [(dt, of_coarse)], width)
             near = jnp.max(jnp.abs(xis[1]))
             nearest = jax.tree.map(partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest)
             off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)

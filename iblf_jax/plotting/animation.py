@@ -20,7 +20,7 @@ from PIL import Image
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._arm import Scene, motions_of
-from iblf_jax.plotting._curves import Curve, curves_of
+from iblf_jax.plotting._curves import curves_of
 from iblf_jax.plotting._figures import Runs
 
 MOST_FPS, MOST_FRAMES = 50.0, 10_000
@@ -47,26 +47,34 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
     Raises:
       ValueError: another ending, no run, a batch, robots that do not fit together, or fps or speed out of range.
     """
-    curves, path = curves_of(runs), checks.file_path("path", path)
-    if path.is_dir():
-        raise checks.fail("path", str(path), "the path of a file", "It is a folder.")
-    writers: dict[str, Any] = {".gif": _write_gif, ".html": _write_html}
-    if path.suffix.lower() not in writers:
-        raise checks.fail("path", str(path), f"a file ending of {' or '.join(writers)}")
+    curves, path = curves_of(runs), film_path(path)
     fps = checks.positive_number("fps", fps, "1/s")
     if fps > MOST_FPS:
         raise checks.fail("fps", fps, f"at most {MOST_FPS:g} frames a second")
-    t = _instants(curves, fps, speed)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    t = frame_times(max(float(np.asarray(curve.run.t)[-1]) for curve in curves), fps, speed)
     with _style.styled():
-        scene = Scene(curves, *motions_of(curves, t))
-        writers[path.suffix.lower()](scene, path, fps)
+        return write_film(list(_pictures(Scene(curves, *motions_of(curves, t)))), path, fps)
+
+
+def film_path(path: str | Path) -> Path:
+    """The path of a film, checked."""
+    path = checks.file_path("path", path)
+    if path.is_dir():
+        raise checks.fail("path", str(path), "the path of a file", "It is a folder.")
+    if path.suffix.lower() not in WRITERS:
+        raise checks.fail("path", str(path), f"a file ending of {' or '.join(WRITERS)}")
     return path
 
 
-def _instants(curves: list[Curve], fps: float, speed: float | None) -> np.ndarray:
-    """The times of the frames, from 0 to the end of the longest run, (F,) [s]."""
-    end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves)
+def write_film(pictures: list[Image.Image], path: Path, fps: float) -> Path:
+    """Writes pictures of one size as a film; returns its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    WRITERS[path.suffix.lower()](_with_one_palette(pictures), path, fps)
+    return path
+
+
+def frame_times(end: float, fps: float, speed: float | None = None) -> np.ndarray:
+    """The times of the frames of a run that ends then [s], from 0 on, (F,) [s]."""
     speed = max(1.0, end / LONGEST_FILM) if speed is None else checks.positive_number("speed", speed, "1")
     frames = end / speed * fps
     if not frames <= MOST_FRAMES:
@@ -95,9 +103,9 @@ def _with_one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
     return [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
 
 
-def _write_gif(scene: Scene, path: Path, fps: float) -> None:
+def _write_gif(pictures: list[Image.Image], path: Path, fps: float) -> None:
     """Writes a GIF that repeats."""
-    first, *rest = _with_one_palette(list(_pictures(scene)))
+    first, *rest = pictures
     first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=False)
 
 
@@ -116,10 +124,14 @@ class _Screen(Figure):
         self.picture.save(fname, format="png")
 
 
-def _write_html(scene: Scene, path: Path, fps: float) -> None:
+def _write_html(pictures: list[Image.Image], path: Path, fps: float) -> None:
     """Writes a page that holds its frames and matplotlib's controls to play them."""
-    screen, pictures = _Screen(), _with_one_palette(list(_pictures(scene)))
+    screen = _Screen()
     screen.show_picture(pictures[0])
     with matplotlib.rc_context({"animation.embed_limit": 1000.0, "animation.frame_format": "png"}):
         player = FuncAnimation(screen, screen.show_picture, frames=pictures, cache_frame_data=False)
         path.write_text(player.to_jshtml(fps=max(1, round(fps))), encoding="utf-8")
+
+
+WRITERS: dict[str, Any] = {".gif": _write_gif, ".html": _write_html}
+"""Ending of a film's path -> what writes it."""

@@ -23,11 +23,12 @@ JOINT, FIXED, NO_BIAS = 0, 0, 0
 """The library's numbers for kinds of joints, of constraints, and of an actuator's transmission, gain and bias."""
 
 
-def _mujoco() -> Any:
+def mujoco_package() -> Any:
+    """The package, where it is installed."""
     try:
         import mujoco
     except ImportError as error:
-        raise ImportError('Robots are loaded from files with the mujoco package: pip install mujoco, or ".[robots]" in a clone.') from error
+        raise ImportError('This needs the mujoco package: pip install mujoco, or ".[robots]" in a clone.') from error
     return mujoco
 
 
@@ -65,7 +66,7 @@ class Tree:
           ValueError: what the library does not accept, in its words.
           ImportError: it is not installed.
         """
-        mujoco = _mujoco()
+        mujoco = mujoco_package()
         try:
             spec = mujoco.MjSpec.from_string(text)
             spec.compiler.fusestatic = False

@@ -120,7 +120,13 @@ def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
 
 
 def observed(
-    accuracy: Accuracy, method: str, dt: jax.Array, index: jax.Array, slopes: list[LoopState], width: jax.Array, held: bool = False
+    accuracy: Accuracy,
+    method: str,
+    dt: jax.Array,
+    index: jax.Array,
+    pieces: list[tuple[jax.Array, list[LoopState]]],
+    width: jax.Array,
+    held: bool = False,
 ) -> Accuracy:
     """The estimate after one more instant.
 
@@ -129,13 +135,14 @@ def observed(
       method: the integrator.
       dt: time step, () [s].
       index: number of the instant, () int.
-      slopes: of the stages of the step from it.
+      pieces: length [s] of what the step from it was made of, and the slopes of the stages there: one, or two where the torque is held.
       width: of the tube, (n,) [rad].
       held: whether the torque is, as in a sampled loop.
     """
     table, n = tableau(method), width.size
     if held:
-        return _observed_within(accuracy, table, dt, slopes, width)
+        return _observed_within(accuracy, table, dt, pieces, width)
+    ((_, slopes),) = pieces
     weights, each = table.differences[::-1], 2 if table.halfway else 1
     width = jax.lax.stop_gradient(width)
     here = _rate(accuracy, slopes[0])
@@ -151,21 +158,26 @@ def observed(
     return Accuracy(tuple(pending), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
-def _observed_within(accuracy: Accuracy, table: Tableau, dt: jax.Array, slopes: list[LoopState], width: jax.Array) -> Accuracy:
+def _observed_within(
+    accuracy: Accuracy, table: Tableau, dt: jax.Array, pieces: list[tuple[jax.Array, list[LoopState]]], width: jax.Array
+) -> Accuracy:
     """As `observed`, from the stages of one step; a method of one stage is held against the step before."""
-    n = width.size
-    rates = [_rate(accuracy, slope._replace(observer=(), actuator=())) for slope in slopes]
-    if table.halfway:
-        early, late = (jax.tree.map(jnp.subtract, slopes[i + 1], slopes[i]) for i in (0, table.halfway - 1))
-        sizes = [sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part))) for part in (early, late)]
-        fast = jnp.minimum(2.0 * sizes[1] / jnp.maximum(sizes[0], jnp.finfo(dt.dtype).tiny), 2.0)
-        error = (rates[table.halfway] - rates[table.halfway - 1]) * fast**2 / 3.0
-    else:
-        error = (rates[-1] - (rates[0] if len(rates) > 1 else accuracy.pending[0])) / 2.0
-    drift = (1.0 - SLOWEST * dt) * accuracy.drift + dt * error
+    n, drift, before = width.size, (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending[0]
+    starts: list[jax.Array] = []
+    for length, slopes in pieces:
+        rates = [_rate(accuracy, slope._replace(observer=(), actuator=())) for slope in slopes]
+        if table.halfway:
+            early, late = (jax.tree.map(jnp.subtract, slopes[i + 1], slopes[i]) for i in (0, table.halfway - 1))
+            sizes = [sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part))) for part in (early, late)]
+            fast = jnp.minimum(2.0 * sizes[1] / jnp.maximum(sizes[0], jnp.finfo(dt.dtype).tiny), 2.0)
+            error = (rates[table.halfway] - rates[table.halfway - 1]) * fast**2 / 3.0
+        else:
+            error = (rates[-1] - (rates[0] if len(rates) > 1 else before)) / 2.0
+        starts.append(rates[0])
+        before, drift = rates[0], drift + jax.lax.stop_gradient(length) * error
     size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
     relative = jnp.maximum(accuracy.relative, jnp.max(size / jax.lax.stop_gradient(width)))
-    return Accuracy((rates[0],), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
+    return Accuracy((starts[0],), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
 class Unseen(NamedTuple):

@@ -181,7 +181,6 @@ def evaluate(
     """
     plant, model = at_time(scenario.plant, t), scenario.model
     q, dq = state.q, state.dq
-    tube = scenario.setting.tube(t)
 
     if scenario.sampling is None:
         f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
@@ -190,19 +189,43 @@ def evaluate(
     else:
         asked, said = state.held.commands[0] if torque is None else torque, state.held.said
     delivered = scenario.actuator.deliver(asked, dq, state.actuator)
-    tau = delivered.tau
-    pushed = tau + scenario.disturbance.torque(t, q, dq, plant, model) + friction_torque(plant, dq)
+    pushed = delivered.tau + scenario.disturbance.torque(t, q, dq, plant, model) + friction_torque(plant, dq)
     ddq = solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
     rate = LoopState(dq, ddq, (), (), delivered.rate)
     if scenario.sampling is None:
         told = scenario.observer.derivative(t, q, dq, asked, model, state.observer)
         rate = rate._replace(controller=controller_rate, observer=told)
+    return rate, observed(scenario, t, dt, q, dq, ddq, delivered.tau, delivered.limited, said)
 
+
+def observed(
+    scenario: Scenario,
+    t: jax.Array,
+    dt: jax.Array | float,
+    q: jax.Array,
+    dq: jax.Array,
+    ddq: jax.Array,
+    tau: jax.Array,
+    limited: jax.Array,
+    said: Said,
+) -> Sample:
+    """The sample at time t of a loop whose robot moves like this, whatever moves it.
+
+    Args:
+      scenario: its reference, bounds and model are looked at.
+      t: time, () [s].
+      dt: the time that the sample stands for, () [s].
+      q, dq, ddq: motion, (n,) each.
+      tau: torque that acts, (n,) [N m].
+      limited: whether the actuator gave less than was asked, (n,) bool.
+      said: what the law says.
+    """
+    model, tube = scenario.model, scenario.setting.tube(t)
     M0, G0 = model.mass_matrix(q), model.gravity(q)
     f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
     e2, f_tilde = dq - said.alpha, f - said.f_hat
     V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
-    sample = Sample(
+    return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
         q=q,
@@ -221,9 +244,8 @@ def evaluate(
         disturbance_estimate=said.f_hat,
         V=V,
         guard_active=said.guard_active,
-        saturated=said.saturated | delivered.limited,
+        saturated=said.saturated | limited,
     )
-    return rate, sample
 
 
 def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:

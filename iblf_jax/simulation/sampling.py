@@ -1,8 +1,7 @@
 """When a law runs that is sampled: its period, when its torque arrives, and the noise of what it is told.
 
 Time goes in steps dt, of which a period holds m.  Instant k is the start of a sample where k is a multiple of m.  A command arrives `delay`
-after its sample's start, wherever that lies in a step: the torque of such a step is the line in time that has the integral, and the
-integral of the integral, of the one that jumps there.
+after its sample's start, wherever that lies in a step: the integrator makes two of that step.
 """
 
 from __future__ import annotations
@@ -98,32 +97,44 @@ def instant(sampling: Sampling, dt: jax.Array, index: jax.Array) -> Instant:
     return Instant(sample, index - sample * steps)
 
 
-def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array, order: int) -> tuple[jax.Array, jax.Array]:
-    """The torque of a step, a + b s with s from 0 to 1, (n,) each [N m].
+class Arriving(NamedTuple):
+    """The torque of a step, (n,) each [N m]."""
+
+    torque: jax.Array
+    """From its start on."""
+    next: jax.Array
+    """From where the next command arrives."""
+    place: jax.Array
+    """Where that is, () [1]: 0 is the start of the step, 1 its end; 1 too where none arrives."""
+    changes: jax.Array
+    """Whether one arrives, at the end of the step at the latest, () bool."""
+
+
+def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array) -> Arriving:
+    """The torque of a step that may change once within it.
+
+    A command that arrives with the end of a step is its own: then the step's torque has a derivative by the delay there too.
 
     Args:
       sampling: the period and the delay.
       dt: of the step, () [s].
       now: its start.
       commands: newest first, (queue + 1, n) [N m].
-      order: of the integrator; one of the first order sees the start of a step alone, and is given the mean.
     """
     if sampling.queue == 0:
-        return _if_possible(sampling, dt, sampling.delay, commands[0]), jnp.zeros_like(commands[0])
+        one = jnp.ones_like(dt)
+        return Arriving(_if_possible(sampling, dt, sampling.delay, commands[0]), commands[0], one, one < 0)
     delay = sampling.delay / dt
     whole = jnp.round(delay)
     near = NEARLY + 4.0 * jnp.finfo(dt.dtype).eps * delay
     delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0))
     steps, phase = _steps(sampling, dt), now.phase.astype(dt.dtype)
-    # The command at work before this step, counted from the newest, and where in the step the next one takes over.
-    age = jnp.maximum(jnp.floor(jax.lax.stop_gradient(delay - phase) / steps) + 1.0, 0.0)
+    # The command at work at the start of this step, counted from the newest, and where the one after it arrives.
+    age = jnp.maximum(jnp.ceil(jax.lax.stop_gradient(delay - phase) / steps), 0.0)
     place = delay - phase - (age - 1.0) * steps
-    change = (age > 0) & (place < 1.0)
+    changes = (age > 0) & (place <= 1.0)
     old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
-    jump, left = jnp.where(change, new - old, 0.0), jnp.where(change, 1.0 - place, 1.0)
-    a, b = jump * left * (1.0 - 3.0 * (1.0 - left)), 6.0 * jump * left * (1.0 - left)
-    a, b = (a, b) if order > 1 else (a + 0.5 * b, jnp.zeros_like(b))
-    return _if_possible(sampling, dt, age, old + a), b
+    return Arriving(_if_possible(sampling, dt, age, old), new, jnp.where(changes, place, 1.0), changes)
 
 
 def _if_possible(sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array) -> jax.Array:

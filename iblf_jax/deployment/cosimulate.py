@@ -1,0 +1,255 @@
+"""`cosimulate`: a scenario's law, sampled, against a robot that MuJoCo moves.
+
+Sensor, law, observer, actuator, delay and disturbance are those of `simulate`; plant and integrator are MuJoCo's.  The run goes step by
+step in Python; its samples, metrics and flags follow from the motion when it is over.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.actuators import Ideal
+from iblf_jax.core import checks
+from iblf_jax.core.status import VELOCITY_LIMIT, Status
+from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
+from iblf_jax.disturbances import Nothing
+from iblf_jax.engine.simulate import report
+from iblf_jax.engine.step import folded, sample_status
+from iblf_jax.robots import at_time
+from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled
+from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
+from iblf_jax.simulation.results import Metrics, Rollout
+from iblf_jax.simulation.sampling import NEARLY, Sampling, check_step, has_noise, noise_key, normals
+from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.signals import SIGNALS
+
+
+def cosimulate(
+    scenario: Scenario,
+    plant: Any,
+    *,
+    duration: float,
+    period: float | None = None,
+    dt: float | None = None,
+    integrator: str | None = "RK4",
+    locked: Mapping[str, float] | None = None,
+    record_every: int = 1,
+    metrics: Sequence[Fold] | None = None,
+    throw: bool = False,
+    seed: int = 0,
+    film: str | Path | None = None,
+) -> Rollout:
+    """Runs a scenario's law against a robot that MuJoCo moves, contacts and mechanical stops included.
+
+        tau_k = law(t_k, sensor(q, q'))  once a period,   x' = MuJoCo(x, tau + disturbance)  between
+
+    The law knows the scenario's `model`; what MuJoCo knows besides (a payload, friction, a stop, a table) is uncertainty to it.  Of the
+    scenario's `plant` only the names of its joints and what a disturbance asks of it are used.  Torque changes when a command
+    arrives, also within a step.  A disturbance and an actuator go along with the stages of MuJoCo's integrator.  Joints have the
+    scenario's names in MuJoCo's model, or its order where the scenario's have none; other joints of the same arm are locked at their
+    reference, and a model's own drives of the arm are switched off.
+
+    Args:
+      scenario: the law and all around it, of n joints.
+      plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`.  A URDF's shapes whose mesh is not there are left out.
+      duration: length of the run [s], a whole number of steps.
+      period: of the law [s]; the scenario's `sampling.period` if not given.
+      dt: step of MuJoCo [s], which divides the period; the model's own, or the next shorter one that does, if not given.
+      integrator: "RK4", "Euler", "implicit" or "implicitfast"; None for the model's own.
+      locked: joint name -> position [rad or m], for joints of the model that are not to move.
+      record_every: record every so-many-th step; metrics and status cover every step whatever is recorded.
+      metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
+      throw: raise instead of warn when the run failed.
+      seed: fixes the noise of a sensor, as in `simulate`.
+      film: file to write the motion to, ".gif" or ".html": MuJoCo's picture where it can draw one, the arm's skeleton otherwise.
+
+    Returns:
+      A `Rollout` as `simulate` gives.  Of MuJoCo's robot nothing is known but how it moves: `fastest_mode` is NaN, there is no
+      `numerical_error`, and no flag tells of too large a step or too long a period.
+
+    Raises:
+      ValueError: bad arguments, or joints that are not in MuJoCo's model; the message names the field, the value and the remedy.
+      SimulationError: with `throw`, when a bound was violated or the state ran away.
+      ImportError: the extra `robots` is not installed.
+
+    Source: design of this package; E. Todorov, T. Erez, Y. Tassa, MuJoCo, IROS 2012.
+    """
+    if integrator is not None:
+        checks.one_of("integrator", integrator, INTEGRATORS)
+    scenario = canonical(_with_period(scenario, period))
+    if not checks.is_concrete(scenario):
+        raise checks.fail("scenario", scenario, "numbers", "MuJoCo has no derivatives: call this outside of jit, vmap and grad.")
+    seed, throw = checks.seed(seed), checks.flag("throw", throw)
+    names = tuple(getattr(scenario.plant, "joints", ()))
+    locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
+    robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
+    sampling: Any = scenario.sampling
+    own = float(sampling.period) / max(1, math.ceil(float(sampling.period) / robot.timestep - NEARLY))
+    dt = own if dt is None else checks.positive_number("dt", dt, "s")
+    check_step(scenario, dt)
+    steps = checks.whole_steps(duration, dt)
+    record_every = checks.recorded_every(record_every, steps)
+    write = None if film is None else _film_writer(film)
+    folds = as_folds(metrics, scenario.initial.q.dtype, scenario.n)
+    motion = _run(scenario, robot, dt, steps, seed)
+    result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
+    report(result, steps, throw)
+    if write is not None:
+        write(result, robot, motion.whole, dt)
+    return result
+
+
+def _film_writer(path: str | Path) -> Callable:
+    """What writes a film there.  Matplotlib comes with it, so it is imported where a film is asked for."""
+    from iblf_jax.deployment.film import film_run
+    from iblf_jax.plotting.animation import film_path
+
+    return partial(film_run, path=film_path(path))
+
+
+def _with_period(scenario: Scenario, period: float | None) -> Scenario:
+    """The scenario, its law sampled with this period."""
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
+    if period is None:
+        if scenario.sampling is None:
+            raise checks.fail("period", None, "the period of the law [s]", "MuJoCo's robot is driven by a sampled law: period=1e-3.")
+        return scenario
+    period = checks.positive_number("period", period, "s")
+    sampling = Sampling(period) if scenario.sampling is None else dataclasses.replace(scenario.sampling, period=period)
+    return dataclasses.replace(scenario, sampling=sampling)
+
+
+class _Motion(NamedTuple):
+    """What has happened, instant by instant (T first), and sample by sample."""
+
+    q: Any
+    dq: Any
+    ddq: Any
+    tau: Any
+    limited: Any
+    actuator: Any
+    sample: Any
+    """Number of the last sample at each instant, (T,)."""
+    whole: Any
+    """Positions of everything in MuJoCo's model."""
+    states: LoopState
+    """After each sample of the law."""
+    broken: bool
+    """Whether the state ran away; it stands still from there."""
+
+
+@partial(jax.jit, static_argnames="draws")
+def _law(scenario: Scenario, t, state: LoopState, index, noise, draws: int) -> LoopState:
+    """The state after a sample."""
+    normal = normals(noise, index, draws, scenario.n).astype(state.q.dtype)
+    return sampled(scenario, t, state, normal)
+
+
+@jax.jit
+def _delivered(scenario: Scenario, t, q, dq, asked, state):
+    """What the actuator delivers, and the torque with what disturbs."""
+    delivered = scenario.actuator.deliver(asked, dq, state)
+    return delivered, delivered.tau + scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
+
+
+def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: int) -> _Motion:
+    """Moves the robot."""
+    sampling: Any = scenario.sampling
+    period, delay, every = float(sampling.period), float(sampling.delay), round(float(sampling.period) / dt)
+    noise = noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else jnp.zeros(4, jnp.float32)
+    state, asked = initial_state(scenario), np.asarray(scenario.model.gravity(scenario.initial.q))
+    plain = isinstance(scenario.actuator, Ideal) and isinstance(scenario.disturbance, Nothing)
+    commands: list[np.ndarray] = []
+    states: list[LoopState] = []
+    arrived = 0
+
+    def rate(t, q, dq, actuator):
+        if plain:
+            return asked, ()
+        delivered, torque = _delivered(scenario, t, q, dq, asked, actuator)
+        return np.asarray(torque), jax.tree.map(np.asarray, delivered.rate)
+
+    stages = Stages(rate, jax.tree.map(np.asarray, state.actuator))
+    rows: list[tuple] = []
+    broken = False
+    robot.place(np.asarray(state.q), np.asarray(state.dq))
+    with robot.driven(stages):
+        for index in range(steps + 1):
+            t = index * dt
+            q, dq = robot.q, robot.dq
+            broken = broken or not (np.all(np.isfinite(q)) and np.all(np.abs(dq) < VELOCITY_LIMIT))
+            if broken:
+                rows.append(rows[-1])
+                continue
+            if index % every == 0:
+                state = _law(scenario, t, state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)), len(commands), noise, scenario.sensor.draws)
+                states.append(state)
+                commands.append(np.asarray(state.held.commands[0]))
+            # Where the next command arrives within the step, MuJoCo makes two of it.
+            now, end = t, t + dt
+            while arrived < len(commands) and arrived * period + delay <= now + NEARLY * dt:
+                asked, arrived = commands[arrived], arrived + 1
+            stages.begin(now)
+            ddq = robot.acceleration(now)
+            tau, limited = asked, np.zeros(scenario.n, bool)
+            if not plain:
+                delivered, _ = _delivered(scenario, t, q, dq, asked, stages.state)
+                tau, limited = np.asarray(delivered.tau), np.asarray(delivered.limited)
+            rows.append((q, dq, ddq, tau, limited, stages.state, len(commands) - 1, robot.data.qpos.copy()))
+            while index < steps and now < end - NEARLY * dt:
+                change = arrived * period + delay if arrived < len(commands) else end
+                h = min(change, end) - now
+                stages.begin(now)
+                robot.step(now, h)
+                stages.finish(h)
+                now += h
+                if change < end - NEARLY * dt:
+                    asked, arrived = commands[arrived], arrived + 1
+    told = jax.tree.map(lambda *x: np.stack(x), *states)
+    columns: list[Any] = [np.stack(column) if isinstance(column[0], np.ndarray | int) else () for column in zip(*rows, strict=True)]
+    return _Motion._make([*columns, told, broken])
+
+
+@jax.jit
+def _observed(scenario: Scenario, folds, dt, motion: _Motion):
+    """Samples, metrics and flags of a motion."""
+    index = jnp.arange(len(motion.q))
+    t, covered = index.astype(dt.dtype) * dt, jnp.where(index < len(index) - 1, dt, 0.0)
+    said = jax.tree.map(lambda x: x[motion.sample], motion.states.held.said)
+    see = jax.vmap(partial(observed, scenario))
+    samples = see(t, covered, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, said)
+    raised = jax.vmap(sample_status)(samples)
+    return samples, folded(folds, samples), raised
+
+
+def _rollout(scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_every: int, method: str) -> Rollout:
+    """The motion as a run."""
+    step_size = jnp.asarray(dt, scenario.initial.q.dtype)
+    samples, results, raised = _observed(scenario, folds, step_size, motion)
+    status = np.bitwise_or.reduce(np.asarray(raised)) | (int(Status.NOT_FINITE) if motion.broken else 0)
+    at = slice(None, None, record_every)
+    states = jax.tree.map(lambda x: jnp.asarray(x[motion.sample[at]]), motion.states)
+    return Rollout(
+        scenario=scenario,
+        controller_state=states.controller,
+        observer_state=states.observer,
+        metrics=Metrics(results, metric_units(folds)),
+        status=jnp.int32(status),
+        fastest_mode=jnp.full_like(step_size, jnp.nan),
+        dt=step_size,
+        actuator_state=jax.tree.map(lambda x: jnp.asarray(x[at]), motion.actuator),
+        measured=states.held.measured,
+        method=method,
+        steps=len(motion.q) - 1,
+        **{name: getattr(samples, name)[at] for name in SIGNALS},
+    )

@@ -1,0 +1,214 @@
+"""A law against MuJoCo's robot: equal to `simulate` where the robots are equal, and what happens where they are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arm_cases import ARMS
+
+import iblf_jax as ij
+
+mujoco = pytest.importorskip("mujoco")
+
+TIMING = {"duration": 0.4, "dt": 5e-4}
+PAPER = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0})
+"""Slow enough for a filter and a drive in the loop."""
+DRIVEN = ij.with_parts(
+    PAPER,
+    sampling=ij.Sampling(1e-3, delay=0.7e-3),
+    sensor=ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)),
+    actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0, limit=[15.0, 5.0], stall=[14.0, 6.0], no_load_speed=[6.0, 8.0]),
+)
+
+
+def two_link(robot, *, inside: str = "", elbow: str = "", outside: str = "") -> str:
+    """The planar arm as an MJCF: gravity along -y, hinges about z."""
+    m, length, centre, inertia = (np.asarray(x) for x in (robot.mass, robot.length, robot.centre, robot.inertia))
+    bodies = [
+        f'<inertial pos="{centre[i]} 0 0" mass="{m[i]}" diaginertia="{inertia[i]} {inertia[i]} {inertia[i]}"/>'
+        f'<geom type="capsule" fromto="0 0 0 {length[i]} 0 0" size="0.03" contype="0" conaffinity="0"/>'
+        for i in (0, 1)
+    ]
+    return f"""<mujoco><compiler angle="radian"/><option timestep="0.0008" gravity="0 -{float(robot.g)} 0"/><worldbody>
+      <body name="upper"><joint name="shoulder" axis="0 0 1"/>{bodies[0]}
+        <body name="fore" pos="{length[0]} 0 0"><joint name="elbow" axis="0 0 1" {elbow}/>{bodies[1]}{inside}</body></body>
+      {outside}</worldbody></mujoco>"""
+
+
+def spec_of(robot, **parts):
+    return mujoco.MjSpec.from_string(two_link(robot, **parts))
+
+
+def largest_difference(a, b) -> float:
+    return float(np.max(np.abs(np.asarray(a) - np.asarray(b))))
+
+
+@pytest.mark.parametrize("scenario", [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN], ids=["ideal", "driven"])
+def test_on_the_nominal_arm_it_is_simulate(scenario):
+    run = ij.simulate(scenario, **TIMING, seed=3)
+    other = ij.cosimulate(scenario, spec_of(scenario.plant), **TIMING, seed=3)
+    assert largest_difference(run.measured.q, other.measured.q) < 1e-9
+    assert largest_difference(run.observer_state, other.observer_state) < 1e-9
+    assert np.isnan(other.fastest_mode)
+    assert "numerical_error" not in other.metrics
+    assert other.method == "MuJoCo RK4"
+    for name in ("q", "dq", "tau", "alpha", "disturbance", "disturbance_estimate", "V", "xi"):
+        assert largest_difference(getattr(run, name), getattr(other, name)) < 1e-9, name
+    for name in run.metrics.keys() & other.metrics.keys():
+        np.testing.assert_allclose(other.metrics[name], run.metrics[name], rtol=1e-9, atol=1e-9, err_msg=name)
+    assert int(other.status) == int(run.status)
+
+
+@pytest.mark.slow
+def test_a_real_arm_from_its_file():
+    arm = ij.robots.load(ARMS / "iiwa14.urdf")
+    scenario = ij.with_parts(ij.presets.iiwa14(), robot=arm, sampling=ij.Sampling(1e-3))
+    run = ij.simulate(scenario, duration=0.2, dt=1e-3)
+    other = ij.cosimulate(scenario, ARMS / "iiwa14.urdf", duration=0.2, dt=1e-3)
+    assert largest_difference(run.q, other.q) < 1e-10
+
+
+def test_a_payload_that_the_law_does_not_know():
+    load = '<body pos="{} 0 0"><inertial pos="0 0 0" mass="0.3" diaginertia="1e-12 1e-12 1e-12"/></body>'
+    spec = spec_of(PAPER.plant, inside=load.format(float(PAPER.plant.length[1])))
+    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3))
+    loaded = ij.simulate(ij.with_parameters(scenario, {"plant.payload": 0.3}), **TIMING)
+    found = ij.cosimulate(scenario, spec, **TIMING)
+    assert largest_difference(loaded.q, found.q) < 1e-9
+    assert largest_difference(loaded.disturbance, found.disturbance) < 1e-7
+    assert largest_difference(found.q, ij.simulate(scenario, **TIMING).q) > 1e-3
+
+
+def test_a_joint_that_touches_its_stop():
+    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3))
+    free = ij.cosimulate(scenario, spec_of(PAPER.plant), **TIMING)
+    # The start is 0.8 and the reference leads downwards: a stop lies in the way.
+    stop = 0.5 * (float(free.q[0, 1]) + float(np.min(free.q[:, 1])))
+    held = ij.cosimulate(scenario, spec_of(PAPER.plant, elbow=f'range="{stop} 3"'), **TIMING)
+    assert float(np.min(free.q[:, 1])) < stop - 0.05
+    assert float(np.min(held.q[:, 1])) > stop - 0.02
+    before = np.argmax(np.asarray(free.q[:, 1]) < stop) - 1
+    assert largest_difference(held.q[:before], free.q[:before]) < 1e-12
+    # What the law does not know of, the stop's push, is in f.
+    assert float(np.max(np.abs(held.disturbance[before:]))) > 2 * float(np.max(np.abs(free.disturbance[before:])))
+
+
+FINGER = '<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/><geom size="0.01" mass="0.2"/></body>'
+
+
+def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
+    ball = '<body name="ball" pos="9 9 9"><freejoint/><geom size="0.1"/></body>'
+    named = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore")
+    scenario = ij.with_parts(PAPER, robot=named, sampling=ij.Sampling(1e-3))
+    expected = ij.simulate(scenario, **TIMING)
+    spec = spec_of(PAPER.plant, inside=FINGER, outside=ball)
+    found = ij.cosimulate(scenario, spec, **TIMING)
+    assert largest_difference(found.q, expected.q) < 1e-9
+    elsewhere = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore", locked={"grip": 0.2})
+    away = ij.simulate(ij.with_parts(scenario, plant=elsewhere, model=named), **TIMING)
+    found = ij.cosimulate(scenario, spec, locked={"grip": 0.2}, **TIMING)
+    assert largest_difference(found.q, away.q) < 1e-9
+    assert largest_difference(found.q, expected.q) > 1e-5
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def _written(name: str, text: str) -> str:
+    with open(name, "w") as file:
+        file.write(text)
+    return name
+
+
+def test_a_models_own_drives_are_off():
+    text = two_link(PAPER.plant).replace("</worldbody>", '</worldbody><actuator><position joint="elbow" kp="50"/></actuator>')
+    driven = ij.cosimulate(PAPER, _written("driven.xml", text), period=1e-3, **TIMING)
+    plain = ij.cosimulate(PAPER, _written("plain.xml", two_link(PAPER.plant)), period=1e-3, **TIMING)
+    assert largest_difference(driven.q, plain.q) == 0.0
+
+
+def test_models_stay_as_they_are_and_other_integrators_come_near():
+    model = spec_of(PAPER.plant).compile()
+    # 0.8 ms do not divide 1 ms: the step is the next shorter one that does.
+    found = ij.cosimulate(PAPER, model, duration=0.4, period=1e-3)
+    assert float(found.dt) == 5e-4
+    assert model.opt.timestep == 0.0008
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    coarse, fine = (ij.cosimulate(PAPER, model, duration=0.4, period=1e-3, dt=dt, integrator=None) for dt in (5e-4, 2.5e-4))
+    errors = [largest_difference(run.q[-1], found.q[-1]) for run in (coarse, fine)]
+    assert errors[1] == pytest.approx(0.5 * errors[0], rel=0.1)
+
+
+def test_callbacks_of_others_are_kept():
+    seen, model = [], spec_of(PAPER.plant).compile()
+    mujoco.set_mjcb_control(lambda model, data: seen.append(data.time))
+    try:
+        ij.cosimulate(PAPER, model, period=1e-3, duration=0.01, dt=1e-3)
+        assert seen
+        count = len(seen)
+        mujoco.mj_forward(model, mujoco.MjData(model))
+        assert len(seen) == count + 1
+    finally:
+        mujoco.set_mjcb_control(None)
+
+
+def test_a_run_that_flies_away_is_told():
+    wild = ij.with_parameters(PAPER, {"controller.K2": 2000.0})
+    with pytest.warns(ij.SimulationWarning, match="ran away|not finite|bound"):
+        run = ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, **TIMING)
+    assert int(run.status) & int(ij.Status.BOUND_VIOLATED)
+    with pytest.raises(ij.SimulationError):
+        ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, throw=True, **TIMING)
+
+
+def test_records_and_films(tmp_path):
+    from PIL import Image
+
+    short = {"duration": 0.2, "dt": 1e-3, "period": 1e-3}
+    every = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), **short)
+    some = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), record_every=10, film=tmp_path / "arm.gif", **short)
+    assert some.t.shape == (21,)
+    np.testing.assert_array_equal(some.q, every.q[::10])
+    np.testing.assert_array_equal(some.actuator_state, every.actuator_state[::10])
+    np.testing.assert_array_equal(some.metrics.rmse, every.metrics.rmse)
+    some.to_xarray()
+    ij.save_rollouts(some, tmp_path / "run.nc")
+    with Image.open(tmp_path / "arm.gif") as film:
+        assert film.n_frames == 6
+
+
+BAD = {
+    "no period": ({}, {}, "period"),
+    "steps": ({}, {"period": 1e-3, "dt": 3e-4}, "Take dt=0.00025"),
+    "integrator": ({}, {"period": 1e-3, "integrator": "rk4"}, "RK4"),
+    "joints": ({"inside": FINGER}, {"period": 1e-3}, "3 joints that move"),
+    "locked": ({}, {"period": 1e-3, "locked": {"wrist": 0.0}}, "wrist.*shoulder"),
+    "floating": ({"outside": ""}, {"period": 1e-3, "locked": {"shoulder": 0.0}}, "1 joints that move"),
+    "film": ({}, {"period": 1e-3, "film": "arm.mp4"}, "gif"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_does_not_fit_is_named(case):
+    parts, options, words = BAD[case]
+    with pytest.raises(ValueError, match=words):
+        ij.cosimulate(PAPER, spec_of(PAPER.plant, **parts), duration=0.1, **options)
+
+
+def test_files_and_names_that_do_not_fit():
+    with pytest.raises(ValueError, match=r"nowhere\.xml"):
+        ij.cosimulate(PAPER, "nowhere.xml", duration=0.1, period=1e-3)
+    with pytest.raises(ValueError, match="body"):
+        ij.cosimulate(PAPER, _written("bad.xml", "<mujoco><worldbody><body pos='a'/></worldbody></mujoco>"), duration=0.1, period=1e-3)
+    arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant)))
+    other = _written("other.xml", two_link(PAPER.plant).replace("elbow", "elbows"))
+    with pytest.raises(ValueError, match=r"elbow.*elbows"):
+        ij.cosimulate(ij.with_parts(PAPER, robot=arm), other, duration=0.1, period=1e-3)
+    floating = two_link(PAPER.plant).replace('<body name="upper">', '<body name="base"><freejoint/><geom size="0.1"/><body name="upper">')
+    text = floating.replace("</body></body>", "</body></body></body>")
+    with pytest.raises(ValueError, match="base that stands still"):
+        ij.cosimulate(ij.with_parts(PAPER, robot=arm), _written("floating.xml", text), duration=0.1, period=1e-3)
+    with pytest.raises(ValueError, match="MjModel"):
+        ij.cosimulate(ij.with_parts(PAPER, robot=arm), spec_of(PAPER.plant, inside=FINGER).compile(), duration=0.1, period=1e-3)
