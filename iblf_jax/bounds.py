@@ -1,4 +1,4 @@
-"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference.
+"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference; bounds on their velocities alike.
 
 Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the reference.  The law works with
 the errors' bounds
@@ -26,7 +26,10 @@ class Side(Protocol):
     """What the package asks of one side of the bounds."""
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
-        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for bounds that follow it."""
+        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for bounds that follow it.
+
+        As a bound on q' it is given q_d' and is in rad/s.
+        """
         ...
 
 
@@ -95,6 +98,8 @@ class Funnel:
 class Bounds:
     """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`.
 
+    On positions in rad; on velocities (`Scenario.velocity_bounds`) in rad/s.
+
     Args:
       lower: the lower side, any `Side`.
       upper: the upper side, any `Side`.
@@ -151,6 +156,30 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
             f"The narrowest range is {float(np.min(np.diff(robot.limits, axis=0))):g} rad.",
         )
     return Bounds(lower=Constant(lower), upper=Constant(upper))
+
+
+def from_speed_limits(robot: Robot, *, share: float = 1.0, unlimited: float | None = None) -> Bounds:
+    """Constant bounds on the velocities at a share of a robot's largest joint speeds, for `Scenario.velocity_bounds`.
+
+        -share speed < q' < share speed
+
+    Args:
+      robot: one with `speed`, such as `iblf_jax.robots.Arm`.
+      share: of the largest speeds, > 0 [1].
+      unlimited: largest speed of joints that have none [rad/s].
+
+    Raises:
+      ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a share that is not positive.
+    """
+    if not hasattr(robot, "speed"):
+        raise checks.fail("robot", type(robot).__name__, "a robot with speed limits, such as an Arm", "Give velocity bounds of your own.")
+    share = checks.positive_number("share", share, "1")
+    far = 0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive")
+    if checks.is_concrete(robot.speed) and not np.all(np.isfinite(robot.speed)) and unlimited is None:
+        remedy = "Say what to use where there is none: unlimited=3.0."
+        raise checks.fail("robot.speed", robot.speed, "a limit on every joint", remedy)
+    most = share * jnp.where(jnp.isfinite(robot.speed), robot.speed, far)
+    return Bounds(lower=Constant(-most), upper=Constant(most))
 
 
 class Tube(NamedTuple):
@@ -240,6 +269,12 @@ def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration:
     (q_d, lower, upper), (dq_d, dlower, dupper) = jax.jvp(values, (t,), (jnp.ones_like(t),))
     ddq_d = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1] if acceleration else None
     return Tube(q_d, dq_d, lower, upper, dlower, dupper, ddq_d)
+
+
+def speed_limits_at(reference: Reference, bounds: Bounds, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The bounds v_l, v_u on the velocities at time t [s], (n,) each [rad/s]; sides that follow something follow q_d'."""
+    dq_d = jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
+    return bounds.lower.at(t, dq_d), bounds.upper.at(t, dq_d)
 
 
 MEMBERS = {"constant": Constant, "sinusoid": Sinusoid, "funnel": Funnel}

@@ -94,7 +94,7 @@ LAWS = {
     "saturated_smooth": controllers.Saturated(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"),
 }
 
-FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), metrics.AboveGravity())}
+FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), metrics.AboveGravity(), metrics.VelocityMargin())}
 
 FAMILIES = {
     "robot": (ROBOTS, robots.MEMBERS, ij.testing.check_robot),
@@ -106,6 +106,6 @@ FAMILIES = {
     "sensor": (SENSORS, sensors.MEMBERS, ij.testing.check_sensor),
     "actuator": (ACTUATORS, actuators.MEMBERS, ij.testing.check_actuator),
     "law": (LAWS, controllers.MEMBERS, ij.testing.check_law),
-    "fold": (FOLDS, {type(fold).__name__: type(fold) for fold in metrics.standard()}, ij.testing.check_fold),
+    "fold": (FOLDS, {cls.__name__: cls for cls in metrics.MEMBERS.values()}, ij.testing.check_fold),
 }
 """Family -> (instances by name, the package's registry, the checker)."""

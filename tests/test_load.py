@@ -78,6 +78,7 @@ def test_names_limits_and_friction(file):
     np.testing.assert_allclose(arm.damping, [0.4, 0.0])
     np.testing.assert_allclose(arm.friction, [0.2, 0.0])
     np.testing.assert_allclose(arm.effort, [7.0, np.inf])
+    np.testing.assert_allclose(arm.speed, [1.0, np.inf])
     np.testing.assert_allclose(arm.limits.lower, [-1.0, -np.inf])
     np.testing.assert_allclose(arm.limits.upper, [2.0, np.inf])
     np.testing.assert_allclose(arm.mass, [1.5, 4.5])
@@ -554,6 +555,7 @@ WITH_REPAIR = {
     "no range": (arm_with(ja='<limit lower="0" upper="0"/>'), r"joint 'ja': limit: from \(0.0, 0.0\) to no limits"),
     "no <limit>": (arm_with(ja=""), "joint 'ja': limit: from nothing to no limits"),
     "negative torque": (arm_with(ja=LIMIT.replace("7", "-1")), "joint 'ja': effort: from -1.0 to no limit"),
+    "negative speed": (arm_with(ja=LIMIT.replace('velocity="1"', 'velocity="-1"')), "joint 'ja': velocity: from -1.0 to no limit"),
     "mimic of nothing": (
         arm_with(ja=LIMIT + '<mimic joint="x"/>'),
         "joint 'ja': from a mimic of 'x' in the chain to one that moves by itself",

@@ -170,7 +170,7 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
         row = [name, unit]
         for run in runs.values():
             values = np.ravel(run.metrics[name])
-            cells = ["-" if name == "first_violation_joint" and x < 0 else number(x) for x in values]
+            cells = ["-" if name.endswith("violation_joint") and x < 0 else number(x) for x in values]
             row += [*cells, *[""] * (run.n - len(cells))][: run.n]
         rows.append(row)
     if any(runs):  # a name, over the first of its joints

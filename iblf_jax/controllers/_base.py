@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
-from iblf_jax.bounds import Bounds, Tube, tube_at
+from iblf_jax.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.references import Reference
 from iblf_jax.robots import Robot
 
@@ -20,15 +20,20 @@ State = Any
 
 
 class Setting(NamedTuple):
-    """What a law knows of the world."""
+    """What a law knows of the world; of bounds on the velocities if there are any."""
 
     model: Robot
     reference: Reference
     bounds: Bounds
+    velocity_bounds: Bounds | None = None
 
     def tube(self, t: jax.Array, *, acceleration: bool = True) -> Tube:
         """Reference, bounds and their rates at time t [s]; arguments as `bounds.tube_at`."""
         return tube_at(self.reference, self.bounds, t, acceleration=acceleration)
+
+    def speed_limits(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The bounds on the velocities at time t [s], (n,) each [rad/s]; only where there are any."""
+        return speed_limits_at(self.reference, self.velocity_bounds, t)  # type: ignore[arg-type]
 
 
 class Command(NamedTuple):

@@ -37,8 +37,16 @@ class Status(enum.IntFlag):
     SAMPLING_TOO_SLOW = 512
     """The loop grows from one period to the next (spectral radius above 1) at one of the instants that were looked at: sample faster."""
 
+    VELOCITY_VIOLATED = 1024
+    """A joint's velocity touched or left its bound."""
+    ALPHA_INFEASIBLE = 2048
+    """The virtual velocity touched or left the velocities' bounds: there no law that follows it can keep them, and nothing is claimed."""
 
-FAILED = Status.BOUND_VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
+
+VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED
+"""The flags of a constraint that was not kept."""
+
+FAILED = VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
 """The flags that make a run one that did not do its job."""
 
 UNTRUSTED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
@@ -59,6 +67,8 @@ _WORDS = {
     Status.INACCURATE: "the positions are inaccurate: the time step is too large",
     Status.GUARD_STAYED: "the guard stayed active beyond the first instant",
     Status.SAMPLING_TOO_SLOW: "the law is sampled too slowly",
+    Status.VELOCITY_VIOLATED: "a velocity bound was violated",
+    Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from iblf_jax.bounds import tube_at
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
@@ -93,7 +94,7 @@ def simulate(
     scenario, seed = canonical(scenario), checks.seed(seed)
     check_step(scenario, dt)
     dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype, scenario.n)
+    folds = as_folds(metrics, dtype, scenario.n, velocity_bounds=scenario.velocity_bounds is not None)
     step_size, noise = jnp.asarray(dt, dtype), noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
     result = simulate_unchecked(scenario, folds, step_size, noise, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
@@ -134,10 +135,12 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
         raise _infeasible(result, steps)
     failed = status & FAILED
     told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW)
+    if getattr(unwrapped(result.scenario.controller), "needs_velocity_bounds", False):
+        told |= status & Status.ALPHA_INFEASIBLE
     if not told:
         return
     heading = f"{'The run failed' if failed else 'Look again'}: {describe(told)}."
-    text = " ".join([heading, *_explanations(result, status, steps)])
+    text = " ".join([heading, *_explanations(result, told | status & ~Status.ALPHA_INFEASIBLE, steps)])
     if throw and failed:
         raise SimulationError(text)
     warnings.warn(text, SimulationWarning, stacklevel=3)
@@ -148,11 +151,15 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     metrics = result.metrics
     if status & Status.BOUND_VIOLATED and "first_violation_time" in metrics:
         joint = int(metrics["first_violation_joint"])
-        name = joint_names(result.scenario.plant, result.n)[joint]
         texts.append(
-            f"Joint {joint}{'' if name == f'joint {joint}' else f' ({name})'} left its bounds first, "
-            f"at t = {float(metrics['first_violation_time']):.4g} s; "
+            f"{_called(result, joint)} left its bounds first, at t = {float(metrics['first_violation_time']):.4g} s; "
             f"its smallest margin is {float(metrics['margin'][joint]):.3g} rad."
+        )
+    if status & Status.VELOCITY_VIOLATED and "first_velocity_violation_time" in metrics:
+        joint = int(metrics["first_velocity_violation_joint"])
+        texts.append(
+            f"{_called(result, joint)} left its velocity bounds first, at t = {float(metrics['first_velocity_violation_time']):.4g} s; "
+            f"its smallest margin is {float(metrics['velocity_margin'][joint]):.3g} rad/s."
         )
     if status & Status.STEP_TOO_LARGE:
         mode = float(result.fastest_mode)
@@ -177,12 +184,24 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             "at. Sample faster (ij.recommended_period says how fast), shorten the delay, or lower controller.K2, observer.kf or the gains "
             "of the velocity's filter."
         )
+    if status & Status.ALPHA_INFEASIBLE:
+        worst = f"by up to {-float(np.min(metrics['alpha_margin'])):.3g} rad/s" if "alpha_margin" in metrics else "at some time"
+        texts.append(
+            f"The virtual velocity alpha left the velocity bounds {worst}: nothing is claimed there. Start nearer to the reference, "
+            "slow it down, widen the velocity bounds or lower controller.k1."
+        )
     if status & Status.GUARD_STAYED:
         texts.append(
             "While the guard is active the barrier is softer than the one that was asked for: what ran there is another law. Start or stay "
             "further from the bounds, or give the barrier a smaller guard."
         )
     return texts
+
+
+def _called(result: Rollout, joint: int) -> str:
+    """A joint by its number, and by its name if it has one."""
+    name = joint_names(result.scenario.plant, result.n)[joint]
+    return f"Joint {joint}" if name == f"joint {joint}" else f"Joint {joint} ({name})"
 
 
 def _infeasible(result: Rollout, steps: int) -> ValueError:

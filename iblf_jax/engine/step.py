@@ -28,7 +28,7 @@ from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.simulation import accuracy, integrators, sampling, stability
 from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS, Sample
+from iblf_jax.simulation.signals import SIGNALS, Sample, has_speed_limits, speed_margin
 
 
 class Run(NamedTuple):
@@ -87,7 +87,7 @@ def sample_status(sample: Sample) -> jax.Array:
     """The flags that one sample raises, () int32."""
     narrowest = jnp.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
-    return (
+    found = (
         flag(jnp.any(~(margin > 0)), Status.BOUND_VIOLATED)
         | flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
         | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
@@ -95,6 +95,10 @@ def sample_status(sample: Sample) -> jax.Array:
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
         | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
     )
+    if not has_speed_limits(sample):
+        return found
+    found |= flag(jnp.any(~(speed_margin(sample, sample.dq) > 0)), Status.VELOCITY_VIOLATED)
+    return found | flag(jnp.any(~(speed_margin(sample, sample.alpha) > NARROWEST)), Status.ALPHA_INFEASIBLE)
 
 
 def is_sound(state: LoopState) -> jax.Array:

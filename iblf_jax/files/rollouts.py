@@ -146,6 +146,8 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     for name, signal in SIGNALS.items():
         if name == "t":
             continue
+        if isinstance(getattr(run, name), tuple):
+            continue  # this scenario has no such signal
         value = np.asarray(getattr(run, name))
         dims = (*batch, "time", *_own_dims(name, value.shape[len(batch) + 1 :], run.n))
         variables[name] = (dims, value, _attrs(signal.unit, signal.meaning))

@@ -17,7 +17,9 @@ from iblf_jax.plotting._figures import positions as positions
 from iblf_jax.plotting._figures import save as save
 from iblf_jax.plotting._figures import torques as torques
 from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
+from iblf_jax.plotting._figures import velocities as velocities
 from iblf_jax.plotting._figures import velocity_errors as velocity_errors
+from iblf_jax.plotting._figures import velocity_portrait as velocity_portrait
 from iblf_jax.plotting._overview import overview as overview
 from iblf_jax.plotting._studies import bands as bands
 from iblf_jax.plotting._studies import histograms as histograms

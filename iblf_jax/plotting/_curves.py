@@ -29,7 +29,7 @@ DERIVED = {
 }
 """Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, and f - f_hat."""
 
-GIVEN = {"t", "q_d", "dq_d", "lower", "upper", "error_lower", "error_upper", "wall_lower", "wall_upper"}
+GIVEN = {"t", "q_d", "dq_d", "lower", "upper", "error_lower", "error_upper", "wall_lower", "wall_upper", "dq_lower", "dq_upper"}
 """Signals that do not depend on the state, and are drawn to the end whatever became of it."""
 
 SAME = 0.03
@@ -38,7 +38,10 @@ SAME = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One run as figures see it: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run was frozen before its end."""
+    """One run as figures see it: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run was frozen before its end.
+
+    A signal that the run's scenario does not have is no number.
+    """
 
     name: str
     """What the caller called it; empty for a run that came alone."""
@@ -47,7 +50,8 @@ class Curve:
     """How many samples are worth drawing."""
 
     def __getitem__(self, field: str) -> np.ndarray:
-        values = DERIVED[field](self.run) if field in DERIVED else np.asarray(getattr(self.run, field))
+        values = DERIVED[field](self.run) if field in DERIVED else getattr(self.run, field)
+        values = np.full(self.run.q.shape, np.nan) if isinstance(values, tuple) else np.asarray(values)
         return values if field in GIVEN else values[: self.samples]
 
     @property
@@ -59,6 +63,11 @@ class Curve:
         """A signal at other times t [s], linearly between its samples and constant after its end, (len(t), n)."""
         values = self[field]
         return np.stack([np.interp(t, self.t[: len(values)], column) for column in values.T], axis=-1)
+
+    @property
+    def has_speed_limits(self) -> bool:
+        """Whether its velocities have bounds."""
+        return not isinstance(self.run.dq_lower, tuple)
 
     @property
     def ok(self) -> bool:

@@ -7,8 +7,9 @@ inset of its own that covers no curve.  Source: Zhang & Yan 2024, figures 1 to 6
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -80,6 +81,8 @@ def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figu
     """A figure with one row a joint."""
     curves = curves_of(runs)
     n, quantity = curves[0].run.n, QUANTITIES[field]
+    if field == "dq" and not any(curve.has_speed_limits for curve in curves):
+        quantity = replace(quantity, frame=None)
     rows = [PanelRow(quantity, joint, f"{curves[0].called(joint)}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
     return _rows_with_zoom(title, curves, rows, zoom, 1.75 if n <= 3 else 1.25)
 
@@ -150,6 +153,22 @@ def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:
       ValueError: no run, a batch, or a zoom that is no time.
     """
     return _every_joint("Velocity error", runs, "e2", zoom)
+
+
+def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Velocity q' [rad/s] of every joint, in the tube of its bounds where it has some (`Scenario.velocity_bounds`).
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: no run, a batch, or a zoom that is no time.
+    """
+    return _every_joint("Velocity", runs, "dq", zoom)
 
 
 def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:
@@ -235,6 +254,55 @@ def phase_portrait(runs: Runs, joints: tuple[int, int] = (0, 1)) -> Figure:
     _style.entitle(figure, "Phase portrait of the positions", curves)
     _style.legend_below(figure, 4)
     return figure
+
+
+@_style.styled()
+def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
+    """Velocity [rad/s] of one joint against its position [rad], with the reference, and the box of its bounds.
+
+    Bounds that move are a box at the start and one, dotted, around all that they reach.
+
+    Args:
+      runs: one run, or a dict of runs by name.
+      joint: which joint, from 0.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: no run, a batch, or no such joint.
+    """
+    curves = curves_of(runs)
+    joint = check_joint(curves, joint)
+    figure = _style.new_figure(4.9, 4.6)
+    axes = figure.subplots()
+    for i, curve in enumerate(distinct(curves, ["lower", "upper", "dq_lower", "dq_upper"], [joint])):
+        _box(axes, curve, joint, "bounds" if i == 0 else "_")
+    for i, curve in enumerate(distinct(curves, ["q_d", "dq_d"], [joint])):
+        axes.plot(curve["q_d"][:, joint], curve["dq_d"][:, joint], **(_style.reference() | {"label": "_" if i else "reference"}))
+    for i, curve in enumerate(curves):
+        look = _style.series(i) | (_style.FAINT if curve.failed and len(curves) > 1 else {})
+        axes.plot(curve["q"][:, joint], curve["dq"][:, joint], label=curve.name or "run", **look)
+        axes.plot(curve["q"][0, joint], curve["dq"][0, joint], marker="o", color=look["color"], linestyle="none", label="_")
+    axes.set_xlabel(_style.label(f"position of {curves[0].called(joint)}", "rad"))
+    axes.set_ylabel(_style.label(r"velocity $\dot q$", "rad/s"))
+    _style.entitle(figure, "Velocity against position", curves)
+    _style.legend_below(figure, 4)
+    return figure
+
+
+def _box(axes: Axes, curve: Curve, joint: int, label: str) -> None:
+    """The bounds of one joint's position and velocity at the start as a box; dotted what they reach, if they move."""
+    left, right, low, high = (curve[name][:, joint] for name in ("lower", "upper", "dq_lower", "dq_upper"))
+    first = (left[0], right[0], low[0], high[0])
+    ends = (left.min(), right.max(), low.min(), high.max())
+    for (x0, x1, y0, y1), line in ((first, "-"), *([(ends, ":")] if not np.allclose(first, ends, equal_nan=True) else [])):
+        look: dict[str, Any] = {"color": _style.bound(), "linewidth": 1.0, "linestyle": line, "label": label if line == "-" else "_"}
+        if curve.has_speed_limits:
+            axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], **look)
+        else:
+            for i, x in enumerate((x0, x1)):
+                axes.axvline(x, **(look | ({"label": "_"} if i else {})))
 
 
 def paper_figures(runs: Runs, *, zoom: float | None = None) -> dict[str, Figure]:

@@ -25,8 +25,8 @@ COLUMNS = 4
 def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     """One run at a glance, its status in the title: what `run.plot()` shows.
 
-    Position of every joint in its tube; then, with the joints together, e1, xi and the phase portrait of the first two
-    joints; torque, uncertain term with estimate, and Lyapunov function.
+    Position of every joint in its tube, and velocity where it has bounds; then, with the joints together, e1, xi and the phase portrait of
+    the first two joints; torque, uncertain term with estimate, and Lyapunov function.
 
     Args:
       run: one run of n joints.
@@ -43,26 +43,28 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     checks.word("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
-    figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows + 4.4)
-    halves = figure.add_gridspec(2, 1, height_ratios=(2.0 * rows, 4.4))
+    tubes = ("q", "dq") if curve.has_speed_limits else ("q",)
+    figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows * len(tubes) + 4.4)
+    parts = figure.add_gridspec(1 + len(tubes), 1, height_ratios=(*(2.0 * rows for _ in tubes), 4.4))
     whole = (0.0, float(np.asarray(run.t)[-1]) or 1e-3)
-    _tubes(figure, halves[0], curve, whole)
-    _together(figure, halves[1], curve, whole)
+    for i, field in enumerate(tubes):
+        _tubes(figure, parts[i], curve, QUANTITIES[field], whole)
+    _together(figure, parts[len(tubes)], curve, whole)
     _style.entitle(figure, title, [curve], always=True)
     _style.legend_below(figure, 8)
     return figure
 
 
-def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
-    """Position of every joint in its tube."""
+def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, quantity: Plotted, whole: Window) -> None:
+    """Position, or velocity, of every joint in its tube."""
     rows = _style.spread(figure, curve.run.n, COLUMNS, where)
     for joint, axes in enumerate(axes for row in rows for axes in row):
-        show(axes, [curve], QUANTITIES["q"], joint, whole)
+        show(axes, [curve], quantity, joint, whole)
         for line in axes.get_lines():
-            if line.get_label() == "$q$":
+            if line.get_label() == quantity.symbol:
                 line.set(**_style.series(joint), label="_")
         axes.set_title(curve.called(joint))
-        axes.set_ylabel(QUANTITIES["q"].label if any(axes is row[0] for row in rows) else "")
+        axes.set_ylabel(quantity.label if any(axes is row[0] for row in rows) else "")
         axes.set_xlabel(_style.label("time $t$", "s") if axes in rows[-1] else "")
 
 

@@ -63,6 +63,7 @@ QUANTITIES = {
         Plotted("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
         Plotted("xi", "relative error", r"$\xi$", "1", ("wall_lower", "wall_upper"), r"walls $\xi = \pm 1$"),
         Plotted("e2", "error", "$e_2$", "rad/s"),
+        Plotted("dq", "velocity", r"$\dot q$", "rad/s", ("dq_lower", "dq_upper"), "bounds", "dq_d", r"reference $\dot q_d$"),
         Plotted("tau", "torque", r"$\tau$", "N m"),
         Plotted("disturbance_estimate", "uncertain term", "$f$", "N m", truth="disturbance", transient="estimate_error"),
     )

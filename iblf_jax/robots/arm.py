@@ -88,6 +88,7 @@ class Arm:
       upper: upper ends of the joints' ranges, () or (n,) [rad]; infinite if not given.
       effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; of the dynamics nothing depends on them; infinite if not
         given.
+      speed: largest speeds of the joints, () or (n,) [rad/s], > 0; of the dynamics nothing depends on them; infinite if not given.
       carried: a load with an extent of its own, which may be picked up at a time, a `Payload`; nothing if not given.
       kinds: "revolute" or "prismatic", one a joint, (n,); all revolute if not given.
       links: names of the links, from the first that moves, (n,); link1 ... if not given.
@@ -114,6 +115,7 @@ class Arm:
     lower: Leaf = leaf("rad", sign="limit", default=-np.inf)
     upper: Leaf = leaf("rad", sign="limit", default=np.inf)
     effort: Leaf = leaf("N m", sign="positive limit", default=np.inf)
+    speed: Leaf = leaf("rad/s", sign="positive limit", default=np.inf)
     carried: Payload = None  # type: ignore[assignment]
     kinds: tuple[str, ...] = static(default=())
     links: tuple[str, ...] = static(default=())
@@ -126,7 +128,7 @@ class Arm:
         "link": ("links", ("mass", "centre", "inertia")),
         "joint": (
             "joints",
-            ("position", "rotation", "axis", "armature", "damping", "friction", "friction_width", "lower", "upper", "effort"),
+            ("position", "rotation", "axis", "armature", "damping", "friction", "friction_width", "lower", "upper", "effort", "speed"),
         ),
     }
     """What a path may call by name: word -> (the field that holds the names, the fields with one row a name)."""
@@ -142,7 +144,7 @@ class Arm:
                 object.__setattr__(self, name, jnp.broadcast_to(value, (n, width)))
             else:
                 checks.shape_is(f"Arm.{name}", value, (n, width))
-        for name in ("armature", "damping", "friction", "friction_width", "lower", "upper", "effort"):
+        for name in ("armature", "damping", "friction", "friction_width", "lower", "upper", "effort", "speed"):
             value = getattr(self, name)
             if value.ndim == 0:
                 object.__setattr__(self, name, jnp.broadcast_to(value, (n,)))

@@ -47,7 +47,7 @@ def load(
 
     the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link, where a link that moves would resist its
     joint with nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and
-    refused else.  A range that is none, and a torque below 0, become no limits; friction below 0 becomes 0; a spring is left
+    refused else.  A range that is none, and a torque or speed below 0, become no limits; friction below 0 becomes 0; a spring is left
     out, and so is MuJoCo's compensation of a body's gravity; a joint of the chain that is tied to another (a mimic, a coupling) moves by
     itself.
 
@@ -61,8 +61,8 @@ def load(
       repair: whether to mend what can be mended; a warning and the arm's `repaired` then say what changed, a line a link or joint.
 
     Returns:
-      An Arm, with the names of links and joints, limits, damping, friction, armature and efforts of the file; its `limits` and `effort`
-      are infinite where the file has none.
+      An Arm, with the names of links and joints, limits, damping, friction, armature, efforts and speeds of the file; its `limits`,
+      `effort` and `speed` are infinite where the file has none (an MJCF has no speeds).
 
     Raises:
       ValueError: what is wrong with the file or the chain; the message names the element and the remedy.
@@ -77,11 +77,11 @@ def load(
         file = urdf.checked(root)
         tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
         chain = _Chain.picked(tree, base, tip, dict(locked), repairs).following(file, repairs)
-        arm = chain.arm(gravity, {}, repairs)
+        arm = chain.arm(gravity, {}, repairs, file.speeds)
     else:
         model = mjcf.checked(root, Path(path).parent)
         tree = Tree.compiled(model.text, str(path), "world", model.taken_out)
-        arm = _Chain.picked(tree, base, tip, dict(locked), repairs).arm(gravity, model.tendons, repairs)
+        arm = _Chain.picked(tree, base, tip, dict(locked), repairs).arm(gravity, model.tendons, repairs, {})
     if arm.repaired:
         warnings.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".", stacklevel=2)
     return arm
@@ -155,7 +155,7 @@ class _Chain(NamedTuple):
             seen.add(name)
         return offset + factor * at.get(name, 0.0)
 
-    def arm(self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs) -> Arm:
+    def arm(self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs, speeds: Mapping[str, float]) -> Arm:
         """The Arm, all bodies welded to the links that carry them."""
         tree = self.tree
         g = np.asarray(tree.gravity if gravity is None else checks.as_floats("gravity", gravity), float)
@@ -173,6 +173,7 @@ class _Chain(NamedTuple):
             tip_position=tip_p,
             tip_rotation=quaternion(tip_R),
             g=upright.T @ g,
+            speed=np.array([speeds.get(name, np.inf) for name in joints["joints"]]),
             links=links.names,
             repaired=tuple(repairs.lines),
         )

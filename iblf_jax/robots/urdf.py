@@ -48,7 +48,9 @@ class Urdf(NamedTuple):
     axes: dict[str, Fault]
     """Joint -> what is wrong with its kind or axis: matters where it moves, or is locked away from 0."""
     motions: dict[str, list[Fault]]
-    """Joint -> what is wrong with its range, torque or friction: matters where it moves."""
+    """Joint -> what is wrong with its range, torque, speed or friction: matters where it moves."""
+    speeds: dict[str, float]
+    """Joint -> its largest speed, which the library does not keep; none for one without."""
 
     def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
         """The library's bodies with their weights: it gets none of them, as it would refuse what may not matter."""
@@ -70,7 +72,7 @@ def checked(robot: ET.Element) -> Urdf:
     parent_of = {_end(joint, "child", links): (_end(joint, "parent", links), name) for name, joint in reversed(joints.items())}
     _is_tree(links, joints, parent_of)
     root = next(name for name in links if name not in parent_of)
-    found = Urdf("", root, {}, {}, {}, {}, {})
+    found = Urdf("", root, {}, {}, {}, {}, {}, {})
     copy = ET.Element("robot", name="robot")
     for name, link in links.items():
         found.weights[name], centre = _weight(link)
@@ -206,7 +208,7 @@ def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
     faults = found.motions[name] = []
     for read in (_limit, _dynamics):
         try:
-            faults += read(joint, where, copy)
+            faults += read(joint, where, copy, found)
         except ValueError as error:
             faults.append(Fault(where, "", error))
     try:
@@ -231,8 +233,8 @@ def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
     return direction
 
 
-def _limit(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
-    """Range and largest torque of a joint, into the copy; what cannot be, and is left out there."""
+def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list[Fault]:
+    """Range and largest torque of a joint, into the copy, and its largest speed; what cannot be, and is left out there."""
     limit, endless, faults = _one(joint, "limit"), joint.get("type") == "continuous", []
     if limit is None:
         if endless:
@@ -240,7 +242,7 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
         remedy = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
         error = checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", remedy)
         return [Fault(f"{where}: limit", "nothing", error, "no limits")]
-    names = ("effort",) if endless else ("lower", "upper", "effort")
+    names = ("effort", "velocity") if endless else ("lower", "upper", "effort", "velocity")
     values = {name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0] for name in names}
     if not endless and not values["lower"] < values["upper"]:
         got = (values.pop("lower"), values.pop("upper"))
@@ -248,13 +250,18 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
     if values["effort"] < 0:
         torque = values.pop("effort")
         faults.append(Fault(f"{where}: effort", str(torque), checks.fail(f"{where}: effort", torque, "a number >= 0"), "no limit"))
+    speed = values.pop("velocity")
+    if speed > 0:
+        found.speeds[str(joint.get("name"))] = speed
+    elif speed < 0:
+        faults.append(Fault(f"{where}: velocity", str(speed), checks.fail(f"{where}: velocity", speed, "a number >= 0"), "no limit"))
     if "lower" in values and copy.get("type") == "continuous":
         copy.set("type", "revolute")
     ET.SubElement(copy, "limit", {name: repr(value) for name, value in values.items()})
     return faults
 
 
-def _dynamics(joint: ET.Element, where: str, copy: ET.Element) -> list[Fault]:
+def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[Fault]:
     """Damping and friction of a joint, into the copy."""
     dynamics, faults = _one(joint, "dynamics"), []
     if dynamics is None:

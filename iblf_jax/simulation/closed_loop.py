@@ -225,6 +225,7 @@ def observed(
     f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
     e2, f_tilde = dq - said.alpha, f - said.f_hat
     V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
+    limits = () if scenario.velocity_bounds is None else scenario.setting.speed_limits(t)
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
@@ -245,6 +246,7 @@ def observed(
         V=V,
         guard_active=said.guard_active,
         saturated=said.saturated | limited,
+        **dict(zip(("dq_lower", "dq_upper"), limits, strict=False)),
     )
 
 

@@ -19,11 +19,14 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.simulation.accuracy import UNITS
 from iblf_jax.simulation.scenario import fit_joints
-from iblf_jax.simulation.signals import Sample
+from iblf_jax.simulation.signals import Sample, speed_margin
 
 
 class Fold(Protocol):
-    """What the package asks of a metric."""
+    """What the package asks of a metric.
+
+    It may also have, as a class attribute, `needs_velocity_bounds = True` if it reads `sample.dq_lower` and `sample.dq_upper`.
+    """
 
     units: ClassVar[dict[str, str]]
     """Name -> SI unit of everything that `finish` returns."""
@@ -168,6 +171,57 @@ class Margin:
         }
 
 
+class _SpeedState(NamedTuple):
+    margin: jax.Array
+    alpha: jax.Array
+    time: jax.Array
+    joint: jax.Array
+
+
+@component
+class VelocityMargin:
+    """How near the velocities, and the virtual velocity alpha, came to the bounds of the velocities, and the first violation.
+
+    velocity_margin = min(q' - v_l, v_u - q') and alpha_margin = min(alpha - v_l, v_u - alpha), both continuous through zero: alpha outside
+    means that a law which follows it cannot keep the bounds.  first_velocity_violation_time is infinite and
+    first_velocity_violation_joint -1 on a run that keeps them.  For scenarios with `velocity_bounds` alone, whose runs carry it unless told
+    otherwise.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "velocity_margin": "rad/s",
+        "alpha_margin": "rad/s",
+        "first_velocity_violation_time": "s",
+        "first_velocity_violation_joint": "1",
+    }
+    needs_velocity_bounds: ClassVar[bool] = True
+
+    def init(self, sample: Sample) -> _SpeedState:
+        """Infinitely far from the bounds."""
+        far = jnp.full_like(sample.dq, jnp.inf)
+        return _SpeedState(far, far, jnp.full_like(sample.t, jnp.inf), jnp.int32(-1))
+
+    def update(self, acc: _SpeedState, sample: Sample) -> _SpeedState:
+        """Adds one sample."""
+        margin = speed_margin(sample, sample.dq)
+        first = jnp.any(~(margin > 0)) & (acc.joint < 0)
+        return _SpeedState(
+            jnp.minimum(acc.margin, margin),
+            jnp.minimum(acc.alpha, speed_margin(sample, sample.alpha)),
+            jnp.where(first, sample.t, acc.time),
+            jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.joint),
+        )
+
+    def finish(self, acc: _SpeedState) -> dict[str, jax.Array]:
+        """velocity_margin and alpha_margin, each (n,); first_velocity_violation_time and first_velocity_violation_joint, ()."""
+        return {
+            "velocity_margin": acc.margin,
+            "alpha_margin": acc.alpha,
+            "first_velocity_violation_time": acc.time,
+            "first_velocity_violation_joint": acc.joint,
+        }
+
+
 class _TorqueSums(NamedTuple):
     time: jax.Array
     square: jax.Array
@@ -276,14 +330,23 @@ class Estimation:
         return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
 
 
-def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int | None = None) -> tuple[Fold, ...]:
-    """The folds that a user asked for (None: the standard ones), checked (for n joints), their numbers in one floating-point type.
+def as_folds(
+    metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int | None = None, *, velocity_bounds: bool = False
+) -> tuple[Fold, ...]:
+    """The folds that a user asked for (None: the standard ones), checked, their numbers in one floating-point type.
+
+    Args:
+      metrics: the folds, or None.
+      dtype: of their numbers.
+      n: joints of the scenario that they are for, if it is known.
+      velocity_bounds: whether it has bounds on the velocities.
 
     Raises:
-      ValueError: something that is not a fold, units that are no words, fields that are no numbers, or two folds that return the same name.
+      ValueError: something that is not a fold, one that needs velocity bounds where there are none, units that are no words, fields that
+        are no numbers, or two folds that return the same name.
     """
     if metrics is None:
-        metrics = standard()
+        metrics = (*standard(), VelocityMargin()) if velocity_bounds else standard()
     if not isinstance(metrics, tuple | list):
         raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
     owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
@@ -291,6 +354,9 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int
         checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
         if n is not None:
             fit_joints(fold, n, f"metrics[{i}]")
+        if getattr(fold, "needs_velocity_bounds", False) and not velocity_bounds:
+            remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
+            raise checks.fail(f"metrics[{i}]", type(fold).__name__, "a metric of a scenario without velocity bounds", remedy)
         for name, unit in checks.mapping(f"metrics[{i}].units", fold.units, '{"rmse": "rad"}').items():
             checks.word(f"metrics[{i}].units[{name!r}]", unit, "a unit in words")
             if name in owner:
@@ -313,7 +379,7 @@ def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
 
 
 def standard() -> tuple[Fold, ...]:
-    """The folds that every run carries unless told otherwise.
+    """The folds that every run carries unless told otherwise; one with bounds on the velocities a `VelocityMargin` too.
 
     Made on the call: an array made at import would start JAX's backend and fix its precision before a user can choose.
     """
@@ -324,6 +390,7 @@ MEMBERS = {
     "tracking": Tracking,
     "settling": Settling,
     "margin": Margin,
+    "velocity_margin": VelocityMargin,
     "torque": Torque,
     "above_gravity": AboveGravity,
     "estimation": Estimation,

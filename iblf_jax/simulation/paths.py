@@ -81,10 +81,11 @@ def _need_component(scenario: Any) -> None:
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
 
 
-def _walk(part: Any, path: str, named: bool) -> Iterator[Parameter]:
+def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = None) -> Iterator[Parameter]:
+    units = units or {}
     if isinstance(part, tuple | list):
         for i, x in enumerate(part):
-            yield from _walk(x, f"{path}[{i}]", named)
+            yield from _walk(x, f"{path}[{i}]", named, units)
     elif dataclasses.is_dataclass(part) and not isinstance(part, type):
         own = {field.name for field in dataclasses.fields(part)}
         for field in dataclasses.fields(part):
@@ -98,11 +99,16 @@ def _walk(part: Any, path: str, named: bool) -> Iterator[Parameter]:
                     yield inner if parse(rest)[0] not in own else inner._replace(path=f"{name}.{rest}")
                 continue
             if isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-                yield Parameter(name, jnp.shape(value), field.metadata.get("unit", ""), value)
+                yield Parameter(name, jnp.shape(value), _unit(field, units), value)
             else:
-                yield from _walk(value, name, named)
+                yield from _walk(value, name, named, {**units, **field.metadata.get("units", {})})
         if named:
             yield from _rows(part, path)
+
+
+def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
+    """The unit of a leaf: its own, unless what holds it says otherwise (`units` among the metadata of its field)."""
+    return str(units.get(field.name, field.metadata.get("unit", "")))
 
 
 def _rows(part: Any, path: str) -> Iterator[Parameter]:
@@ -186,7 +192,7 @@ def leaves(scenario: Scenario, path: str) -> list[str]:
 
 def unit_at(scenario: Scenario, path: str) -> str:
     """The unit of the leaf at a path."""
-    return _metadata(scenario, path).get("unit", "")
+    return str(_metadata(scenario, path).get("unit", ""))
 
 
 def sign_at(scenario: Scenario, path: str) -> str | None:
@@ -199,11 +205,14 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
     """What was declared of the leaf at a path."""
     part: Any = scenario
     metadata: Mapping[str, Any] = {}
+    units: dict[str, str] = {}
     for token in places(scenario, path)[0]:
         if isinstance(token, int):
             part = part[token] if isinstance(part, tuple | list) else part
         else:
-            metadata = next(f.metadata for f in dataclasses.fields(part) if f.name == token)
+            field = next(f for f in dataclasses.fields(part) if f.name == token)
+            metadata = {**field.metadata, "unit": _unit(field, units)}
+            units |= field.metadata.get("units", {})
             part = getattr(part, token)
     return metadata
 

@@ -18,11 +18,11 @@ import numpy as np
 
 from iblf_jax.actuators import Actuator
 from iblf_jax.actuators import Ideal as IdealActuator
-from iblf_jax.bounds import Bounds, tube_at
+from iblf_jax.bounds import Bounds, speed_limits_at, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
-from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, leaf
+from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
@@ -59,6 +59,9 @@ PARTS = (
 )
 """Field, protocol, remedy and what may be missing, for each part of a scenario that may be a user's own."""
 
+OF_VELOCITY = {"units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")}
+"""What bounds are measured in where they bound velocities: leaf -> unit."""
+
 
 @component
 class Scenario:
@@ -78,6 +81,8 @@ class Scenario:
       sampling: when law and observer run, a `Sampling`; at every instant if not given.
       sensor: what they are told of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others need a sampling.
       actuator: what becomes of the torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
+      velocity_bounds: what the joints' velocities must keep, a `bounds.Bounds` [rad/s] whose funnels follow q_d'; none if not given.
+        They are watched whatever the law; `controllers.FullState` keeps them.
 
     Raises:
       ValueError: if a leaf has the wrong number of joints, model and plant differ in theirs, or a sensor comes without a sampling.
@@ -94,6 +99,7 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
+    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=OF_VELOCITY)
 
     def check(self) -> None:
         """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""
@@ -105,6 +111,13 @@ class Scenario:
             raise checks.fail("Scenario.initial", self.initial, "an Initial", "Such as Initial(q=[0.8, 0.8]).")
         if not isinstance(self.bounds, Bounds):
             raise checks.fail("Scenario.bounds", self.bounds, "a Bounds", "Such as Bounds(lower=Constant(0.1), upper=Constant(0.9)).")
+        if not isinstance(self.velocity_bounds, Bounds | None):
+            remedy = "Such as Bounds(lower=Constant(-1.0), upper=Constant(1.0)), in rad/s."
+            raise checks.fail("Scenario.velocity_bounds", self.velocity_bounds, "a Bounds, or None", remedy)
+        law = unwrapped(self.controller)
+        if self.velocity_bounds is None and getattr(law, "needs_velocity_bounds", False):
+            remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
+            raise checks.fail("Scenario.velocity_bounds", None, f"the bounds that {type(law).__name__} keeps", remedy)
         if not isinstance(self.sampling, Sampling | None):
             raise checks.fail("Scenario.sampling", self.sampling, "a Sampling, or None", "Such as ij.Sampling(period=2e-3).")
         if self.sampling is None and not isinstance(self.sensor, IdealSensor):
@@ -123,7 +136,7 @@ class Scenario:
     @property
     def setting(self) -> Setting:
         """What the law knows: model, reference and bounds."""
-        return Setting(self.model, self.reference, self.bounds)
+        return Setting(self.model, self.reference, self.bounds, self.velocity_bounds)
 
 
 def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
@@ -135,8 +148,9 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
 
     Args:
       scenario: what to change; it stays as it is.
-      parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance, initial, sampling, sensor, actuator; each as
-        `Scenario` takes it, so that one number stands for one number a joint.  Numbers take the scenario's floating-point type.
+      parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance, initial, sampling, sensor, actuator,
+        velocity_bounds; each as `Scenario` takes it, so that one number stands for one number a joint.  Numbers take the scenario's
+        floating-point type.
 
     Returns:
       A new Scenario; it runs like any other, and compiles where the structure is new.
@@ -278,12 +292,33 @@ def _start(scenario: Scenario):
     _shaped(
         "disturbance.torque(t, q, dq, plant, model)", lambda: scenario.disturbance.torque(zero, q, dq, scenario.plant, scenario.model), n
     )
-    return tube.q_d, tube.lower, tube.upper
+    return tube.q_d, tube.lower, tube.upper, _speed_limits(scenario, zero)
+
+
+def _speed_limits(scenario: Scenario, zero: jax.Array):
+    """Bounds on the velocities at the start, their shapes checked; None if there are none."""
+    bounds, n = scenario.velocity_bounds, scenario.n
+    if bounds is None:
+        return None
+    dq_d = jnp.zeros((n,), zero.dtype)
+    for name, side in (("lower", bounds.lower), ("upper", bounds.upper)):
+        _shaped(f"velocity_bounds.{name}.at(t, dq_d)", lambda side=side: side.at(zero, dq_d), n)
+    return speed_limits_at(scenario.reference, bounds, zero)
+
+
+def _check_speeds(dq: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raises ValueError for bounds on the velocities that leave no room at t = 0, or a start outside of them."""
+    for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        if not low < high:
+            raise checks.fail(f"velocity_bounds of joint {i}", (low, high), "finite lower < upper at t = 0", "Exchange or widen them.")
+        if not low < dq[i] < high:
+            expected = f"a start inside the velocity bounds ({low:.6g}, {high:.6g}) at t = 0"
+            raise checks.fail(f"initial.dq[{i}]", dq[i], expected, "Change the start or widen the bounds.")
 
 
 def _check_start(scenario: Scenario) -> None:
     q = np.asarray(scenario.initial.q)
-    q_d, lower, upper = (np.asarray(x) for x in _start(scenario))
+    q_d, lower, upper, speeds = jax.tree.map(np.asarray, _start(scenario))
     M = [np.asarray(mass_matrix_at(robot, scenario.initial.q)) for robot in (scenario.plant, scenario.model)]
     for name, values in (("reference", q_d), ("bounds.lower", lower), ("bounds.upper", upper)):
         if not np.all(np.isfinite(values)):
@@ -305,6 +340,8 @@ def _check_start(scenario: Scenario) -> None:
                 f"a start inside the bounds ({lower[i]:.6g}, {upper[i]:.6g}) at t = 0",
                 "Move the start or widen the bounds.",
             )
+    if speeds is not None:
+        _check_speeds(np.asarray(scenario.initial.dq), *speeds)
     if not np.all(np.abs(scenario.initial.dq) < VELOCITY_LIMIT):
         raise checks.fail(
             "initial.dq", scenario.initial.dq, f"speeds below {VELOCITY_LIMIT:g} rad/s", "A run that fast counts as diverged."

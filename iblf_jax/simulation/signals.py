@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
+import jax.numpy as jnp
 from jax import Array
 
 
@@ -41,9 +42,25 @@ class Sample(NamedTuple):
     """Of (3.12), ()."""
     guard_active: Array
     saturated: Array
+    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = ()
+    """`()` where velocities have no bounds."""
+    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = ()
+
+
+def has_speed_limits(sample: Sample) -> bool:
+    """Whether velocities have bounds."""
+    return not isinstance(sample.dq_lower, tuple)
+
+
+def speed_margin(sample: Sample, velocity: Array) -> Array:
+    """Distance of a velocity to the nearer of its bounds, (n,) [rad/s]."""
+    return jnp.minimum(velocity - sample.dq_lower, sample.dq_upper - velocity)
 
 
 SIGNALS: dict[str, Recorded] = {
     name: hint.__metadata__[0] for name, hint in get_type_hints(Sample, include_extras=True).items() if hasattr(hint, "__metadata__")
 }
 """Name of a recorded signal -> its unit and meaning, time first."""
+
+OPTIONAL = tuple(name for name in SIGNALS if name in Sample._field_defaults)
+"""Signals that some scenarios have: `()` in others."""

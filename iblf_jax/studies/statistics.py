@@ -16,7 +16,10 @@ import numpy as np
 
 from iblf_jax.core import checks
 
-SMALLER_IS_WORSE = ("margin", "xi_margin", "first_violation_time")
+SMALLER_IS_WORSE = (
+    *("margin", "xi_margin", "first_violation_time"),
+    *("velocity_margin", "alpha_margin", "first_velocity_violation_time"),
+)
 """Metrics of which the smallest value, over joints and over runs, is the worst."""
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking
-from iblf_jax.tuning.quantities import MetricResult, Peak, Quantity, TimeIntegral
+from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, Quantity, TimeIntegral
 
 
 @component
@@ -99,7 +99,7 @@ class Requirement:
     def measure(self) -> tuple[float, str]:
         """Sign and unit with which its numbers are shown: a deficit is shown as a margin."""
         signal = getattr(self.quantity, "signal", "")
-        return -1.0 if signal == "deficit" else 1.0, getattr(self.quantity, "units", {}).get(signal, "")
+        return -1.0 if signal in DEFICITS else 1.0, getattr(self.quantity, "units", {}).get(signal, "")
 
     def __add__(self, other: Any) -> Objective:
         return Objective((), (self,)) + other
@@ -219,6 +219,19 @@ def has_price_on_torque(objective: Objective) -> bool:
     return any(getattr(q, "signal", "torque") in ("torque", "torque_rate") for q in quantities if not _of_the_error(q))
 
 
+def check_velocity_bounds(objective: Objective, scenario: Any) -> None:
+    """Raises ValueError for an objective that asks for margins of velocities where these have no bounds."""
+    of_velocity = [q for q in _composed(objective).quantities if _of_velocity(q)]
+    if of_velocity and scenario.velocity_bounds is None:
+        remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
+        raise checks.fail("objective", "a margin of velocities", "a scenario with velocity_bounds", remedy)
+
+
+def _of_velocity(quantity: Quantity) -> bool:
+    fold = getattr(quantity, "fold", None)
+    return getattr(quantity, "signal", "") == "velocity_deficit" or getattr(fold, "needs_velocity_bounds", False)
+
+
 def _of_the_error(quantity: Quantity) -> bool:
     return isinstance(quantity, MetricResult) and isinstance(quantity.fold, Tracking | Settling)
 
@@ -298,6 +311,12 @@ def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -
     return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="margin"),))
 
 
+def velocity_margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
+    """Soft penalty on velocities that come nearer to a bound than a target; as `margin`, in rad/s, for scenarios with `velocity_bounds`."""
+    quantity = Peak(target, "velocity_deficit", smoothing=smoothing)
+    return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="velocity_margin"),))
+
+
 def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Objective:
     """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own, summed over the joints.
 
@@ -344,6 +363,11 @@ def peak_torque_below(limit: Any, *, allowed: Any = 0.01, joints: Any = 1.0) -> 
 def margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
     """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `allowed` as `error_below`."""
     return Requirement(Peak(limit, "deficit"), -limit, limit, allowed, name=f"margin > {limit:g} rad")
+
+
+def velocity_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
+    """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with `velocity_bounds`; as `margin_above`."""
+    return Requirement(Peak(limit, "velocity_deficit"), -limit, limit, allowed, name=f"velocity margin > {limit:g} rad/s")
 
 
 def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:

@@ -53,15 +53,18 @@ class Quantity(Protocol):
         ...
 
 
-TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1", "deficit": "rad"}
+TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1", "deficit": "rad", "velocity_deficit": "rad/s"}
 """Signal -> unit."""
+DEFICITS = ("deficit", "velocity_deficit")
+"""Signals of which the largest is minus a margin: no sizes, and no weights of the joints."""
 
 
 def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax.Array:
     """A signal at one sample, (n,) or (2 n,).
 
     error e1; torque tau; torque_rate (tau - last tau) / dt; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose
-    integral of squares is the time outside the tolerance; deficit (lower - q, q - upper), the largest of which is minus the margin.
+    integral of squares is the time outside the tolerance; deficit (lower - q, q - upper), the largest of which is minus the margin;
+    velocity_deficit the same of the velocities.
     """
     if name == "error":
         return sample.e1
@@ -72,6 +75,8 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax
     if name == "outside":
         size = jnp.where(sample.e1 >= 0, sample.e1, -sample.e1)
         return jax.nn.sigmoid((size - tolerance) / (SOFT_EDGE * tolerance)) ** 0.5
+    if name == "velocity_deficit":
+        return jnp.concatenate([sample.dq_lower - sample.dq, sample.dq - sample.dq_upper])
     return jnp.concatenate([sample.lower - sample.q, sample.q - sample.upper])
 
 
@@ -132,7 +137,7 @@ class Peak:
 
     Args:
       scale: the size of y that matters, () in its unit, > 0.
-      signal: "error", "torque", "torque_rate" or "deficit"; "torque" if not given.
+      signal: "error", "torque", "torque_rate", "deficit" or "velocity_deficit"; "torque" if not given.
       joints: weight of each joint, () or (n,) [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       smoothing: T as a part of the scale, () [1], > 0; 0.01 if not given.
@@ -153,7 +158,7 @@ class Peak:
 
     def _at(self, acc, sample: Sample) -> jax.Array:
         y = signal_of(self.signal, sample, acc[1], None)
-        if self.signal != "deficit":
+        if self.signal not in DEFICITS:
             y = self.joints * y
             y = jnp.concatenate([y, -y])
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)

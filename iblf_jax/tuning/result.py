@@ -182,7 +182,8 @@ class TuneResult:
         """The nominal run before and after, in full."""
         setup = self.setup
         dtype, steps = self.start.initial.q.dtype, checks.whole_steps(setup.duration, setup.dt)
-        folds, step = as_folds(None, dtype), jnp.asarray(setup.dt, dtype)
+        bounded = self.start.velocity_bounds is not None
+        folds, step = as_folds(None, dtype, velocity_bounds=bounded), jnp.asarray(setup.dt, dtype)
         run = partial(simulate_unchecked, folds=folds, dt=step, steps=steps, method=setup.method, record_every=1)
         return run(canonical(self.start)), run(canonical(self.scenario))
 

@@ -1,0 +1,176 @@
+"""Bounds on the velocities: watched by metrics, status, requirements and figures, whatever the law knows of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import bounds, plotting
+from iblf_jax.files.scenario import load_scenario, save_scenario, scenario_to_toml
+from iblf_jax.simulation import metrics
+from iblf_jax.simulation.signals import OPTIONAL
+
+SHORT = {"duration": 1.0, "dt": 1e-3}
+
+
+def speeds(low=(-1.6, -1.4), high=(0.6, 0.5), amplitude=(0.1, 0.0)):
+    return bounds.Bounds(
+        lower=bounds.Sinusoid(offset=low, amplitude=[-x for x in amplitude]),
+        upper=bounds.Sinusoid(offset=high, amplitude=amplitude, phase=np.pi / 2),
+    )
+
+
+def paper(**parts):
+    return ij.with_parts(ij.presets.zhang_yan_2024(reading="corrected"), **({"velocity_bounds": speeds()} | parts))
+
+
+@pytest.fixture(scope="module")
+def watched():
+    return ij.simulate(paper(), **SHORT)
+
+
+@pytest.fixture(scope="module")
+def violated():
+    with pytest.warns(ij.SimulationWarning, match=r"Joint 1 left its velocity bounds first, at t = 0\.00\d s"):
+        return ij.simulate(paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5))), **SHORT)
+
+
+def test_what_is_watched_is_what_the_samples_say(watched):
+    run, t = watched, np.asarray(watched.t)
+    low = np.stack([-1.6 - 0.1 * np.sin(t), np.full_like(t, -1.4)], axis=1)
+    high = np.stack([0.6 + 0.1 * np.cos(t), np.full_like(t, 0.5)], axis=1)
+    np.testing.assert_allclose(run.dq_lower, low, atol=1e-15)
+    np.testing.assert_allclose(run.dq_upper, high, atol=1e-15)
+    assert run.ok
+    for name, signal in (("velocity_margin", run.dq), ("alpha_margin", run.alpha)):
+        np.testing.assert_allclose(run.metrics[name], np.minimum(signal - low, high - signal).min(axis=0), rtol=1e-12)
+    assert np.isinf(run.metrics.first_velocity_violation_time)
+    assert int(run.metrics.first_velocity_violation_joint) == -1
+
+
+def test_the_law_and_the_loop_do_not_know(watched):
+    free = ij.simulate(paper(velocity_bounds=None), **SHORT)
+    for name in ("q", "dq", "tau", "V"):
+        np.testing.assert_array_equal(getattr(free, name), getattr(watched, name))
+    assert all(getattr(free, name) == () for name in OPTIONAL)
+    assert "velocity_margin" not in free.metrics
+
+
+def test_a_violation_is_flagged_with_time_and_joint(violated):
+    run = violated
+    status = ij.Status(int(run.status))
+    assert status == ij.Status.VELOCITY_VIOLATED | ij.Status.ALPHA_INFEASIBLE
+    outside = np.asarray((run.dq <= run.dq_lower) | (run.dq >= run.dq_upper))
+    first = int(np.flatnonzero(outside.any(axis=1))[0])
+    assert float(run.metrics.first_velocity_violation_time) == pytest.approx(float(run.t[first]))
+    assert int(run.metrics.first_velocity_violation_joint) == 1
+    assert float(np.min(run.metrics.velocity_margin)) < 0
+    with pytest.raises(ij.SimulationError, match="velocity bound"), np.errstate(all="ignore"):
+        ij.simulate(run.scenario, **SHORT, throw=True)
+
+
+def test_backends_agree():
+    scenario = paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5)))
+    options = {"runs": 4, "duration": 0.3, "dt": 1e-3, "progress": False}
+    studies = [ij.monte_carlo(scenario, {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}, backend=b, **options) for b in ("xla", "vmap")]
+    for name in ("velocity_margin", "alpha_margin", "first_velocity_violation_time"):
+        np.testing.assert_allclose(*(np.asarray(s.metrics[name]) for s in studies), rtol=1e-9)
+    assert np.all(studies[0].status & int(ij.Status.VELOCITY_VIOLATED) != 0)
+    np.testing.assert_array_equal(studies[0].status, studies[1].status)
+
+
+def test_a_funnel_of_velocities_follows_the_reference():
+    funnel = bounds.Bounds(lower=bounds.Funnel(-1.0, -0.2, 2.0), upper=bounds.Funnel(1.5, 0.2, 2.0))
+    run = ij.simulate(paper(velocity_bounds=funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0])), duration=0.2, dt=1e-3)
+    r = np.exp(-2.0 * np.asarray(run.t))[:, None]
+    np.testing.assert_allclose(run.dq_upper, run.dq_d + 1.3 * r + 0.2, rtol=1e-12)
+    np.testing.assert_allclose(run.dq_lower, run.dq_d - 0.8 * r - 0.2, rtol=1e-12)
+
+
+def test_the_margin_has_a_derivative():
+    def margin(low):
+        scenario = ij.with_parameters(paper(), {"velocity_bounds.lower.offset": low, "controller.k1": 2.0 + low})
+        return jnp.min(ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=200).metrics.velocity_margin)
+
+    found, h = jax.grad(margin)(-1.5), 1e-6
+    assert float(found) == pytest.approx((float(margin(-1.5 + h)) - float(margin(-1.5 - h))) / (2 * h), rel=1e-6)
+
+
+def test_files_hold_them_and_say_their_unit(tmp_path):
+    scenario = paper()
+    save_scenario(scenario, tmp_path / "s.toml")
+    again = load_scenario(tmp_path / "s.toml")
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    jax.tree.map(np.testing.assert_array_equal, again, scenario)
+    assert "offset = [-1.6, -1.4]  # rad/s" in scenario_to_toml(scenario)
+    assert "velocity_bounds" not in scenario_to_toml(paper(velocity_bounds=None))
+    units = {p.path: p.unit for p in ij.parameters(scenario)}
+    assert units["velocity_bounds.lower.offset"] == "rad/s"
+    assert units["velocity_bounds.lower.phase"] == units["bounds.lower.offset"] == "rad"
+    assert ij.simulation.paths.unit_at(scenario, "velocity_bounds.upper.amplitude[0]") == "rad/s"
+
+
+def test_a_dataset_has_them(watched):
+    data = watched.to_xarray()
+    assert data.dq_lower.units == "rad/s"
+    np.testing.assert_array_equal(data.dq_upper, watched.dq_upper)
+
+
+def test_requirements_on_velocities():
+    scenario = paper(velocity_bounds=speeds((-0.6, -0.6)))
+    objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
+    result = ij.tune(scenario, ["controller.k1"], objective, duration=0.3, dt=1e-3, iterations=12, progress=False)
+    line = result.report.verdicts[0]
+    assert (line.name, line.unit, line.verdict) == ("velocity margin > 0.02 rad/s", "rad/s", "pass")
+    run = result.nominal[1]
+    assert float(np.min(run.metrics.velocity_margin)) == pytest.approx(line.value)
+    assert float(np.min(result.nominal[0].metrics.velocity_margin)) < 0.02
+    with pytest.raises(ValueError, match="velocity_bounds"):
+        ij.tune(paper(velocity_bounds=None), ["controller.k1"], objective, duration=0.3, dt=1e-3, progress=False)
+
+
+def test_figures(watched, violated):
+    figure = plotting.velocities({"wide": watched, "narrow": violated})
+    assert len(figure.axes) == 4
+    drawn = [line.get_ydata() for line in figure.axes[0].get_lines() if line.get_label() == "bounds"]
+    np.testing.assert_allclose(drawn[0][0], watched.dq_lower[0, 0])
+    box = next(line for line in plotting.velocity_portrait(watched, 1).axes[0].get_lines() if line.get_label() == "bounds")
+    np.testing.assert_allclose(box.get_ydata(), [-1.4, -1.4, 0.5, 0.5, -1.4])
+    np.testing.assert_allclose(box.get_xdata()[:2], [watched.lower[0, 1], watched.upper[0, 1]])
+    free = ij.simulate(paper(velocity_bounds=None), **SHORT)
+    assert "bounds" not in [line.get_label() for line in plotting.velocities(free).axes[0].get_lines()]
+    assert (
+        len(plotting.velocity_portrait(free).axes[0].get_lines()) == 7
+    )  # position bounds at the start and all they reach, reference, run, start
+    assert len(watched.plot().axes) == len(free.plot().axes) + 2
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"velocity_bounds": 3.0}, "a Bounds, or None"),
+        ({"velocity_bounds": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))}, "velocity_bounds of joint 0"),
+        ({"initial": ij.Initial([0.8, 0.8], [0.0, 0.6])}, r"initial\.dq\[1\]"),
+        ({"velocity_bounds": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))}, "2 .one a joint."),
+    ],
+)
+def test_bad_ones_are_refused(parts, words):
+    with pytest.raises(ValueError, match=words):
+        ij.simulate(paper(**parts), **SHORT)
+
+
+def test_the_metric_asks_for_bounds():
+    with pytest.raises(ValueError, match="velocity_bounds"):
+        ij.simulate(paper(velocity_bounds=None), **SHORT, metrics=(metrics.VelocityMargin(),))
+
+
+def test_limits_of_a_robot():
+    arm = ij.presets.arms.arm("ur5")
+    found = bounds.from_speed_limits(arm, share=0.5)
+    np.testing.assert_allclose(found.upper.value, 0.5 * np.array([3.15, 3.15, 3.15, 3.2, 3.2, 3.2]))
+    np.testing.assert_allclose(found.lower.value, -np.asarray(found.upper.value))
+    with pytest.raises(ValueError, match="speed limits"):
+        bounds.from_speed_limits(ij.presets.customary_two_link())
+    with pytest.raises(ValueError, match="unlimited"):
+        bounds.from_speed_limits(ij.robots.Arm(mass=[1.0], centre=[[0, 0, 0]], inertia=[[1, 1, 1, 0, 0, 0]], position=[[0, 0, 0]]))
