@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,11 +23,17 @@ class Arm3D:
         return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(links, axis=0)])
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Holder:
-    """In place of a Scenario: a drawing asks it for the plant only."""
+    """In place of a Scenario, without leaves: a drawing asks it for no more than this."""
 
     plant: object
+    sampling: None = None
+    sensor: object = ij.sensors.Ideal()
+    actuator: object = ij.actuators.Ideal()
+
+
+jax.tree_util.register_pytree_node(Holder, lambda holder: ((), holder), lambda holder, _: holder)
 
 
 def chain(n):

@@ -160,20 +160,20 @@ def test_a_failed_run_is_named_cut_and_does_not_flatten_the_others():
 
 def test_a_run_without_one_finite_number_still_gives_a_figure():
     run = made_up(chain(2), status=int(ij.Status.NOT_FINITE))
-    run = jax.tree.map(lambda x: x * jnp.nan if x.ndim == 2 else x, dataclasses.replace(run, scenario=()))
+    run = jax.tree.map(lambda x: x * jnp.nan if x.ndim == 2 else x, run)
     drawn(run.plot())
     drawn(plotting.joint(run))
 
 
 def test_a_run_of_one_sample_is_drawn():
-    run = jax.tree.map(lambda x: x[:1] if jnp.ndim(x) else x, dataclasses.replace(made_up(chain(2)), scenario=()))
+    run = jax.tree.map(lambda x: x[:1] if jnp.ndim(x) else x, made_up(chain(2)))
     plotting.paper_figures(run)
     drawn(run.plot())
 
 
 def test_bad_arguments_are_named(runs, tmp_path):
     run = made_up(chain(2))
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), dataclasses.replace(run, scenario=()))
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), run)
     with pytest.raises(ValueError, match=r"batch of 2 runs.*run\[0\]"):
         plotting.overview(batch)
     with pytest.raises(ValueError, match=r"runs\['b'\].*run\[0\]"):

@@ -134,7 +134,7 @@ def test_a_delay_may_be_of_any_length(delay):
 def test_an_encoder_and_a_lag_are_those_of_an_independent_program():
     actuator = ij.actuators.Motor(bandwidth=600.0)
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=1.3e-3), sensor=ENCODER, actuator=actuator)
-    run = agree(scenario, WithEncoder, dt=2.5e-4)
+    run = agree(scenario, WithEncoder, dt=1.25e-4, tau=2e-6)
     assert run.metrics.relative_numerical_error < 1e-5
     assert np.any(run.measured.q != run.q)
 

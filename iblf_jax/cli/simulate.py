@@ -32,6 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     add_scenario_arguments(parser)
     add_run_arguments(parser)
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of a sensor's noise (default: 0)")
     parser.add_argument("--out", metavar="DIR", help="write rollout.nc, metrics.json, overview.png and scenario.toml into this folder")
     parser.set_defaults(run=run)
 
@@ -44,17 +45,17 @@ def run(args: argparse.Namespace) -> int:
     file = scenario_of(args)
     options = run_options(args, file)
     folder = output_folder(args.out) if args.out else None
-    result = simulate(file.scenario, **options)
+    result = simulate(file.scenario, **options, seed=args.seed)
     failed = bool(int(result.status) & int(FAILED))
     print(f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}")
     print(f"status: {describe(int(result.status))}")
     print("\n" + metrics_table({"": result}))
     if folder is not None:
-        _write(folder, args.scenario, result, options)
+        _write(folder, args.scenario, result, options, args.seed)
     return 1 if failed else 0
 
 
-def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any]) -> None:
+def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any], seed: int) -> None:
     import iblf_jax
     from iblf_jax import plotting
     from iblf_jax.files.rollouts import save_rollouts
@@ -62,6 +63,7 @@ def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any]) 
 
     save_scenario(result.scenario, folder / "scenario.toml", run=options)
     save_rollouts(result, folder / "rollout.nc")
-    write_json(folder / "metrics.json", {"source": source, "run": options, "iblf_jax_version": iblf_jax.__version__, **verdict(result)})
+    head = {"source": source, "run": options, "seed": seed, "iblf_jax_version": iblf_jax.__version__}
+    write_json(folder / "metrics.json", head | verdict(result))
     plotting.save({"overview": plotting.overview(result)}, folder, formats=("png",))
     print(f"\nwritten to {folder}: rollout.nc, metrics.json, overview.png, scenario.toml")

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from iblf_jax.actuators import Ideal as IdealActuator
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.robots import joint_names
+from iblf_jax.sensors import Ideal as IdealSensor
 from iblf_jax.simulation.results import Rollout
 
 POINTS = 2400
@@ -26,8 +28,13 @@ DERIVED = {
     "wall_lower": lambda run: -np.ones(run.q.shape),
     "wall_upper": lambda run: np.ones(run.q.shape),
     "estimate_error": lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate),
+    "measured_q": lambda run: run.measured.q,
+    "measured_dq": lambda run: run.measured.dq,
 }
-"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, and f - f_hat."""
+"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f - f_hat, and what a sensor told."""
+
+HELD = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
+"""Signals of a sampled law that stay as they are from sample to sample."""
 
 GIVEN = {"t", "q_d", "dq_d", "lower", "upper", "error_lower", "error_upper", "wall_lower", "wall_upper", "dq_lower", "dq_upper"}
 """Signals that do not depend on the state, and are drawn to the end whatever became of it."""
@@ -63,6 +70,16 @@ class Curve:
         """A signal at other times t [s], linearly between its samples and constant after its end, (len(t), n)."""
         values = self[field]
         return np.stack([np.interp(t, self.t[: len(values)], column) for column in values.T], axis=-1)
+
+    def is_held(self, field: str) -> bool:
+        """Whether a signal goes in steps: the law is sampled, and no drive makes something else of its torque."""
+        scenario = self.run.scenario
+        return scenario.sampling is not None and field in HELD and (field != "tau" or isinstance(scenario.actuator, IdealActuator))
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the law was told something else than what was."""
+        return not isinstance(self.run.scenario.sensor, IdealSensor)
 
     @property
     def has_speed_limits(self) -> bool:

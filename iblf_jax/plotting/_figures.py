@@ -7,7 +7,6 @@ inset of its own that covers no curve.  Source: Zhang & Yan 2024, figures 1 to 6
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,8 +80,6 @@ def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figu
     """A figure with one row a joint."""
     curves = curves_of(runs)
     n, quantity = curves[0].run.n, QUANTITIES[field]
-    if field == "dq" and not any(curve.has_speed_limits for curve in curves):
-        quantity = replace(quantity, frame=None)
     rows = [PanelRow(quantity, joint, f"{curves[0].called(joint)}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
     return _rows_with_zoom(title, curves, rows, zoom, 1.75 if n <= 3 else 1.25)
 

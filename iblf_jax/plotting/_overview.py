@@ -25,8 +25,8 @@ COLUMNS = 4
 def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     """One run at a glance, its status in the title: what `run.plot()` shows.
 
-    Position of every joint in its tube, and velocity where it has bounds; then, with the joints together, e1, xi and the phase portrait of
-    the first two joints; torque, uncertain term with estimate, and Lyapunov function.
+    Position of every joint in its tube, and velocity where it has bounds or is measured; then, with the joints together, e1, xi and the
+    phase portrait of the first two joints; torque, uncertain term with estimate, and Lyapunov function.
 
     Args:
       run: one run of n joints.
@@ -43,7 +43,7 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     checks.word("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
-    tubes = ("q", "dq") if curve.has_speed_limits else ("q",)
+    tubes = ("q", "dq") if curve.has_speed_limits or curve.is_measured else ("q",)
     figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows * len(tubes) + 4.4)
     parts = figure.add_gridspec(1 + len(tubes), 1, height_ratios=(*(2.0 * rows for _ in tubes), 4.4))
     whole = (0.0, float(np.asarray(run.t)[-1]) or 1e-3)

@@ -47,6 +47,8 @@ class Plotted:
     guide_words: str = ""
     truth: str | None = None
     """The signal that it estimates, drawn broad and pale under it; once, where the runs' cannot be told apart."""
+    measured: str = ""
+    """What a sensor told of it."""
     transient: str = ""
     """The signal whose transient a zoom should show, if not its own."""
 
@@ -59,11 +61,23 @@ class Plotted:
 QUANTITIES = {
     quantity.field: quantity
     for quantity in (
-        Plotted("q", "position", "$q$", "rad", ("lower", "upper"), "bounds", "q_d", "reference $q_d$", transient="e1"),
+        Plotted(
+            "q", "position", "$q$", "rad", ("lower", "upper"), "bounds", "q_d", "reference $q_d$", measured="measured_q", transient="e1"
+        ),
         Plotted("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
         Plotted("xi", "relative error", r"$\xi$", "1", ("wall_lower", "wall_upper"), r"walls $\xi = \pm 1$"),
         Plotted("e2", "error", "$e_2$", "rad/s"),
-        Plotted("dq", "velocity", r"$\dot q$", "rad/s", ("dq_lower", "dq_upper"), "bounds", "dq_d", r"reference $\dot q_d$"),
+        Plotted(
+            "dq",
+            "velocity",
+            r"$\dot q$",
+            "rad/s",
+            ("dq_lower", "dq_upper"),
+            "bounds",
+            "dq_d",
+            r"reference $\dot q_d$",
+            measured="measured_dq",
+        ),
         Plotted("tau", "torque", r"$\tau$", "N m"),
         Plotted("disturbance_estimate", "uncertain term", "$f$", "N m", truth="disturbance", transient="estimate_error"),
     )
@@ -78,13 +92,14 @@ def draw(axes: Axes, curve: Curve, field: str, joint: int, window: Window, **opt
     near = (t >= window[0]) & (t <= window[1])
     shown_t, shown_y = thinned(t[near], y[near])
     marker = {"marker": "."} if len(shown_t) == 1 else {}
-    axes.plot(shown_t, shown_y, **(marker | options))
+    steps = {"drawstyle": "steps-post"} if curve.is_held(field) else {}
+    axes.plot(shown_t, shown_y, **(marker | steps | options))
     return y[near]
 
 
 def draw_frame(axes: Axes, curve: Curve, quantity: Plotted, joint: int, window: Window, **options: Any) -> list[np.ndarray]:
     """Draws the bounds of a quantity as grey lines with a pale tube between them; returns them."""
-    if quantity.frame is None:
+    if quantity.frame is None or np.isnan(curve[quantity.frame[0]]).all():
         return []
     look = {"color": _style.bound(), "linewidth": 1.0, "zorder": 1.8, "label": quantity.frame_words} | options
     lower, upper = (curve[field][:, joint] for field in quantity.frame)
@@ -209,6 +224,17 @@ def _draw_truth(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: i
     return drawn
 
 
+def _draw_measured(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window) -> list[tuple[Curve, np.ndarray]]:
+    """Draws what the sensors told, pale under what was; returns it."""
+    drawn = []
+    for i, curve in enumerate(curves):
+        if quantity.measured and curve.is_measured:
+            name = " ".join(filter(None, [curve.name, "measured"]))
+            look: dict[str, Any] = {"color": _style.shade(0.45, series(i)["color"]), "linewidth": 0.8, "zorder": 1.9, "label": name}
+            drawn.append((curve, draw(axes, curve, quantity.measured, joint, window, **look)))
+    return drawn
+
+
 def show(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window, *, tight: bool = False) -> None:
     """Draws a quantity of one joint for every run.
 
@@ -221,7 +247,7 @@ def show(axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, win
       tight: let the limits follow runs and reference alone, not the bounds (for a zoom).
     """
     bounds, guides = _draw_surroundings(axes, curves, quantity, joint, window)
-    drawn = _draw_truth(axes, curves, quantity, joint, window)
+    drawn = _draw_truth(axes, curves, quantity, joint, window) + _draw_measured(axes, curves, quantity, joint, window)
     for i, curve in enumerate(curves):
         name = " ".join(filter(None, [curve.name, r"$\hat f$" if quantity.truth else ""])) or quantity.symbol
         drawn.append(
