@@ -108,6 +108,19 @@ def test_simulate_a_file(command, paper, tmp_path):
     np.testing.assert_array_equal(ij.load_rollouts(tmp_path / "out" / "rollout.nc")["run"].q, run.q)
 
 
+def test_a_seed_fixes_the_noise(command, paper, tmp_path):
+    noisy = ij.with_parts(
+        paper, sampling=ij.Sampling(2e-3), sensor=ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Tracking(bandwidth=100.0))
+    )
+    ij.save_scenario(noisy, tmp_path / "noisy.toml", run={"duration": 0.02})
+    for folder, seed in (("a", "3"), ("b", "3"), ("c", "4")):
+        command("simulate", "noisy.toml", "--seed", seed, "--out", folder)
+    a, b, c = (strict_json(tmp_path / folder / "metrics.json") for folder in "abc")
+    assert a == b
+    assert a["seed"] == 3
+    assert a["metrics"]["rmse"] != c["metrics"]["rmse"]
+
+
 def test_simulate_a_preset(command):
     code, out, _ = command("simulate", "zhang_yan_2024", *SHORT, "--arg", "law=log", "--arg", "reading=corrected", "--record-every", "7")
     assert code == 0

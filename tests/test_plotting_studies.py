@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import study_cases as cases
 
-from iblf_jax import plotting
+from iblf_jax import Status, plotting
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,14 @@ def test_scatter_shows_the_correlation(study):
     figure = drawn(plotting.scatter(study))
     rho = float(study.correlations(["margin"]).correlation.sel(parameter="plant.mass[1]", metric="margin"))
     assert figure.axes[0].get_title() == f"rank correlation {rho:.2f}"
+
+
+def test_heat_maps_stand_side_by_side(table):
+    figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
+    shares, margins = (axes.images[0].get_array() for axes in figure.axes if axes.images and not axes.get_label())
+    violated = (table.status & int(Status.BOUND_VIOLATED)) != 0
+    np.testing.assert_array_equal(shares, violated.mean("run").T)
+    np.testing.assert_array_equal(margins, table.margin.min("joint").median("run").T)
 
 
 def test_heat_map_shows_the_medians(table):

@@ -305,3 +305,15 @@ def test_tuning_hears_the_noise():
     high = np.exp(np.max(box.high))
     assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 0.9 * high})), 1e-3, np.linspace(0, 6, 7)) < 1.0
     assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 1.1 * high})), 1e-3, np.linspace(0, 6, 7)) >= 1.0
+
+
+def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3), sensor=ENCODER)
+    run, driven = (ij.simulate(ij.with_parts(scenario, actuator=a), duration=0.1, dt=1e-3) for a in (scenario.actuator, MOTOR))
+    (lines, others) = ({line.get_label(): line for line in ij.plotting.torques(r).axes[0].get_lines()} for r in (run, driven))
+    assert lines[r"$\tau$"].get_drawstyle() == "steps-post"
+    assert others[r"$\tau$"].get_drawstyle() == "default"
+    lines = {line.get_label(): line for line in ij.plotting.velocities(run).axes[0].get_lines()}
+    np.testing.assert_array_equal(lines["measured"].get_ydata(), run.measured.dq[:, 0])
+    assert lines["measured"].get_drawstyle() == "steps-post"
+    assert any(line.get_label() == "measured" for axes in run.plot().axes for line in axes.get_lines())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
@@ -10,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
-from iblf_jax.core.status import FAILED
+from iblf_jax.core.status import FAILED, Status
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import plain
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
@@ -18,8 +19,11 @@ from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 if TYPE_CHECKING:
     import xarray
 
-FAILED_SHARE = "failed"
-"""What may be drawn beside the metrics: the share of the runs that failed."""
+SHARES = {
+    "failed": (int(FAILED), "share of failed runs [1]"),
+    "violated": (int(Status.BOUND_VIOLATED), "share of runs that left a bound [1]"),
+}
+"""What may be drawn beside the metrics: the share of the runs that raised one of these flags."""
 COLOURS = "viridis"
 
 
@@ -27,11 +31,12 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
     """One number a point, and what it is: the median over runs of the worst joint's metric, or the share of failed runs."""
     if "config" not in getattr(data, "attrs", {}):
         raise checks.fail("data", type(data).__name__, "the Dataset of a sweep", "ij.sweep and ij.load_sweep return one.")
-    if metric == FAILED_SHARE:
-        failed = ((data.status & int(FAILED)) != 0).astype(float).where(data.status >= 0)
-        return (failed.mean("run") if "run" in failed.dims else failed), "share of failed runs [1]"
+    if metric in SHARES:
+        flags, words = SHARES[metric]
+        raised = ((data.status & flags) != 0).astype(float).where(data.status >= 0)
+        return (raised.mean("run") if "run" in raised.dims else raised), words
     if metric not in data.data_vars:
-        raise checks.fail("metric", metric, "one of " + ", ".join([FAILED_SHARE, *map(str, data.data_vars)]))
+        raise checks.fail("metric", metric, "one of " + ", ".join([*SHARES, *map(str, data.data_vars)]))
     values, words = data[metric], metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
     if "joint" in values.dims:
@@ -48,12 +53,15 @@ def _axis_label(data: xarray.Dataset, name: str) -> str:
 
 
 @_style.styled()
-def heat_map(data: xarray.Dataset, metric: str = FAILED_SHARE, *, x: str | None = None, y: str | None = None, **at: Any) -> Figure:
-    """A number at every point over two dimensions of a grid.
+def heat_map(
+    data: xarray.Dataset, metric: str | Sequence[str] = "failed", *, x: str | None = None, y: str | None = None, **at: Any
+) -> Figure:
+    """A number at every point over two dimensions of a grid; several numbers side by side.
 
     Args:
       data: the Dataset of a sweep.
-      metric: name of a metric (the median over the runs, of the worst joint), or "failed" for the share of runs that failed.
+      metric: name of a metric (the median over the runs, of the worst joint), "failed" for the share of runs that failed, or "violated" for
+        that of those that left a bound; or several of them.
       x, y: dimensions of the axes; the first two if not given.
       at: for further dimensions, which value to show (`sel`, nearest), given as a dict: `heat_map(data, **{"observer.kf": 20})`.
 
@@ -63,6 +71,17 @@ def heat_map(data: xarray.Dataset, metric: str = FAILED_SHARE, *, x: str | None 
     Raises:
       ValueError: no Dataset of a sweep, an unknown metric or dimension, or a dimension that is neither shown nor fixed.
     """
+    metrics = [metric] if isinstance(metric, str) else list(metric)
+    if not metrics:
+        raise checks.fail("metric", metric, "at least one")
+    figure = _style.new_figure(_style.WIDTH if len(metrics) == 1 else 5.2 * len(metrics), 4.2)
+    for axes, name in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):
+        _heat(figure, axes, data, name, x, y, at)
+    return figure
+
+
+def _heat(figure: Figure, axes: Any, data: xarray.Dataset, metric: str, x: str | None, y: str | None, at: dict[str, Any]) -> None:
+    """One panel of a heat map."""
     values, words = summary(data, metric)
     for name, value in at.items():
         if name not in values.dims:
@@ -74,8 +93,6 @@ def heat_map(data: xarray.Dataset, metric: str = FAILED_SHARE, *, x: str | None 
     if len(dims) != 2 or {x, y} != set(dims):
         raise checks.fail("x, y", (x, y), f"two dimensions of {dims}", "Fix the others, heat_map(data, ..., **{'observer.kf': 20.0}).")
     picture = values.transpose(y, x).values
-    figure = _style.new_figure(_style.WIDTH, 4.2)
-    axes = figure.subplots()
     image = axes.imshow(picture, origin="lower", aspect="auto", cmap=_style.colour_map(COLOURS))
     axes.grid(visible=False)
     for axis, name in ((axes.xaxis, x), (axes.yaxis, y)):
@@ -85,7 +102,6 @@ def heat_map(data: xarray.Dataset, metric: str = FAILED_SHARE, *, x: str | None 
     figure.colorbar(image, ax=axes, label=words)
     if picture.size <= 150:
         _write_numbers(axes, picture, image)
-    return figure
 
 
 def _ticks(axis: Any, values: np.ndarray) -> None:
