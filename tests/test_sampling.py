@@ -317,3 +317,14 @@ def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():
     np.testing.assert_array_equal(lines["measured"].get_ydata(), run.measured.dq[:, 0])
     assert lines["measured"].get_drawstyle() == "steps-post"
     assert any(line.get_label() == "measured" for axes in run.plot().axes for line in axes.get_lines())
+
+
+def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
+    """Where the loop grows from sample to sample its gradient points nowhere: the search begins at gains with which it does not."""
+    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(period=4e-3))
+    assert ij.simulate(scenario, duration=0.1, dt=1e-3, metrics=()).metrics.sampling_radius > 1
+    goal = ij.objectives.tracking() + 0.3 * ij.objectives.effort()
+    best = ij.tune(scenario, ["controller.K2", "observer.kf"], goal, duration=0.2, dt=1e-3, iterations=6, progress=False)
+    run = ij.simulate(best.scenario, duration=0.1, dt=1e-3, metrics=())
+    assert run.metrics.sampling_radius < 1
+    assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)

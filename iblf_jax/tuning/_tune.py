@@ -29,7 +29,7 @@ from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
 from iblf_jax.tuning.objectives import Objective, check_velocity_bounds, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, values_at
+from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, sampled_too_slowly, values_at
 from iblf_jax.tuning.problem import (
     NO_LEVEL,
     NUMBERS_A_RUN,
@@ -213,6 +213,10 @@ class Problem:
             f"Take dt={self.step():g}, not {float(self.shared.dt):g} s (ij.recommended_dt), lower gains, or narrower perturbations.",
         )
 
+    def too_slow(self, z: np.ndarray) -> bool:
+        """Whether the law is sampled too slowly for these gains, (p,)."""
+        return sampled_too_slowly(with_parameters(self.shared.cases.scenario, values_at(self.formulation.blocks, jnp.asarray(z))))
+
     @property
     def limits(self) -> Pieces:
         """The requirements, as `newton` sees them."""
@@ -299,18 +303,19 @@ def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
 
 
 def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarray | None:
-    """Better starting points where the first one leaves its bounds or cannot be integrated, else None.
+    """Better starting points where the first one leaves its bounds, cannot be integrated or is sampled too slowly, else None.
 
-    Past the wall the motion is chaotic, and its gradient points nowhere.  So SCREENED points of the box are looked at, values
-    only, and the starts are those that break the requirements and the bounds least.
+    Past the wall the motion is chaotic, and so it is where it grows from sample to sample: its gradient points nowhere.  So SCREENED points
+    of the box are looked at, values only, and the starts are those that are stable and break the requirements and the bounds least.
 
     Raises:
       ValueError: as `look_around`.
     """
-    if found.value.valid[0] and found.value.margin[0] > 0:
+    if found.value.valid[0] and found.value.margin[0] > 0 and not problem.too_slow(z[0]):
         return None
     points, seen, broken = look_around(problem, seed, z)
-    order = np.lexsort((seen.objective, broken, ~seen.valid))
+    slow = np.array([problem.too_slow(point) for point in points])
+    order = np.lexsort((seen.objective, broken, slow, ~seen.valid))
     return points[order[: len(z)]]
 
 

@@ -32,6 +32,8 @@ CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the paper's law."""
 SHARE = 0.7
 """Part of the integrator's stability range that a gain may use up by default."""
+TIMES = np.linspace(0.0, 6.0, 7)
+"""Along the reference, where is looked for how fast a loop is [s]."""
 MOST = 1e2
 """How far above its start a gain may go by default, as a factor, where the step sets no limit."""
 EDGE = 1e-3
@@ -162,11 +164,10 @@ def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: floa
         return np.full(value.shape, np.inf)
 
     def fits(factor: float) -> bool:
-        changed, times = with_parameters(scenario, {item.path: jnp.asarray(value * factor)}), np.linspace(0.0, 6.0, 7)
+        changed = with_parameters(scenario, {item.path: jnp.asarray(value * factor)})
         if changed.sampling is not None:
-            return radius_at(changed, float(changed.sampling.period), times) < 1.0
-        mode = fastest_along(changed, times)
-        return dt * mode <= SHARE * tableau(method).stability
+            return not sampled_too_slowly(changed)
+        return dt * fastest_along(changed, TIMES) <= SHARE * tableau(method).stability
 
     if not fits(1.0):
         return 1.01 * value
@@ -177,6 +178,12 @@ def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: floa
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fits(float(np.exp(middle))) else (low, middle)
     return np.exp(low) * value
+
+
+def sampled_too_slowly(scenario: Scenario) -> bool:
+    """Whether the law is sampled and its loop grows from one period to the next."""
+    sampling = scenario.sampling
+    return sampling is not None and not radius_at(scenario, float(sampling.period), TIMES) < 1.0
 
 
 def _coordinate(x: np.ndarray, log: bool) -> np.ndarray:
