@@ -197,3 +197,17 @@ def test_solve(rng, size):
     matrix, rhs = rng.normal(size=(size, size)), rng.normal(size=(size, 3))
     matrix[0, 0] = 0.0 if size > 1 else 2.0  # so that it has to pivot
     np.testing.assert_allclose(linalg.solve(jnp.asarray(matrix), jnp.asarray(rhs)), np.linalg.solve(matrix, rhs), rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["rk4", "heun"])
+@pytest.mark.parametrize("actuator", [ij.actuators.Ideal(), ij.actuators.Motor(bandwidth=600.0)], ids=["ideal", "lag"])
+def test_a_sampled_run_says_how_accurate_it_is(method, actuator):
+    """The torque jumps from step to step: the stages of each step tell its error, which is never told too small."""
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 5.0})
+    scenario = ij.with_parts(scenario, sampling=ij.Sampling(period=4e-3, delay=1.3e-3), actuator=actuator)
+    for dt in (2e-3, 1e-3):
+        run, fine = (ij.simulate(scenario, duration=0.5, dt=step, method=method, record_every=round(4e-3 / step)) for step in (dt, dt / 8))
+        error = np.max(np.abs(run.q - fine.q) / (run.upper - run.lower))
+        told = float(run.metrics.relative_numerical_error)
+        assert told > error
+        assert told < 200 * error or told < 1e-6

@@ -328,3 +328,25 @@ def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
     run = ij.simulate(best.scenario, duration=0.1, dt=1e-3, metrics=())
     assert run.metrics.sampling_radius < 1
     assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)
+
+
+@pytest.mark.parametrize(
+    "observer",
+    [ij.observers.Momentum(kf=[50.0, 300.0]), ij.observers.ExtendedState(bandwidth=100.0), ij.observers.ExtendedState(l1=100.0, l2=6000.0)],
+    ids=["momentum", "double pole", "complex poles"],
+)
+def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias(observer):
+    T = 2e-3
+    stepped = observer.at_period(jnp.asarray(T))
+    if hasattr(observer, "kf"):
+        assert np.allclose(1 - stepped.kf * T, np.exp(-observer.kf * T), rtol=1e-13)
+    else:
+        (l1, l2), (g1, g2) = observer._gains, stepped._gains
+        poles = np.exp(T * np.roots([1.0, float(l1), float(l2)]))
+        assert np.allclose(np.sort_complex(np.roots([1.0, float(T * g1) - 2.0, 1.0 - float(T * g1 - T * T * g2)])), np.sort_complex(poles))
+    ways = ("exact", "poles", "euler")
+    scenario = ij.with_parts(SLOW, observer=observer)
+    runs = [ij.simulate(ij.with_parts(scenario, sampling=ij.Sampling(T, observer=way)), duration=0.3, dt=1e-3) for way in ways]
+    exact, poles, euler = (float(np.max(run.metrics.estimate_rmse)) for run in runs)
+    assert poles < 0.5 * exact, "f_hat lags by the robot's motion over a period otherwise"
+    assert poles < 1.2 * euler

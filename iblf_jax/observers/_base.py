@@ -20,8 +20,9 @@ State = Any
 class Observer(Protocol):
     """What the package asks of an observer.
 
-    It may also have `advance(t, q, dq, tau, model, state, period)`, its state a period [s] later if what it measures and the torque stay as
-    they are, for sampled loops; they take a step of Euler where there is none.
+    Two methods more are for sampled loops, which take a step of Euler where there is none: `advance(t, q, dq, tau, model, state, period)`,
+    its state a period [s] later if what it measures and the torque stay as they are; and `at_period(period)`, the same observer with gains
+    for which a step of Euler has the poles that it has over a period.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:

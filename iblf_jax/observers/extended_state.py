@@ -86,18 +86,29 @@ class ExtendedState:
         """
         l1, l2 = self._gains
         rate = self.derivative(t, q, dq, tau, model, state)
-        w = 0.5 * l1
-        fade = jnp.exp(-w * period)
-        if self.bandwidth is None:
-            square = (w * w - l2) * period**2
-            C, S = _even_cosh(square), period * _even_sinh(square)
-        else:
-            C, S = jnp.ones_like(w), period * jnp.ones_like(w)
+        w, fade, C, S = self._over(period)
         # (exp(A T) - 1) z', and then A^-1 of it: A = [[-l1, 1], [-l2, 0]].
         p = fade * (C * rate.p_hat + S * (rate.f_hat - w * rate.p_hat)) - rate.p_hat
         f = fade * (C * rate.f_hat + S * (w * rate.f_hat - l2 * rate.p_hat)) - rate.f_hat
         moved_p = -f / l2
         return ExtendedStateValues(state.p_hat + moved_p, state.f_hat + p + l1 * moved_p)
+
+    def at_period(self, period: jax.Array) -> ExtendedState:
+        """l1 T = 2 - (z1 + z2) and l2 T^2 = (1 - z1)(1 - z2), with z1, z2 = exp(-w T) (C -+ d S) the poles over T, the period."""
+        _, fade, C, _ = self._over(period)
+        both, product = 2.0 * fade * C, fade**2
+        return ExtendedState(l1=(2.0 - both) / period, l2=(1.0 - both + product) / period**2)
+
+    def _over(self, period: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """w, exp(-w T), C and S of `advance`, (n,) each."""
+        l1, l2 = self._gains
+        w = 0.5 * l1
+        if self.bandwidth is None:
+            square = (w * w - l2) * period**2
+            C, S = _even_cosh(square), period * _even_sinh(square)
+        else:
+            C, S = jnp.ones_like(w), period * jnp.ones_like(w)
+        return w, jnp.exp(-w * period), C, S
 
 
 def _even_cosh(square: jax.Array) -> jax.Array:

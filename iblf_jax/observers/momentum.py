@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -55,3 +58,7 @@ class Momentum:
     ) -> jax.Array:
         """Eta a period later, (n,) [N m]: exact, as (3.11) is linear in eta."""
         return held_eta(self, t, q, dq, tau, model, state, period)
+
+    def at_period(self, period: jax.Array) -> Momentum:
+        """Kf = (1 - exp(-kf period)) / period: then 1 - kf period is what is left of an error after a period."""
+        return dataclasses.replace(self, kf=-jnp.expm1(-self.kf * period) / period)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,6 +60,10 @@ class Printed:
     ) -> jax.Array:
         """Eta a period later, (n,) [N m]: exact, as (3.11) is linear in eta."""
         return held_eta(self, t, q, dq, tau, model, state, period)
+
+    def at_period(self, period: jax.Array) -> Printed:
+        """Kf = (1 - exp(-kf period)) / period: then 1 - kf period is what is left of an error after a period."""
+        return dataclasses.replace(self, kf=-jnp.expm1(-self.kf * period) / period)
 
 
 def kf_advice(kf: jax.Array) -> list[str]:

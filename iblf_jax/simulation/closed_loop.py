@@ -67,7 +67,7 @@ class LoopState(NamedTuple):
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; torques that are under way then are those that hold the model still."""
     q, dq, n = scenario.initial.q, scenario.initial.dq, scenario.n
-    state = LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), scenario.observer.init(q, dq, scenario.model))
+    state = LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), _stepping(scenario).init(q, dq, scenario.model))
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
     still = scenario.model.gravity(q)
@@ -103,7 +103,7 @@ def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Arra
     sampling: Any = scenario.sampling
     held = state.held
     measured, sensor = scenario.sensor.measure(state.q, state.dq, normal, sampling.period, held.sensor)
-    q, dq, observer = measured.q, measured.dq, scenario.observer
+    q, dq, observer = measured.q, measured.dq, _stepping(scenario)
     f_hat = observer.estimate(t, q, dq, scenario.model, state.observer)
     command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
     after = _advanced(sampling, observer, (t, q, dq, command.tau, scenario.model, state.observer))
@@ -111,6 +111,14 @@ def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Arra
     said = Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated)
     controller = jax.tree.map(lambda x, dx: x + sampling.period * dx, state.controller, rate)
     return state._replace(controller=controller, observer=after, held=Held(commands, sensor, measured, said))
+
+
+def _stepping(scenario: Scenario) -> Any:
+    """The observer as it runs: in a sampled loop, the one whose step of Euler has the poles, where that is asked for."""
+    sampling, observer = scenario.sampling, scenario.observer
+    if sampling is not None and sampling.observer == "poles" and hasattr(observer, "at_period"):
+        return observer.at_period(sampling.period)
+    return observer
 
 
 def _advanced(sampling: Any, observer: Any, told: tuple) -> Any:

@@ -20,7 +20,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 if TYPE_CHECKING:
     from iblf_jax.simulation.scenario import Scenario
 
-OBSERVER_STEPS = ("exact", "euler")
+OBSERVER_STEPS = ("exact", "poles", "euler")
 NEARLY = 1e-6
 """Steps.  A delay that is so near to a whole number of steps is one."""
 WHOLE = 1e-4
@@ -41,7 +41,10 @@ class Sampling:
     Args:
       period: () [s], > 0; a whole number of steps dt.
       delay: () [s], >= 0, of any length; 0 if not given.
-      observer: how an observer goes to the next period: "exact" for a held torque, or a step of "euler"; "exact" if not given.
+      observer: how an observer goes to the next period; "exact" if not given.  "exact": (3.11) integrated over the period with what was
+        measured and commanded at its start; as the robot moves on meanwhile, f_hat is off by about kf period / 2 times the torque that
+        accelerates it.  "poles": a step of Euler with gains that forget in a period what the observer does, without that bias.  "euler":
+        one with the observer's own gains, unstable from kf period = 2 on.
       queue: how many commands may be under way at once; as many as the delay needs if not given.  A study that makes it longer needs more.
 
     Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 2 and 3.
