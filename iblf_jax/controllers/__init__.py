@@ -6,6 +6,7 @@ from iblf_jax.controllers._base import Setting as Setting
 from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping as Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque as ComputedTorque
+from iblf_jax.controllers.dynamic_surface import DynamicSurface as DynamicSurface
 from iblf_jax.controllers.full_state import FullState as FullState
 from iblf_jax.controllers.pd_gravity import PDGravity as PDGravity
 from iblf_jax.controllers.saturated import Saturated as Saturated
@@ -16,6 +17,7 @@ from iblf_jax.controllers.systems import law_by_name as law_by_name
 MEMBERS = {
     "backstepping": Backstepping,
     "full_state": FullState,
+    "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
@@ -31,6 +33,7 @@ __all__ = [
     "Command",
     "ComputedTorque",
     "Controller",
+    "DynamicSurface",
     "FullState",
     "PDGravity",
     "Saturated",
