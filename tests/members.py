@@ -87,6 +87,11 @@ ACTUATORS = {
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"),
+    "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
+    "full_state_mixed": controllers.FullState(
+        k1=2.0, K2=20.0, c=1.0, barrier=barriers.Tan(), velocity_barrier=barriers.PrescribedPerformance()
+    ),
+    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=[10.0, 12.0]),
     "pd_gravity": controllers.PDGravity(Kp=60.0, Kd=[20.0, 10.0]),

@@ -11,7 +11,7 @@ V1 goes on along its tangent, and both have finite derivatives everywhere.  A vi
 error is evaluated there too and goes on with gain k1, so that it still leads back inside.
 
 **Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them and nothing else.  A barrier may
-lack them and then claims nothing.
+lack them and then claims nothing.  `error_over_slope` is for laws that put a barrier on velocities (`controllers.FullState`).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from iblf_jax.core.pytree import Leaf
 GUARD = 1e-3
 """Default distance from the wall, in xi, at which the guard takes over."""
 
-CLAIMS = ("decay_rate", "xi_bound")
-"""Methods that a barrier may lack; then it claims nothing."""
+CLAIMS = ("decay_rate", "xi_bound", "error_over_slope")
+"""Methods that a barrier may lack; then it claims nothing, or cannot stand on velocities."""
 
 
 class Barrier(Protocol):
@@ -69,6 +69,10 @@ class Barrier(Protocol):
           V: level of the Lyapunov function, () or (n,), >= 0.
           tube: the tube at that time; for several barriers the level at which a wall is reached depends on its width.
         """
+        ...
+
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
+        """The ratio e1/s, finite and smooth at e1 = 0, (n,); None for a barrier whose slope is of a higher order there."""
         ...
 
 

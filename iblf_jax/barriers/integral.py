@@ -43,6 +43,11 @@ class Integral:
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return 2.0 * e / (k**2 - e**2)
 
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """(k^2 - e1^2)/2, (n,) [rad^2]."""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return 0.5 * (k**2 - e**2)
+
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s].                                                                          (3.5)"""
         return paper_virtual_velocity(tube, q, k1, o)

@@ -50,6 +50,11 @@ class Log:
         x = e / k
         return x ** (2 * self.p - 1) / (k * (1.0 - x ** (2 * self.p)))
 
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
+        """k^2 - e1^2 for p = 1, (n,) [rad^2]; None for p > 1, whose slope vanishes as e1^(2p - 1)."""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return k**2 - e**2 if self.p == 1 else None
+
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         return paper_virtual_velocity(tube, q, k1, o)

@@ -46,6 +46,12 @@ class Mapping:
         z, z_e = _mapped(e, tube)
         return z * z_e
 
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """((k_l + e1)(k_u - e1))^3 / ((k_l k_u)^2 (k_l k_u + e1^2)), (n,) [1]."""
+        e, _, _, _ = guarded_error(tube, q, self.guard)
+        a, b = e / tube.k_l, e / tube.k_u
+        return ((1.0 + a) * (1.0 - b)) ** 3 / (1.0 + a * b)
+
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, _, _ = guarded_error(tube, q, self.guard)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.barriers._base import GUARD, check_guard, guarded_error
+from iblf_jax.barriers._series import log_remainder
 from iblf_jax.bounds import Tube
 from iblf_jax.core.pytree import component, static
 
@@ -45,6 +46,14 @@ class PrescribedPerformance:
         """s, (n,) [1/rad]."""
         e, _, _, _ = guarded_error(tube, q, self.guard)
         return _eps(e, tube) * _eps_e(e, tube)
+
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """e1/(eps eps_e), (n,) [rad^2]: eps/e1 = 1/2 (h(-e1/k_l)/k_l + h(e1/k_u)/k_u), h(u) = -ln(1 - u)/u."""
+        e, _, _, _ = guarded_error(tube, q, self.guard)
+        a, b = -e / tube.k_l, e / tube.k_u
+        rest = log_remainder(jnp.stack([a, b]))
+        eps_over_e = 0.5 * ((1.0 + a * rest[0]) / tube.k_l + (1.0 + b * rest[1]) / tube.k_u)
+        return 1.0 / (eps_over_e * _eps_e(e, tube))
 
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""

@@ -6,6 +6,7 @@ import math
 from typing import ClassVar
 
 import jax
+import jax.numpy as jnp
 
 from iblf_jax.bounds import Tube
 from iblf_jax.core.pytree import component
@@ -29,6 +30,10 @@ class Quadratic:
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
         """s, (n,) [rad]."""
         return q - tube.q_d
+
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """1, (n,) [1]."""
+        return jnp.ones_like(q)
 
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""

@@ -89,6 +89,11 @@ class State:
         e, _, _, _ = guarded_error(tube, q, self.guard)
         return e / _parts(e, tube.k_l, tube.k_u).g
 
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """(kc^2 - x^2)/kc^2, (n,) [1]."""
+        e, _, _, _ = guarded_error(tube, q, self.guard)
+        return _parts(e, tube.k_l, tube.k_u).g
+
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, _, _ = guarded_error(tube, q, self.guard)

@@ -46,6 +46,11 @@ class Tan:
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return e / _cos_th(e / k) ** 2
 
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """cos(th)^2, (n,) [1]."""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return _cos_th(e / k) ** 2
+
     def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, k, dk = guarded_error(tube, q, self.guard)

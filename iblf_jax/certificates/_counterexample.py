@@ -16,7 +16,7 @@ counterexample: such points are passed over.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ import numpy as np
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.eigenvalues import maximise
 from iblf_jax.certificates.proof_terms import terms_at
+from iblf_jax.controllers import Backstepping
 from iblf_jax.core import checks
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
@@ -51,7 +52,7 @@ def relative_growth(scenario: Scenario) -> jax.Array:
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
     """The growth at the start, and whether the guard or a torque limit is at work there."""
     seen = terms_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
-    constants = claims.claim(scenario)
+    constants: Any = claims.claim(scenario)
     M0 = scenario.model.mass_matrix(scenario.initial.q)
     V1 = seen.V - 0.5 * (seen.e2 @ (M0 @ seen.e2) + seen.f_tilde @ seen.f_tilde)
     by_e2 = seen.e2 @ ((constants.K2 - claims.LOWEST_K2) * seen.e2)
@@ -78,6 +79,8 @@ def counterexample(scenario: Scenario, perturbations: Mapping[str, Perturbation]
     """
     scenario = canonical(scenario)
     reason = claims.why_no_claim(scenario)
+    if not reason and not isinstance(claims.law_of(scenario), Backstepping):
+        reason = f"Q is Theorem 2's; {type(claims.law_of(scenario)).__name__} has a claim of its own"
     if reason:
         raise checks.fail("scenario", type(scenario.controller).__name__, "a scenario with a claim", reason + ".")
     starts, seed = checks.positive_integer("starts", starts), checks.positive_integer("seed", seed, least=0, most=2**32 - 1)

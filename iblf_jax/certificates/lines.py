@@ -18,6 +18,7 @@ import numpy as np
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
 from iblf_jax.certificates.trajectory import Trajectory, Whole
+from iblf_jax.controllers import FullState
 from iblf_jax.core.status import Status
 from iblf_jax.engine.plan import CERTIFY_STRETCH
 from iblf_jax.simulation.scenario import Scenario
@@ -36,7 +37,7 @@ Description = dict[str, Any]
 NO_BOUND = "the barrier states no bound on xi from V1"
 
 
-ASSUMED = ("f bounded", "f' bounded", "reference inside", "start inside")
+ASSUMED = ("f bounded", "f' bounded", "reference inside", "start inside", "alpha inside", "start speed inside")
 """Lines that come before those of the gains."""
 
 
@@ -53,7 +54,7 @@ def over_run(whole: Whole, parts: Iterable[tuple[list[Line], dict[str, float]]])
     for name, share in largest.items():
         merged[name] = dataclasses.replace(merged[name], note=f"at most {100 * share:.3g} % of that margin at one instant")
     constant = [*gains(whole), *(line for case in claims.CASES for line in rates(whole, case))]
-    first = [merged.pop(name) for name in ASSUMED]
+    first = [merged.pop(name) for name in ASSUMED if name in merged]
     return [*first, *constant, *merged.values()]
 
 
@@ -74,10 +75,17 @@ def _worst(same: list[Line]) -> Line:
 def of_stretch(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
     """The lines that are about instants, for one stretch, and the largest share that each dropped term has of its margin there."""
     lines = assumptions(trajectory)
+    if is_full(trajectory.whole):
+        lines += [*full_assumptions(trajectory), step_inequality(trajectory)]
     lines += [inequality(trajectory, case) for case in claims.CASES]
     lines += [envelope(trajectory, case) for case in claims.CASES]
     terms, shares = dropped(trajectory)
-    return [*lines, *bounds(trajectory), *terms, conclusion(trajectory)], shares
+    return [*lines, *bounds(trajectory), *terms, *conclusions(trajectory)], shares
+
+
+def is_full(whole: Whole) -> bool:
+    """Whether the law bounds velocities too, with a claim of its own."""
+    return isinstance(claims.law_of(whole.run.scenario), FullState)
 
 
 def why_not(whole: Whole, case: int) -> str:
@@ -87,7 +95,7 @@ def why_not(whole: Whole, case: int) -> str:
     if case == 1 and whole.case == 2:
         return f"case 1 is for f' = 0; here |f'| reaches {whole.F_d:.4g} N m/s, see case 2"
     if not whole.rho[case, "run"] > 0:
-        return f"the gain conditions {CONDITION[case]} are not met"
+        return f"the gain conditions {'(F.3)' if is_full(whole) else CONDITION[case]} are not met"
     if whole.left_out == whole.samples:
         return "the guard or a torque limit was at work all the time"
     return ""
@@ -129,7 +137,8 @@ def _excluded(whole: Whole) -> str:
     """What was left out of a line, and where claims start anew, in words."""
     notes = []
     if whole.left_out:
-        notes.append(f"{whole.left_out} of {whole.samples} samples are left out: the guard or a torque limit was at work")
+        why = "alpha was outside, or the guard or a torque limit at work" if is_full(whole) else "the guard or a torque limit was at work"
+        notes.append(f"{whole.left_out} of {whole.samples} samples are left out: {why}")
     if whole.jumps.size:
         notes.append(f"f jumps at t = {', '.join(f'{x:.4g}' for x in whole.jumps)} s, and the claim starts anew there")
     return "; ".join(notes)
@@ -177,6 +186,8 @@ def _as_status(whole: Whole, line: Line, flag: Status) -> Line:
 
 def gains(whole: Whole) -> list[Line]:
     """The gain conditions (3.17) and (3.25)."""
+    if is_full(whole):
+        return _full_gains(whole)
     described = (
         ("K2", "(3.17)", "lambda_min(K2 - I/2) > 0", "K2", claims.LOWEST_K2, "N m s/rad"),
         ("kf, case 1", "(3.17)", "lambda_min(kf - I/2) > 0", "kf", claims.LOWEST_KF[1], "1/s"),
@@ -195,6 +206,25 @@ def gains(whole: Whole) -> list[Line]:
     return lines
 
 
+def _full_gains(whole: Whole) -> list[Line]:
+    """What (F.3) asks of kf and c."""
+    lines = []
+    for case in claims.CASES:
+        half = "" if case == 1 else " - 1/2"
+        statement = f"lambda_min(kf){half} - 1/(4 c lambda_min(M0)^2) > 0"
+        description: Description = {"name": f"kf and c, case {case}", "equation": "(F.3)", "statement": statement, "unit": "1/s"}
+        if not isinstance(whole.claim, claims.FullClaim):
+            lines.append(Line(verdict=NOT_APPLICABLE, note=whole.no_claim, **description))
+            continue
+        margin = 0.5 * float(claims.rho_terms(whole.claim, whole.lambda_max, case, whole.lambda_min)[2])
+        spare = case == 2 and whole.case == 1
+        needed = np.asarray(whole.claim.kf).min() - claims.LOWEST_FULL[case]
+        note = f"lambda_min(M0) = {whole.lambda_min:.4g} kg m^2 along the run"
+        note += f": c > {0.25 / (needed * whole.lambda_min**2):.4g} would do" if margin <= 0 < needed else ""
+        lines.append(_line(description, margin, counts=not spare, note="f' = 0 on this run, so case 1 is what counts" if spare else note))
+    return lines
+
+
 def rates(whole: Whole, case: int) -> list[Line]:
     """The rate rho of one case, with lambda_max(M0) along the run and over the admissible box."""
     lines = []
@@ -202,14 +232,21 @@ def rates(whole: Whole, case: int) -> list[Line]:
         name = f"rho, case {case}" + ("" if where == "run" else ", over the box")
         description: Description = {"name": name, "equation": RHO[case], "unit": "1/s"}
         description["statement"] = f"rho = min(decay of V1, 2 (K2 - 1/2)/lambda_max(M0), 2 (kf - {claims.LOWEST_KF[case]:g})) > 0"
+        if is_full(whole):
+            description["equation"] = "(F.3)"
+            half = "" if case == 1 else " - 1/2"
+            description["statement"] = f"rho = min(decay of V1, decay of phi, 2 (kf{half} - 1/(4 c lambda_min(M0)^2))) > 0"
         reason = whole.no_claim or ("" if case == 2 or whole.case == 1 else why_not(whole, 1))
         if reason or whole.claim is None:
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
             continue
-        largest = whole.lambda_max if where == "run" else whole.over_box.lambda_max
-        terms = np.asarray(claims.rho_terms(whole.claim, jnp.asarray(largest), case))
-        least = ("the decay rate of V1", "K2 over lambda_max(M0)", "kf")[int(np.argmin(terms))]
-        note = f"lambda_max(M0) = {largest:.4g} kg m^2" + (f" ({whole.over_box.searched})" if where == "box" else "") + f"; set by {least}"
+        there: Any = whole if where == "run" else whole.over_box
+        largest, smallest = there.lambda_max, there.lambda_min
+        terms = np.asarray(claims.rho_terms(whole.claim, jnp.asarray(largest), case, jnp.asarray(smallest)))
+        second = "the decay rate of phi" if is_full(whole) else "K2 over lambda_max(M0)"
+        least = ("the decay rate of V1", second, "kf and c" if is_full(whole) else "kf")[int(np.argmin(terms))]
+        eigenvalue = f"lambda_min(M0) = {smallest:.4g} kg m^2" if is_full(whole) else f"lambda_max(M0) = {largest:.4g} kg m^2"
+        note = eigenvalue + (f" ({whole.over_box.searched})" if where == "box" else "") + f"; set by {least}"
         counts = not (case == 2 and whole.case == 1)
         lines.append(_line(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
     return lines
@@ -223,6 +260,30 @@ def inequality(trajectory: Trajectory, case: int) -> Line:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
     tolerance = trajectory.whole.eps * (trajectory.proof.terms + trajectory.whole.rho[case, "run"] * trajectory.proof.V)
     return judged(trajectory, -left_side(trajectory, case), tolerance, {**description, "note": _excluded(trajectory.whole)})
+
+
+def full_assumptions(trajectory: Trajectory) -> list[Line]:
+    """What Assumption 2 and the start are to the velocities."""
+    sample, proof = trajectory.sample, trajectory.proof
+    row, joint = np.unravel_index(np.argmin(proof.full.room), proof.full.room.shape)
+    inside: Description = {"name": "alpha inside", "equation": "(F.1)", "statement": "v_l < alpha < v_u", "unit": "rad/s"}
+    line = _line(inside, float(proof.full.room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
+    lines = [_as_status(trajectory.whole, line, Status.ALPHA_INFEASIBLE)]
+    if trajectory.t[0] == 0:
+        start = np.minimum(sample.dq[0] - sample.dq_lower[0], sample.dq_upper[0] - sample.dq[0])
+        inside = {"name": "start speed inside", "equation": "(F.1)", "statement": "v_l(0) < q'(0) < v_u(0)", "unit": "rad/s"}
+        lines.append(_line(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
+    return lines
+
+
+def step_inequality(trajectory: Trajectory) -> Line:
+    """The inequality of the two barriers, at every step: whatever kf and c are."""
+    statement = "(V1 + phi)' + decay of V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2 <= 0"
+    description: Description = {"name": "barriers", "equation": "(F.2)", "statement": statement, "unit": "1/s"}
+    whole, proof = trajectory.whole, trajectory.proof
+    if whole.no_claim or whole.no_run:
+        return Line(verdict=NOT_APPLICABLE, note=whole.no_claim or whole.no_run, **description)
+    return judged(trajectory, -proof.full.left, whole.eps * proof.terms, {**description, "note": _excluded(whole)})
 
 
 def envelope(trajectory: Trajectory, case: int) -> Line:
@@ -242,14 +303,33 @@ def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | Non
     return None if stated is None else jax.vmap(lambda t, V: stated(V, scenario.setting.tube(t)))(t, V)
 
 
+@jax.jit
+def _e2_bound(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, V: jax.Array) -> jax.Array | None:
+    """The velocity barrier's own bound on |xi2| where phi <= V, (T, n), or None if it states none."""
+    law: Any = claims.law_of(scenario)
+    stated = getattr(law.velocity_barrier, "xi_bound", None)
+    return None if stated is None else jax.vmap(lambda t, q, dq, V: stated(V, law.tubes(t, q, dq, scenario.setting)[1]))(t, q, dq, V)
+
+
 def bounds_along(trajectory: Trajectory, V: np.ndarray) -> dict[str, np.ndarray]:
     """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
     places = np.minimum(np.arange(CERTIFY_STRETCH), V.size - 1)  # one program for stretches of every size
     by_barrier = _xi_bound(trajectory.whole.run.scenario, trajectory.t[places], jnp.asarray(V[places], trajectory.t.dtype))
-    return {
+    e2: dict[str, np.ndarray] = {"e2": np.sqrt(2 * V / trajectory.whole.lambda_min)}
+    if is_full(trajectory.whole):
+        sample = trajectory.sample
+        stated = _e2_bound(
+            trajectory.whole.run.scenario,
+            trajectory.t[places],
+            sample.q[places],
+            sample.dq[places],
+            jnp.asarray(V[places], trajectory.t.dtype),
+        )
+        by_phi = np.full(sample.q.shape, np.nan) if stated is None else np.asarray(stated)[: V.size]
+        e2 = {"e2": np.linalg.norm(by_phi * trajectory.proof.full.bound, axis=1), "xi2, by phi": by_phi}
+    return e2 | {
         "xi, by V1": np.full(trajectory.sample.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier)[: V.size],
         "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], trajectory.sample.q.shape),
-        "e2": np.sqrt(2 * V / trajectory.whole.lambda_min),
         "f_tilde": np.sqrt(2 * V),
     }
 
@@ -268,12 +348,16 @@ def bounds(trajectory: Trajectory) -> list[Line]:
         {"name": "e2", "equation": BOUNDS[shown], "statement": "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "unit": "rad/s"},
         {"name": "f_tilde", "equation": BOUNDS[shown], "statement": "|f_tilde| <= sqrt(2 Vbar)", "unit": "N m"},
     ]
+    if is_full(trajectory.whole):
+        descriptions[2] = {"name": "xi2, by phi", "equation": "(F.3)", "statement": "phi <= Vbar: |xi2_i| as the velocity barrier says"}
     if case is None:
         reason = why_not(trajectory.whole, trajectory.whole.case)
         return [Line(verdict=NOT_APPLICABLE, note=reason, **description) for description in descriptions]
     upper, proof = trajectory.envelope[case], trajectory.proof
     tight, wide = bounds_along(trajectory, upper.bound), bounds_along(trajectory, upper.bound + upper.tolerance)
     sizes = {"xi, by V1": np.abs(proof.xi), "xi": np.abs(proof.xi)}
+    if is_full(trajectory.whole):
+        sizes |= {"xi2, by phi": np.abs(proof.full.xi2)}
     sizes |= {"e2": np.linalg.norm(proof.e2, axis=1), "f_tilde": np.linalg.norm(proof.f_tilde, axis=1)}
     lines = []
     for description in descriptions:
@@ -281,6 +365,9 @@ def bounds(trajectory: Trajectory) -> list[Line]:
         reason = _no_xi_bound(tight) if name.startswith("xi") and not np.all(proof.held) else ""
         if reason and (name == "xi" or np.all(np.isnan(tight["xi, by V1"]))):
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
+            continue
+        if name == "xi2, by phi" and np.all(np.isnan(tight[name])):
+            lines.append(Line(verdict=NOT_APPLICABLE, note="the velocity barrier states no bound on xi2 from phi", **description))
             continue
         note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(trajectory.whole)) if x)
         lines.append(judged(trajectory, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
@@ -302,7 +389,9 @@ def dropped(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
         ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", proof.dropped_e2),
         ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", proof.dropped_f),
     )
-    exact = ("exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else "", _exact_observer(trajectory))
+    by_law = "exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else ""
+    by_law = "exact: C0 q' is cancelled, and e2 weighed without M0" if is_full(trajectory.whole) else by_law
+    exact = (by_law, _exact_observer(trajectory))
     lines, shares = [], {}
     for (name, equation, statement, term), none_dropped in zip(described, exact, strict=True):
         description: Description = {"name": name, "equation": equation, "statement": statement, "unit": "1/s", "counts": False}
@@ -326,6 +415,22 @@ def dropped(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
 
 def _exact_observer(trajectory: Trajectory) -> str:
     return "exact: the observer has momentum form" if type(trajectory.whole.run.scenario.observer).__name__ == "Momentum" else ""
+
+
+def conclusions(trajectory: Trajectory) -> list[Line]:
+    """Every joint inside its bounds, and every velocity of a law that bounds them."""
+    first = conclusion(trajectory)
+    if not is_full(trajectory.whole):
+        return [first]
+    sample, whole = trajectory.sample, trajectory.whole
+    room = np.minimum(sample.dq - sample.dq_lower, sample.dq_upper - sample.dq)
+    at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
+    description: Description = {"name": "velocities inside", "equation": "(F.3)", "statement": "v_l < q' < v_u", "unit": "rad/s"}
+    line = _line(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
+    line = _as_status(whole, line, Status.VELOCITY_VIOLATED)
+    if applicable_case(whole) is None:
+        line = dataclasses.replace(line, verdict=NOT_APPLICABLE, note=f"no claim, only seen ({why_not(whole, whole.case)})")
+    return [first, line]
 
 
 def conclusion(trajectory: Trajectory) -> Line:

@@ -27,8 +27,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.claims import law_of
-from iblf_jax.controllers import Backstepping
+from iblf_jax.bounds import NARROWEST
+from iblf_jax.certificates.claims import decay_phi, decay_rate, law_of
+from iblf_jax.controllers import Backstepping, FullState
+from iblf_jax.core.linalg import solve_spd
 from iblf_jax.engine.execute import run_from
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
@@ -69,13 +71,28 @@ class ProofTerms(NamedTuple):
     steady: jax.Array
     """Whether f' = 0 exactly, () bool: the plant is the model at this time, and the torque that is left in f does not change."""
     held: jax.Array
-    """Whether the guard at the wall or a torque limit was at work: nothing is claimed then, () bool."""
+    """Whether the guard at the wall or a torque limit was at work, or alpha outside its bounds: nothing is claimed then, () bool."""
     terms: jax.Array
     """Sizes of the terms of V2', added up, () [1/s]: `rounding` times this is how exactly V2' is known."""
     df_terms: jax.Array
     """Sizes of the terms of f', added up, (n,) [N m/s]."""
     V_terms: jax.Array
     """Error of sqrt(2 V2) for one unit of relative error, ()."""
+    full: Any = ()
+    """Of a law that bounds velocities too, its `FullTerms`."""
+
+
+class FullTerms(NamedTuple):
+    """What the claim of `controllers.FullState` has besides."""
+
+    left: jax.Array
+    """(V1 + phi)' + decay rates times V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2, () [1/s].                                     (F.2)"""
+    xi2: jax.Array
+    """E2 relative to its bound, (n,) [1]."""
+    bound: jax.Array
+    """K of each joint's side, (n,) [rad/s]."""
+    room: jax.Array
+    """Distance of alpha to the velocities' bounds, (n,) [rad/s]."""
 
 
 def rounding(dtype) -> float:
@@ -87,7 +104,9 @@ def _probe(scenario: Scenario, t: jax.Array, state: LoopState):
     """What is differentiated along the loop's vector field."""
     slope_of_state, sample = evaluate(scenario, t, state)
     law = law_of(scenario)
-    barrier_slope = law.barrier.slope(scenario.setting.tube(t), state.q) if isinstance(law, Backstepping) else jnp.zeros_like(state.q)
+    barrier_slope = (
+        law.barrier.slope(scenario.setting.tube(t), state.q) if isinstance(law, Backstepping | FullState) else jnp.zeros_like(state.q)
+    )
     smooth = {name: getattr(sample, name) for name in ("V", "disturbance", "disturbance_estimate", "tau", "alpha", "xi", "e2", "dq_d")}
     plant = at_time(scenario.plant, t)
     # All that f holds where the plant is the model: what is pushed besides the law's torque.
@@ -142,13 +161,35 @@ def _seen(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str,
         "df_terms": df_terms,
         "V_terms": V_terms,
     }
+    if isinstance(law_of(scenario), FullState):
+        proof["full"] = _full(scenario, t, state, M0, ahead, f_tilde)
+        # Where alpha is outside the velocities' bounds, e2 has no tube.
+        proof["held"] |= jnp.any(proof["full"].room <= NARROWEST)
     return proof, M0, sample
+
+
+def _full(scenario: Scenario, t: jax.Array, state: LoopState, M0, ahead, f_tilde) -> FullTerms:
+    """The terms of (F.2) at one state."""
+    law: FullState = law_of(scenario)
+    outer, inner = law.tubes(t, state.q, state.dq, scenario.setting)
+    s2, V1, phi = (
+        law.velocity_barrier.slope(inner, state.dq),
+        law.barrier.value(outer, state.q),
+        law.velocity_barrier.value(inner, state.dq),
+    )
+    barriers_rate = ahead["V"] - f_tilde @ (ahead["disturbance"] - ahead["disturbance_estimate"])
+    first, second = decay_rate(law), decay_phi(law)
+    decays = jnp.sum((0.0 if first is None else first) * V1 + (0.0 if second is None else second) * phi)
+    left = barriers_rate + decays - s2 @ solve_spd(M0, f_tilde) + jnp.sum(law.c * s2**2)
+    above = state.dq > inner.q_d
+    room = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+    return FullTerms(left, inner.xi(state.dq), jnp.where(above, inner.k_u, inner.k_l), room)
 
 
 def _limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
     """Whether a wrapper around the law changed its torque (a smooth limit does so before it is reached), () bool."""
     law = law_of(scenario)
-    if law is scenario.controller or not isinstance(law, Backstepping):
+    if law is scenario.controller or not isinstance(law, Backstepping | FullState):
         return jnp.zeros((), bool)
     own = law.command(t, state.q, state.dq, now["disturbance_estimate"], scenario.setting, ())[0].tau
     return jnp.any(jnp.abs(now["tau"] - own) > UNCHANGED * jnp.finfo(own.dtype).eps * jnp.abs(own))
@@ -182,10 +223,23 @@ def _sizes(scenario: Scenario, t: jax.Array, state: LoopState, M0, now, ahead, f
     )
     df, df_tilde = ahead["disturbance"], ahead["disturbance"] - ahead["disturbance_estimate"]
     terms = slow @ (jnp.abs(now["s"]) / gap + torque) + (jnp.abs(f_tilde) + jnp.abs(df)) @ torque_rate + torque @ jnp.abs(df_tilde)
+    if isinstance(law, FullState):
+        terms += _full_sizes(law, scenario, t, state, M0, torque, fast)
     tube = scenario.setting.tube(t)
     width = jnp.minimum(tube.k_l, tube.k_u)
     reach = jnp.sum((jnp.abs(state.q) / (width * gap)) ** 2) + slow @ (jnp.abs(M0) @ slow) + torque @ torque
     return terms, torque_rate, jnp.sqrt(reach)
+
+
+def _full_sizes(law: FullState, scenario: Scenario, t: jax.Array, state: LoopState, M0, torque, fast) -> jax.Array:
+    """Sizes of the terms of phi', added up, () [1/s]."""
+    inner, barrier = law.tubes(t, state.q, state.dq, scenario.setting)[1], law.velocity_barrier
+    gap = jnp.clip(1.0 - jnp.abs(inner.xi(state.dq)), max(barrier.guard, 0.0), 1.0) if barrier.guard > 0 else jnp.ones_like(torque)
+    accelerations = fast + jnp.sum(
+        jnp.abs(jnp.stack([solve_spd(M0, row) for row in jnp.eye(torque.size, dtype=torque.dtype)])) * torque, axis=1
+    )
+    s2 = jnp.abs(barrier.slope(inner, state.dq))
+    return (s2 / gap) @ accelerations + jnp.sum(law.c * s2**2)
 
 
 class Place(NamedTuple):

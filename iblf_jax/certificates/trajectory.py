@@ -76,7 +76,7 @@ class Whole(NamedTuple):
     """Smallest eigenvalue of M0 along the run [kg m^2]."""
     lambda_max: float
     over_box: Extremes
-    claim: claims.Claim | None
+    claim: claims.Claim | claims.FullClaim | None
     samples: int
     """Steps that were looked at, and the last instant."""
     left_out: int
@@ -145,8 +145,8 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
     rates = {}
     if constants is not None:
         for each in claims.CASES:
-            for where, largest in (("run", tally.lambda_max), ("box", over_box.lambda_max)):
-                rates[each, where] = float(claims.rho(constants, largest, each))
+            for where, seen_there in (("run", tally), ("box", over_box)):
+                rates[each, where] = float(claims.rho(constants, seen_there.lambda_max, each, seen_there.lambda_min))
     return Whole(
         run=run,
         eps=rounding(run.q.dtype),

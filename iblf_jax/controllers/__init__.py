@@ -6,6 +6,8 @@ from iblf_jax.controllers._base import Setting as Setting
 from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping as Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque as ComputedTorque
+from iblf_jax.controllers.dynamic_surface import DynamicSurface as DynamicSurface
+from iblf_jax.controllers.full_state import FullState as FullState
 from iblf_jax.controllers.pd_gravity import PDGravity as PDGravity
 from iblf_jax.controllers.saturated import Saturated as Saturated
 from iblf_jax.controllers.saturated import within_effort as within_effort
@@ -14,6 +16,8 @@ from iblf_jax.controllers.systems import law_by_name as law_by_name
 
 MEMBERS = {
     "backstepping": Backstepping,
+    "full_state": FullState,
+    "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
@@ -29,6 +33,8 @@ __all__ = [
     "Command",
     "ComputedTorque",
     "Controller",
+    "DynamicSurface",
+    "FullState",
     "PDGravity",
     "Saturated",
     "Setting",

@@ -55,8 +55,10 @@ class Controller(Protocol):
     """What the package asks of a law.
 
     A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it works ("k1", "K2" if it says nothing),
-    which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `wraps`, the name of the field that holds
-    another law whose paths are then its own ("controller.K2" reaches through).  And a method `advice()`, a list of warnings.
+    which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `needs_velocity_bounds = True` if it cannot do
+    without `Setting.velocity_bounds`; `includes_e2 = True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2;
+    `wraps`, the name of the field that holds another law whose paths are then its own ("controller.K2" reaches through).  And a method
+    `advice()`, a list of warnings.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:

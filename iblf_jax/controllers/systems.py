@@ -13,6 +13,7 @@ from iblf_jax.controllers._base import Controller
 from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque
+from iblf_jax.controllers.dynamic_surface import DynamicSurface
 from iblf_jax.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
 from iblf_jax.observers import NoObserver, Observer
@@ -34,7 +35,10 @@ YARDSTICKS: dict[str, Callable[[], Controller]] = {
 }
 """Laws outside the family.  ASSUMPTION: their gains are this package's, chosen to settle about as fast as the paper's law."""
 
-LAWS = (*BARRIERS, "adaptive_rbf", *YARDSTICKS)
+FILTER = 0.01
+"""s.  ASSUMPTION: time constant of the dynamic surface by name; small beside 1/k1, and no stiffer than K2 makes the loop."""
+
+LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *YARDSTICKS)
 """Every system by the name that `law_by_name`, the presets and `compare` take."""
 
 _WITHOUT_OBSERVER = ("adaptive_rbf", "pd")
@@ -59,6 +63,8 @@ def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, readi
         return YARDSTICKS[name]()
     if name == "adaptive_rbf":
         return AdaptiveRBF(k1=k1, K2=K2, o=o, barrier=barriers.Log(p=p))
+    if name == "dynamic_surface":
+        return DynamicSurface(k1=k1, K2=K2, o=o, filter=FILTER)
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
     return Backstepping(k1=k1, K2=K2, o=o if getattr(barrier, "uses_o", True) else None, barrier=barrier, reading=reading)
 

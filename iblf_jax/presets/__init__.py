@@ -11,7 +11,7 @@ import numpy as np
 from iblf_jax import bounds as bounds_
 from iblf_jax import disturbances, references
 from iblf_jax.controllers import LAWS as LAWS
-from iblf_jax.controllers import Saturated, law_by_name
+from iblf_jax.controllers import FullState, Saturated, law_by_name
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.core import checks
 from iblf_jax.observers import Momentum, Printed
@@ -151,11 +151,37 @@ def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str =
     return dataclasses.replace(scenario, bounds=bounds_.Bounds(lower=lower, upper=upper))
 
 
+def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
+    """The paper's arm, reference, bounds and disturbance with bounds on the velocities too, and the law that keeps both.
+
+        -1.6 - 0.1 sin t < q1' < 0.6 + 0.1 cos t,   -1.4 < q2' < 0.5   [rad/s]
+
+    `controllers.FullState` with k1 = 2, K2 = 20 1/s, o = 0.1 and the momentum observer.  The claim of case 2 needs c > 6.5 with kf = 100,
+    and c > 33 with the paper's kf = 20.
+
+    Args:
+      kf: gain of the observer [1/s].
+      c: as `FullState.c` [rad^2/s^3].
+
+    Raises:
+      ValueError: a gain that is not positive.
+
+    Source: this package.
+    """
+    scenario, cosine = zhang_yan_2024(reading="corrected"), 0.5 * math.pi
+    lower = bounds_.Sinusoid(offset=[-1.6, -1.4], amplitude=[-0.1, 0.0])
+    upper = bounds_.Sinusoid(offset=[0.6, 0.5], amplitude=[0.1, 0.0], phase=cosine)
+    law = FullState(k1=2.0, K2=20.0, c=c, o=0.1)
+    speeds = bounds_.Bounds(lower=lower, upper=upper)
+    return dataclasses.replace(scenario, controller=law, observer=Momentum(kf=kf), velocity_bounds=speeds)
+
+
 PRESETS: dict[str, Callable[..., Scenario]] = {
     "zhang_yan_2024": zhang_yan_2024,
     "printed_gap": printed_gap,
     "zhang_yan_2024_saturated": zhang_yan_2024_saturated,
     "zhang_yan_2024_funnel": zhang_yan_2024_funnel,
+    "zhang_yan_2024_full_state": zhang_yan_2024_full_state,
     "ur5": ur5,
     "iiwa14": iiwa14,
 }

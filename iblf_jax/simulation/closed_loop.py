@@ -3,7 +3,7 @@
     state  x = (q, q', state of the law, state of the observer, state of the actuator)
     q" = M^-1 (tau + disturbance + friction - C q' - G)                 with the plant's M, C, G, friction at time t
     f  = M0 q" + C0 q' + G0 - tau                                       what the observer should have estimated      (2.1)
-    V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde                                                             (3.12)
+    V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde, without the second term where V1 `includes_e2`             (3.12)
 
 `evaluate` gives the rate of the state and everything that can be looked at; where only the rate is used (the inner stages of an
 integrator) the compiler drops the rest.
@@ -23,6 +23,7 @@ import jax.numpy as jnp
 
 from iblf_jax.actuators import Ideal
 from iblf_jax.core.linalg import inner, matvec, solve_spd
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.robots import at_time, friction_torque
 from iblf_jax.sensors import Measurement
 from iblf_jax.simulation.sampling import Instant, normals
@@ -232,7 +233,10 @@ def observed(
     M0, G0 = model.mass_matrix(q), model.gravity(q)
     f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
     e2, f_tilde = dq - said.alpha, f - said.f_hat
-    V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
+    if getattr(unwrapped(scenario.controller), "includes_e2", False):
+        V = jnp.sum(said.V1) + 0.5 * inner(f_tilde, f_tilde)
+    else:
+        V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
     limits = () if scenario.velocity_bounds is None else scenario.setting.speed_limits(t)
     return Sample(
         t=t,

@@ -132,6 +132,14 @@ def _claims(findings: Findings, barrier: Any, tube: Tube, k1: jax.Array, numbers
         has_shape(findings, "decay_rate(k1)", rate, (2,))
         excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
         findings.require(excess <= 1e-9, f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha", "Claim a smaller rate, or None")
+    ratio = getattr(barrier, "error_over_slope", lambda tube, q: None)
+    if ratio(tube, tube.q_d) is not None:
+        q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
+        found, slope = np.asarray(jax.vmap(lambda q: ratio(tube, q))(jnp.asarray(q))), np.asarray(numbers["slope"])
+        off = np.abs(found * slope - (q - np.asarray(tube.q_d)))[inside]
+        remedy = "It is e1/s inside the wall, written so that it has no 0/0 at e1 = 0"
+        findings.require(np.max(off) < 1e-9, f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})", remedy)
+        findings.require(np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy)
     bound = getattr(barrier, "xi_bound", lambda V, tube: None)
     if bound(jnp.asarray(V1[0]), tube) is not None:
         claimed = np.asarray(jax.vmap(lambda V: bound(V, tube))(jnp.asarray(V1)))

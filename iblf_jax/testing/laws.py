@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.bounds import Bounds, Constant
 from iblf_jax.controllers import Command, Controller
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
@@ -21,6 +23,8 @@ XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
 
 SHORT_RUN = 0.1
 """s."""
+SPEED = 2.0
+"""rad/s.  Bounds of the velocities for a law that needs some."""
 
 
 def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
@@ -37,8 +41,11 @@ def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
     scenario = scenario_or_the_papers(scenario)
     with examine(law, "Controller", Controller) as findings:
         base = in_dtype(scenario, "float64")
+        watched = base.velocity_bounds
+        if watched is None and getattr(unwrapped(law), "needs_velocity_bounds", False):
+            watched = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
         try:
-            base = in_dtype(dataclasses.replace(base, controller=law), "float64")
+            base = in_dtype(dataclasses.replace(base, controller=law, velocity_bounds=watched), "float64")
         except ValueError as error:
             findings.add(f"it does not go into a Scenario ({error})")
             findings.stop_if_any()

@@ -1,0 +1,283 @@
+"""The law that keeps positions and velocities: its formulas beside independent ones, its inequality, its certificate."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from independent import Loop, sine
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers
+from iblf_jax.certificates.proof_terms import rounding, terms_at
+from iblf_jax.simulation.closed_loop import initial_state
+
+H = np.pi / 2
+
+
+@dataclasses.dataclass
+class FullLoop(Loop):
+    """The independent loop under the full-state law with integral barriers; K2 in 1/s."""
+
+    c: np.ndarray = dataclasses.field(default_factory=lambda: np.full(2, 1.0))
+    slowest: tuple = ((-1.6, -1.4), (-0.1, 0.0), 1.0, 0.0)
+    fastest: tuple = ((0.6, 0.5), (0.1, 0.0), 1.0, H)
+
+    def full(self, t, x):
+        """The rate of (q, q', eta), the torque, and V1 + phi of each joint."""
+        q, v, eta = x[:2], x[2:4], x[4:]
+        M, C, G, dM = self.arm(q)
+        (xd, dxd, ddxd), (lo, dlo, ddlo), (up, dup, ddup) = (sine(*s)(t) for s in (self.reference, self.lower, self.upper))
+        kl, dkl, ddkl, ku, dku, ddku = xd - lo, dxd - dlo, ddxd - ddlo, up - xd, dup - dxd, ddup - ddxd
+        e1, ru, rl = q - xd, dku / ku, dkl / kl
+        kappa = np.sqrt(ru**2 + rl**2 + self.o)
+        dkappa = (ru * (ddku / ku - ru**2) + rl * (ddkl / kl - rl**2)) / kappa
+        alpha = dxd - (self.k1 + kappa) * e1
+        dalpha = ddxd - dkappa * e1 - (self.k1 + kappa) * (v - dxd)
+        k = np.where(e1 > 0, ku, kl)
+        s1, e2 = 2 * e1 / (k**2 - e1**2), v - alpha
+        (vl, dvl, _), (vu, dvu, _) = sine(*self.slowest)(t), sine(*self.fastest)(t)
+        Ku, Kl = vu - alpha, alpha - vl
+        K = np.where(e2 > 0, Ku, Kl)
+        s2, kappa2 = 2 * e2 / (K**2 - e2**2), np.sqrt(((dvu - dalpha) / Ku) ** 2 + ((dalpha - dvl) / Kl) ** 2 + self.o)
+        w = -(self.K2 + kappa2) * e2 - s1 * (K**2 - e2**2) / 2 - self.c * s2
+        f_hat = eta + self.kf * (M @ v)
+        tau = C(v) @ v + G + M @ (dalpha + w) - f_hat
+        f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
+        ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
+        deta = -self.kf * (f_hat + tau - C(v) @ v - G + dM * v[1] @ v)
+        return np.concatenate([v, ddq, deta]), tau, -np.log(1 - (e1 / k) ** 2) - np.log(1 - (e2 / K) ** 2)
+
+    @classmethod
+    def random(cls, rng, **given):
+        """Gains and bounds at random, around the paper's."""
+        gains = {name: rng.uniform(low, high, 2) for name, low, high in (("k1", 1, 3), ("K2", 8, 25), ("c", 0.3, 2), ("o", 0.05, 0.3))}
+        slowest = (-rng.uniform(1.5, 2.0, 2), rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 2.0), rng.uniform(0, 6, 2))
+        fastest = (rng.uniform(0.9, 1.5, 2), rng.uniform(-0.1, 0.1, 2), 1.0, rng.uniform(0, 6, 2))
+        lower = (rng.uniform(0.1, 0.2, 2), 0.14, 1.0, (H, 0.0))
+        return cls(**gains, kf=rng.uniform(10, 25, 2), slowest=slowest, fastest=fastest, lower=lower, **given)
+
+    @property
+    def scenario(self):
+        """The same in the package."""
+        law = controllers.FullState(k1=self.k1, K2=self.K2, c=self.c, o=self.o)
+        return dataclasses.replace(
+            ij.presets.zhang_yan_2024(reading="corrected"),
+            controller=law,
+            observer=ij.observers.Momentum(kf=self.kf),
+            bounds=bounds.Bounds(lower=bounds.Sinusoid(*self.lower), upper=bounds.Sinusoid(*self.upper)),
+            velocity_bounds=bounds.Bounds(lower=bounds.Sinusoid(*self.slowest), upper=bounds.Sinusoid(*self.fastest)),
+            initial=ij.Initial(self.q0, self.dq0),
+        )
+
+
+def random_states(scenario, count=64, seed=0):
+    """Times and states of the loop inside both pairs of bounds, e1 and e2 up to 0.95 of theirs."""
+    rng, law, setting = np.random.default_rng(seed), scenario.controller, scenario.setting
+
+    def state(t, xi, xi2, eta):
+        tube = setting.tube(t)
+        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+        inner = law.tubes(t, q, jnp.zeros(2), setting)[1]  # alpha and K do not depend on q'
+        dq = inner.q_d + xi2 * jnp.where(xi2 > 0, inner.k_u, inner.k_l)
+        return initial_state(scenario)._replace(q=q, dq=dq, observer=eta), jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+
+    t, xi, xi2 = rng.uniform(0, 10, count), rng.uniform(-0.95, 0.95, (count, 2)), rng.uniform(-0.95, 0.95, (count, 2))
+    states, room = jax.vmap(state)(t, xi, xi2, rng.normal(size=(count, 2)))
+    keep = np.min(room, axis=1) > 0.05
+    return jnp.asarray(t[keep]), jax.tree.map(lambda x: x[keep], states)
+
+
+def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng):
+    for _ in range(5):
+        loop = FullLoop.random(rng)
+        scenario = loop.scenario
+        t, states = random_states(scenario, seed=int(rng.integers(1 << 30)))
+
+        def torque(t, state, scenario=scenario):
+            f_hat = scenario.observer.estimate(t, state.q, state.dq, scenario.model, state.observer)
+            command = scenario.controller.command(t, state.q, state.dq, f_hat, scenario.setting, ())[0]
+            return command.tau, command.V1
+
+        tau, V1 = jax.jit(jax.vmap(torque))(t, states)
+        others = [loop.full(*x) for x in zip(np.asarray(t), np.hstack([states.q, states.dq, states.observer]), strict=True)]
+        np.testing.assert_allclose(tau, [x[1] for x in others], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(V1, [x[2] for x in others], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_run_is_that_of_an_independent_program():
+    # From here e2 keeps its sign for a second: where it changes, the torque jumps, and steps of a fixed size are of the first order.
+    loop = FullLoop(q0=(0.7, 0.7), dq0=(-0.8, -0.5))
+    t, start = np.linspace(0.0, 1.0, 101), [*loop.q0, *loop.dq0, *(-loop.kf * (loop.arm(loop.q0)[0] @ loop.dq0))]
+    found = solve_ivp(lambda t, x: loop.full(t, x)[0], (0.0, 1.0), start, "DOP853", t_eval=t, rtol=1e-10, atol=1e-12)
+    scenario = ij.with_parts(loop.scenario, observer=ij.observers.Momentum(kf=loop.kf, start="matched"))
+    run = ij.simulate(scenario, duration=1.0, dt=2.5e-4, record_every=40)
+    assert np.all(run.e2 < 0)
+    np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-9)
+
+
+FAMILY = {name: cls() for name, cls in barriers.MEMBERS.items()}
+
+
+@pytest.mark.parametrize("second", [name for name in FAMILY if name != "quadratic"])
+@pytest.mark.parametrize("first", ["integral", "tan"])
+def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
+    """(F.2), with the exact rates of the whole loop."""
+    law = controllers.FullState(k1=[2.0, 1.5], K2=[20.0, 12.0], c=[1.0, 0.3], barrier=FAMILY[first], velocity_barrier=FAMILY[second])
+    scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
+    t, states = random_states(scenario)
+    proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
+    assert not np.any(proof.held)
+    allowed = rounding("float64") * np.asarray(proof.terms)
+    assert np.all(proof.full.left <= allowed)
+    assert np.median(allowed / np.abs(proof.dV)) < 1e-10  # small beside what it judges
+
+
+def test_without_its_own_terms_the_inequality_breaks():
+    """What the test above would see of a law without its cross term, or of a smaller rate."""
+    law = controllers.FullState(k1=2.0, K2=20.0, c=1.0)
+    scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(), controller=law)
+    t, states = random_states(scenario)
+
+    def lefts(t, state):
+        wrong = dataclasses.replace(scenario, controller=_WithoutCrossTerm(**vars(law)))
+        return terms_at(wrong, t, state).full.left
+
+    assert np.max(jax.jit(jax.vmap(lefts))(t, states)) > 1.0
+
+
+@ij.component
+class _WithoutCrossTerm(controllers.FullState):
+    def command(self, t, q, dq, f_hat, setting, state):
+        command, rate = controllers.FullState.command(self, t, q, dq, f_hat, setting, state)
+        outer, inner = self.tubes(t, q, dq, setting)
+        crossed = self.barrier.slope(outer, q) * self.velocity_barrier.error_over_slope(inner, dq)
+        return command._replace(tau=command.tau + setting.model.mass_matrix(q) @ crossed), rate
+
+
+def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
+    """V = 1/2 sum ln(k^2/(k^2 - z^2)) with slope z/(k^2 - z^2) on both errors; He, Chen, Yin 2016."""
+    base = ij.presets.zhang_yan_2024_full_state()
+    law = controllers.FullState(k1=2.0, K2=20.0, c=1.0, barrier=barriers.Log(), velocity_barrier=barriers.Log())
+    rest = ij.references.Sinusoid(offset=0.5, amplitude=0.0)
+    walls, speeds = (bounds.Bounds(lower=bounds.Constant(x - w), upper=bounds.Constant(x + w)) for x, w in ((0.5, 0.4), (0.0, 0.8)))
+    scenario = dataclasses.replace(base, controller=law, reference=rest, bounds=walls, velocity_bounds=speeds)
+    t, q, dq, f_hat = jnp.zeros(()), jnp.array([0.5, 0.5]), jnp.array([0.3, -0.6]), jnp.array([0.2, 0.1])
+    command = law.command(t, q, dq, f_hat, scenario.setting, ())[0]
+    z2, kb, model = np.asarray(dq), 0.8, scenario.model
+    np.testing.assert_allclose(command.alpha, 0.0, atol=1e-15)  # z1 = 0, so z2 = q' and its bounds are symmetric
+    np.testing.assert_allclose(command.V1, 0.5 * np.log(kb**2 / (kb**2 - z2**2)), rtol=1e-12)
+    gain = 2.0 + np.sqrt(0.1)
+    kappa2 = np.sqrt(2 * (gain * z2 / kb) ** 2 + 0.1)
+    wanted = -gain * z2 - (20.0 + kappa2) * z2 - z2 / (kb**2 - z2**2)
+    tau = model.mass_matrix(q) @ wanted + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
+    np.testing.assert_allclose(command.tau, tau, rtol=1e-12)
+    z1 = np.array([0.1, -0.2])
+    command = law.command(t, q + z1, dq, f_hat, scenario.setting, ())[0]
+    alpha = -gain * z1
+    phi = 0.5 * np.log(1 / (1 - ((z2 - alpha) / np.where(z2 > alpha, kb - alpha, kb + alpha)) ** 2))
+    np.testing.assert_allclose(command.V1, 0.5 * np.log(0.16 / (0.16 - z1**2)) + phi, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def certificate():
+    return ij.certify(ij.presets.zhang_yan_2024_full_state(), duration=3.0, dt=5e-4)
+
+
+def test_the_certificate_holds_line_by_line(certificate):
+    lines = {line.name: line for line in certificate.lines}
+    assert certificate.verdict == "holds"
+    for name in (
+        "alpha inside",
+        "start speed inside",
+        "barriers",
+        "inequality, case 2",
+        "envelope, case 2",
+        "xi2, by phi",
+        "velocities inside",
+    ):
+        assert lines[name].verdict == "holds", name
+    assert lines["inequality, case 1"].verdict == "not applicable"
+    rho, smallest = lines["rho, case 2"].value, certificate.numbers["lambda_min_run"]
+    assert rho == pytest.approx(min(4.0, 40.0, 2 * (100.0 - 0.5 - 0.25 / (8.0 * smallest**2))))
+    assert lines["kf and c, case 2"].margin == pytest.approx(99.5 - 0.25 / (8.0 * smallest**2))
+    assert np.all(certificate.traces.e2 <= certificate.traces.e2_bound)
+
+
+def test_the_envelope_is_the_one_that_the_inequality_gives(certificate):
+    V, t, F_d = certificate.traces.V, certificate.traces.t, certificate.numbers["F_d"]
+    expected = V[0] * np.exp(-4.0 * t) + 0.5 * F_d**2 / 4.0
+    np.testing.assert_allclose(certificate.traces.envelope, expected, rtol=1e-9)
+
+
+def test_without_disturbance_case_1_counts():
+    quiet = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
+    certificate = ij.certify(ij.with_parameters(ij.presets.zhang_yan_2024_full_state(), quiet), duration=0.5, dt=5e-4)
+    lines = {line.name: line for line in certificate.lines}
+    assert certificate.verdict == "holds"
+    assert lines["inequality, case 1"].verdict == lines["envelope, case 1"].verdict == "holds"
+
+
+def test_too_small_a_c_is_told_with_the_one_that_would_do():
+    certificate = ij.certify(ij.presets.zhang_yan_2024_full_state(kf=20.0, c=1.0), duration=0.3, dt=1e-3)
+    lines = {line.name: line for line in certificate.lines}
+    assert lines["kf and c, case 2"].verdict == "fails"
+    assert "would do" in lines["kf and c, case 2"].note
+    assert lines["barriers"].verdict == "holds"
+    assert lines["envelope, case 2"].verdict == lines["velocities inside"].verdict == "not applicable"
+
+
+@pytest.mark.slow
+def test_no_velocity_bound_is_violated_from_10_000_random_feasible_starts():
+    scenario = ij.presets.zhang_yan_2024_full_state()
+    perturbations = {
+        "initial.q": ij.value(ij.uniform([0.36, 0.22], [1.02, 0.88])),
+        "initial.dq": ij.value(ij.uniform([-1.55, -1.35], [0.65, 0.45])),
+    }
+    with pytest.warns(UserWarning, match="inaccurate"):  # the torque jumps where e2 changes its sign; what is judged is no trajectory
+        study = ij.monte_carlo(scenario, perturbations, runs=28_000, duration=2.0, dt=2.5e-4, progress=False)
+    law, setting, zero = scenario.controller, scenario.setting, jnp.zeros(())
+
+    def start(q, dq):
+        inner = law.tubes(zero, q, dq, setting)[1]
+        return jnp.min(jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)), jnp.max(jnp.abs(inner.xi(dq)))
+
+    room, xi2 = (np.asarray(x) for x in jax.vmap(start)(study.samples["initial.q"], study.samples["initial.dq"]))
+    feasible = (room > 0.05) & (xi2 < 0.95)
+    assert feasible.sum() >= 10_000
+    status = np.asarray(study.status)[feasible]
+    assert not np.any(status & int(ij.Status.VELOCITY_VIOLATED | ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE))
+    assert np.min(np.asarray(study.metrics["velocity_margin"])[feasible]) > 0
+
+
+def test_a_gradient_is_the_difference():
+    def loss(K2):
+        scenario = ij.with_parameters(ij.presets.zhang_yan_2024_full_state(), {"controller.K2": K2, "initial.dq": [-1.0, -0.6]})
+        return jnp.sum(ij.simulate(scenario, duration=0.1, dt=5e-4, record_every=200).metrics.ise)
+
+    found, h = jax.grad(loss)(20.0), 1e-4
+    assert float(found) == pytest.approx((float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"velocity_barrier": barriers.Log(p=2)}, "falls with the error itself"),
+        ({"velocity_barrier": 3.0}, "FullState.velocity_barrier"),
+        ({"o": 0.1, "barrier": barriers.Tan(), "velocity_barrier": barriers.Tan()}, "Neither has a kappa"),
+        ({"c": -1.0}, "> 0"),
+    ],
+)
+def test_bad_ones_are_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        controllers.FullState(**{"k1": 2.0, "K2": 20.0, "c": 1.0} | change)
+
+
+def test_it_needs_bounds_to_keep():
+    with pytest.raises(ValueError, match="the bounds that FullState keeps"):
+        ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=None)
+    with pytest.raises(ValueError, match="Q is Theorem 2's"):
+        ij.certificates.counterexample(ij.presets.zhang_yan_2024_full_state(), {"controller.k1": ij.value(ij.uniform(1.0, 3.0))})
