@@ -6,8 +6,8 @@ Rows: SciPy LSODA and diffrax (of the same motion, in steps of 1 ms), the textbo
 package's backends with the standard metrics and without, on one thread and on all, value and 6 forward sensitivities, and the limit: a
 rollout written by hand in C++ (`limit/paper_loop.cc`), which carries the state alone and is there for the paper's loop only.  The second
 loop is a planar chain of four joints; the third, a real arm of seven (`presets.iiwa14`), whose step is too long for XLA.  Last, `native`
-on 1e4, 1e5 and 1e6 runs.  `a core` is steps per second of processor time: on a shared machine it is the number to compare.  A row that
-needs a package which is not there is left out.
+on 1e4, 1e5 and 1e6 runs, and on a law that is sampled beside one that is not.  `a core` is steps per second of processor time: on a shared
+machine it is the number to compare.  A row that needs a package which is not there is left out.
 """
 
 from __future__ import annotations
@@ -290,6 +290,27 @@ def flat(quick: bool) -> list[list]:
     return result
 
 
+def sampled(quick: bool) -> list[list]:
+    """`native` on the paper's loop where its law runs at every instant, once a period, and late."""
+    jax.config.update("jax_enable_x64", True)
+    paper, dt, result = ij.presets.zhang_yan_2024(reading="corrected"), jnp.asarray(1e-3), []
+    loops = {
+        "law at every instant": None,
+        "law every 4 steps": ij.Sampling(4e-3),
+        "law every 4 steps, late": ij.Sampling(4e-3, delay=1.3e-3),
+        "law every step": ij.Sampling(1e-3),
+    }
+    runs, steps = (2, 20) if quick else (2048, 4000)
+    for name, sampling in list(loops.items())[: 2 if quick else None]:
+        soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
+        scenario = canonical(ij.with_parts(soft, sampling=sampling))
+        row = next(row for row in rows_of(scenario, "float64", "chain", method_for(quick)) if row.name == "native")
+        seconds, wall, cpu = timed(row, draws(scenario, runs, "float64"), dt, steps, 1 if quick else 3)
+        speeds = runs * steps / wall, runs * steps / cpu
+        result.append(["paper", "float64", runs, f"native, {name}", steps, seconds, *speeds, math.nan, math.nan])
+    return result
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
@@ -306,7 +327,7 @@ def main() -> None:
     for loop in ["paper"] if options.quick else options.loops.split(","):
         for dtype in ["float32"] if options.quick else options.dtypes.split(","):
             rows += table(dtype, batches, loop, options.quick)
-    rows += flat(options.quick)
+    rows += flat(options.quick) + sampled(options.quick)
     columns = ["loop", "type", "runs", "row", "steps", "compile s", "steps/s", "steps/s a core", "x textbook", "of limit"]
     report(f"Throughput, {method_for(options.quick)} at 1 ms", columns, rows, options.json)
 

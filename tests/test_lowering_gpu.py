@@ -139,8 +139,15 @@ def test_records_agree_with_the_reference(on_cpu, monkeypatch, written_out):
 
 @needs_compiler
 @pytest.mark.slow
-def test_one_run_is_the_run(on_cpu, paper):
-    one, other = (ij.simulate(paper, duration=0.15, dt=1e-3, record_every=10, backend=backend) for backend in ("gpu", "xla"))
+@pytest.mark.parametrize("sampled", [False, True])
+def test_one_run_is_the_run(on_cpu, paper, sampled):
+    """A law that is sampled and delayed too, with the noise of its sensor: its branches are calls in the kernel."""
+    if sampled:
+        sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+        soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
+        paper = ij.with_parts(soft, sampling=ij.Sampling(2e-3, delay=1.3e-3), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=600.0))
+    timing = {"duration": 0.15, "dt": 1e-3, "record_every": 10, "seed": 3}
+    one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "xla"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 
 

@@ -350,3 +350,10 @@ def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias(obse
     exact, poles, euler = (float(np.max(run.metrics.estimate_rmse)) for run in runs)
     assert poles < 0.5 * exact, "f_hat lags by the robot's motion over a period otherwise"
     assert poles < 1.2 * euler
+
+
+def test_a_sampled_step_is_explained():
+    sensor = ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Tracking(bandwidth=100.0))
+    counts = [ij.explain(ij.with_parts(PAPER, sampling=ij.Sampling(2e-3), sensor=s)).counts for s in (ij.sensors.Ideal(), sensor)]
+    plain, noisy = (sum(sum(counter.values()) for counter in c.values()) for c in counts)
+    assert 0 < plain < noisy

@@ -12,10 +12,10 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.execute import automatic
+from iblf_jax.engine.execute import automatic, inputs_of
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Inputs, TimeStep
+from iblf_jax.engine.step import Run, TimeStep
 from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
@@ -23,6 +23,7 @@ from iblf_jax.lowering.toolchain import threads
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
+from iblf_jax.simulation.sampling import NOISE_NAME, has_noise
 from iblf_jax.simulation.scenario import Scenario, canonical
 
 LIBRARY_CALL = 40
@@ -60,7 +61,7 @@ class Explanation:
 
 
 def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk4", metrics=None) -> Explanation:
-    """What one step of a scenario costs on a compiled backend.
+    """What one step of a scenario costs on a compiled backend; where the law is sampled, a step in which it runs and a command arrives.
 
     Args:
       scenario: what runs; its floating-point type decides the width of a register of runs.
@@ -82,7 +83,8 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
-    one = Batch.of(Inputs(scenario, folds, *jnp.asarray([1e-3, 1.0], dtype)), leaves, mechanism=mechanism_of(scenario))
+    noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
+    one = Batch.of(inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), Run(1), None), leaves | noise, mechanism=mechanism_of(scenario))
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
