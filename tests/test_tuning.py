@@ -630,7 +630,7 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
         ij.tune(paper, paths, goal, perturbations=perturbed, runs=200, **SHORT)
 
 
-@pytest.mark.parametrize(("runs", "share"), [(1000, 0.3), (60, 0.1)])
+@pytest.mark.parametrize(("runs", "share"), [(300, 0.3), (60, 0.1)])
 def test_a_share_of_many_runs_is_in_the_programme(runs, share):
     """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down, whatever the number of the worst."""
     pieces = Pieces.of((1,), (share,), runs)
