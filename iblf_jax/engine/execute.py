@@ -114,20 +114,20 @@ def _program(batch: Batch, run: Run) -> Program:
     return program_of(TimeStep.of(run), batch, carry_shapes(batch, run.method)).program
 
 
-def run_lowered(name: str, batch: Batch, run: Run, program: Program | None = None, go: Callable[..., Any] = run_all) -> Any:
+def run_lowered(name: str, batch: Batch, run: Run, program: Program | None = None, go: Callable[..., Any] | None = None) -> Any:
     """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core.
 
     Args:
       name: of the executor.
       batch, run: what to run.
       program: of its step, where the caller has it.
-      go: what is done, a function (executor, batch, run).
+      go: what is done, a function (executor, batch, run); `run_all` if not given.
     """
     if name == "native":
         program = program or _program(batch, run)
         native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
     try:
-        return go(executor_named(name), batch, run)
+        return (go or run_all)(executor_named(name), batch, run)
     except BaseException:
         stop_compilers()
         raise
