@@ -588,7 +588,8 @@ np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best
 
 
 @pytest.mark.slow
-def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
+def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
+    """As one that nobody stops, in another process."""
     env = os.environ | {"PYTHONPATH": str(Path(ij.__file__).parents[1])}
 
     def start(checkpoint, pace, out):
@@ -606,7 +607,8 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
     with np.load(tmp_path / "a.npz") as half:
         assert 1 <= len(half["history_loss"]) < 12
     assert start("a.npz", "fast", "resumed.npz").wait() == 0
-    assert start("b.npz", "fast", "whole.npz").wait() == 0
+    monkeypatch.setattr(sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "whole.npz")])
+    exec(KILLED, {})
     with np.load(tmp_path / "resumed.npz") as resumed, np.load(tmp_path / "whole.npz") as whole:
         assert set(resumed.files) == set(whole.files)
         for name in whole.files:
