@@ -45,10 +45,18 @@ SHORT = {"duration": 0.5, "dt": 1e-3}
 """A run with every step recorded; used wherever the length does not matter, so that it compiles once."""
 
 
-XLA_FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+XLA_FLAGS = " ".join(
+    [
+        "--xla_backend_optimization_level=0",
+        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_cpu_parallel_codegen_split_count=1",
+        "--xla_disable_hlo_passes=hlo-verifier",
+    ]
+)
 """Half of the tests' time was the compilers', spent on making loops faster that run for milliseconds.  XLA is asked for the same programs;
-it writes the machine's code plainly, operation by operation and on one thread.  So does the compiler of kernels (`plain_compiler`).
-`test_users_settings.py` runs tests as users compile; so do the release tests, and all of them with TEST_AS_USERS=1 in the environment."""
+it writes the machine's code plainly, operation by operation and on one thread, and does not check itself after each pass.  So does the
+compiler of kernels (`plain_compiler`).  `test_users_settings.py` runs tests as users compile; so do the release tests, and all of them with
+TEST_AS_USERS=1 in the environment."""
 
 MEMORY = 3 * 2**30
 """Bytes of a process from which what it has compiled is let go after a test: what is needed again comes from the cache on disk."""

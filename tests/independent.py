@@ -93,10 +93,10 @@ class Loop:
         V = V1.sum() + 0.5 * e2 @ M @ e2 + 0.5 * (f - f_hat) @ (f - f_hat)
         return np.concatenate([v, ddq, deta]), {"tau": tau, "e1": e1, "e2": e2, "xi": xi, "V": V, "f": f, "f_hat": f_hat, "alpha": alpha}
 
-    def solve(self, times):
+    def solve(self, times, rtol=1e-11):
         """The run at these times, by DOP853: name -> (T, ...)."""
         x0 = np.concatenate([self.q0, self.dq0, np.zeros(2)])
         span = (0.0, float(times[-1]))
-        solution = solve_ivp(lambda t, x: self.evaluate(t, x)[0], span, x0, "DOP853", t_eval=times, rtol=1e-11, atol=1e-13)
+        solution = solve_ivp(lambda t, x: self.evaluate(t, x)[0], span, x0, "DOP853", t_eval=times, rtol=rtol, atol=0.01 * rtol)
         outputs = [self.evaluate(t, x)[1] for t, x in zip(times, solution.y.T, strict=True)]
         return {"q": solution.y[:2].T, "dq": solution.y[2:4].T, **{k: np.array([o[k] for o in outputs]) for k in outputs[0]}}

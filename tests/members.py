@@ -81,6 +81,7 @@ ACTUATORS = {
     "ideal": actuators.Ideal(),
     "motor_bare": actuators.Motor(),
     "motor_lag": actuators.Motor(bandwidth=[300.0, 400.0]),
+    "chain": actuators.Chain((actuators.Motor(bandwidth=900.0, limit=[40.0, 20.0]), actuators.Ideal(), actuators.Motor(bandwidth=300.0))),
     "motor": actuators.Motor(bandwidth=300.0, limit=[40.0, 20.0], rate_limit=500.0, stall=[40.0, 20.0], no_load_speed=[6.0, 8.0]),
 }
 

@@ -560,12 +560,12 @@ def test_search_finds_the_gap_of_the_printed_law_only():
         "controller.K2": between(0.6, 20.0),
         "observer.kf": between(1.1, 40.0),
     }
-    found = counterexample(ij.presets.printed_gap(), perturbations, starts=8)
+    found = counterexample(ij.presets.printed_gap(), perturbations, starts=4)
     assert found.growth > 0.3
     for path, perturbation in perturbations.items():
         low, high = perturbation.distribution.support()
         assert np.all((found.parameters[path] >= low) & (found.parameters[path] <= high))
-    none = counterexample(ij.presets.printed_gap(reading="corrected"), perturbations, starts=8)
+    none = counterexample(ij.presets.printed_gap(reading="corrected"), perturbations, starts=4)
     assert none.growth < -1.0 + 1e-9
 
 

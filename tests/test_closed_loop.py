@@ -65,7 +65,7 @@ def scenario_of(loop: independent.Loop) -> ij.Scenario:
 @pytest.mark.parametrize("seed", range(3))
 def test_other_numbers_against_scipy(seed, law, reading):
     loop = random_loop(seed, law, reading)
-    expected = loop.solve(TIMES)
+    expected = loop.solve(TIMES, rtol=1e-9)
     run = ij.simulate(scenario_of(loop), **PAPER)
     assert run.ok
     tolerances = {"q": 1e-7, "dq": 5e-5, "e1": 1e-7, "xi": 1e-6, "alpha": 1e-6, "e2": 5e-5, "tau": 2e-3, "V": 1e-5}

@@ -43,7 +43,12 @@ def largest_difference(a, b) -> float:
     return float(np.max(np.abs(np.asarray(a) - np.asarray(b))))
 
 
-@pytest.mark.parametrize("scenario", [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN], ids=["ideal", "driven"])
+CHAINED = ij.with_parts(DRIVEN, actuator=ij.actuators.Chain((ij.actuators.Motor(bandwidth=900.0), ij.actuators.Motor(limit=[15.0, 5.0]))))
+
+
+@pytest.mark.parametrize(
+    "scenario", [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN, CHAINED], ids=["ideal", "driven", "chained"]
+)
 def test_on_the_nominal_arm_it_is_simulate(scenario):
     run = ij.simulate(scenario, **TIMING, seed=3)
     other = ij.cosimulate(scenario, spec_of(scenario.plant), **TIMING, seed=3)

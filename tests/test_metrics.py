@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT
@@ -62,31 +64,26 @@ def test_settling_and_overshoot(paper_run, short_run):
 
 
 def test_settling_counts_from_the_sample_after_the_last_one_outside():
-    import jax.numpy as jnp
-
     from iblf_jax.testing.metrics import samples
 
     some = samples(np.random.default_rng(0))
     fold = ij.metrics.Settling(tolerance=0.05)
     e1 = np.where(np.arange(40)[:, None] < [10, 40], 0.1, 0.01)
-    acc = fold.init(_row(some._replace(e1=jnp.asarray(e1)), 0))
+    acc = fold.init(_row(dataclasses.replace(some, e1=jnp.asarray(e1)), 0))
     for i in range(40):
-        acc = fold.update(acc, _row(some._replace(e1=jnp.asarray(e1)), i))
+        acc = fold.update(acc, _row(dataclasses.replace(some, e1=jnp.asarray(e1)), i))
     np.testing.assert_allclose(fold.finish(acc)["settling_time"], [0.1, np.inf])
 
 
 @pytest.mark.parametrize(("q", "slope"), [(0.84, -1.0), (0.86, -1.0), (2.0, -1.0), (0.19, 1.0), (-1.0, 1.0)])
 def test_margins_go_on_through_zero(q, slope):
     """Bounds 0.2 and 0.85: past the wall the margin is negative and its gradient still says which way is back."""
-    import jax
-    import jax.numpy as jnp
-
     from iblf_jax.testing.metrics import samples
 
     fold, sample = ij.metrics.Margin(), _row(samples(np.random.default_rng(0)), 0)
 
     def margin(q):
-        now = sample._replace(q=jnp.stack([q, jnp.asarray(0.5)]))
+        now = dataclasses.replace(sample, q=jnp.stack([q, jnp.asarray(0.5)]))
         return fold.finish(fold.update(fold.init(now), now))["margin"][0]
 
     value, gradient = jax.value_and_grad(margin)(jnp.asarray(q))
@@ -95,7 +92,7 @@ def test_margins_go_on_through_zero(q, slope):
 
 
 def _row(samples, i):
-    return type(samples)(*(x[i] for x in samples))
+    return jax.tree.map(lambda x: x[i], samples)
 
 
 def test_metrics_do_not_depend_on_what_is_recorded(paper, short_run):

@@ -328,7 +328,7 @@ def test_an_infeasible_start_finds_its_way_in(paper):
 @pytest.mark.slow
 def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
     """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just so."""
-    wanted = objectives.tracking() + objectives.peak_torque_below(12.0)
+    wanted = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
     best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
     assert 11.0 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 12.0
@@ -588,7 +588,8 @@ np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best
 
 
 @pytest.mark.slow
-def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
+def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
+    """As one that nobody stops, in another process."""
     env = os.environ | {"PYTHONPATH": str(Path(ij.__file__).parents[1])}
 
     def start(checkpoint, pace, out):
@@ -606,7 +607,8 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path):
     with np.load(tmp_path / "a.npz") as half:
         assert 1 <= len(half["history_loss"]) < 12
     assert start("a.npz", "fast", "resumed.npz").wait() == 0
-    assert start("b.npz", "fast", "whole.npz").wait() == 0
+    monkeypatch.setattr(sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "whole.npz")])
+    exec(KILLED, {})
     with np.load(tmp_path / "resumed.npz") as resumed, np.load(tmp_path / "whole.npz") as whole:
         assert set(resumed.files) == set(whole.files)
         for name in whole.files:
@@ -630,7 +632,7 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
         ij.tune(paper, paths, goal, perturbations=perturbed, runs=200, **SHORT)
 
 
-@pytest.mark.parametrize(("runs", "share"), [(1000, 0.3), (60, 0.1)])
+@pytest.mark.parametrize(("runs", "share"), [(300, 0.3), (60, 0.1)])
 def test_a_share_of_many_runs_is_in_the_programme(runs, share):
     """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down, whatever the number of the worst."""
     pieces = Pieces.of((1,), (share,), runs)

@@ -77,10 +77,14 @@ def test_falsify_refuses_sets_without_an_admissible_run(paper):
         ij.falsify(paper, {"initial.q": ij.value(ij.uniform(1.1, 1.2))}, starts=2, **SHORT)
 
 
-@pytest.mark.slow
-def test_pareto_is_a_front(paper):
+@pytest.fixture(scope="module")
+def front(paper):
     pair = (ij.objectives.tracking(), ij.objectives.effort())
-    front = ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, iterations=10, **SHORT)
+    return ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, iterations=10, **SHORT)
+
+
+@pytest.mark.slow
+def test_pareto_is_a_front(paper, front):
     a, b = front.objectives.T
     assert len(front) >= 3
     assert np.all(np.diff(a) > 0)
@@ -230,7 +234,7 @@ def test_a_front_over_decades_has_logarithmic_axes(b, scale):
 
 
 @pytest.mark.slow
-def test_figures(paper):
+def test_figures(paper, front):
     narrow = ij.tunable("controller.k1", low=1.0, high=2.5)
     best = ij.tune(paper, [narrow, "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT)
     figure = best.plot(points=3)
@@ -242,7 +246,6 @@ def test_figures(paper):
     assert b[1] == best.tuned[3]
     with pytest.raises(ValueError, match="landscape"):
         best.landscape("controller.k1[0]", "controller.o[0]")
-    front = ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.effort()), points=2, iterations=2, **SHORT)
     assert front.plot().axes
 
 

@@ -9,7 +9,6 @@ import iblf_jax as ij
 from iblf_jax import bounds, plotting
 from iblf_jax.files.scenario import load_scenario, save_scenario, scenario_to_toml
 from iblf_jax.simulation import metrics
-from iblf_jax.simulation.signals import OPTIONAL
 
 SHORT = {"duration": 1.0, "dt": 1e-3}
 
@@ -53,7 +52,7 @@ def test_the_law_and_the_loop_do_not_know(watched):
     free = ij.simulate(paper(velocity_bounds=None), **SHORT)
     for name in ("q", "dq", "tau", "V"):
         np.testing.assert_array_equal(getattr(free, name), getattr(watched, name))
-    assert all(getattr(free, name) == () for name in OPTIONAL)
+    assert all(getattr(free, name) == () for name in ("dq_lower", "dq_upper"))
     assert "velocity_margin" not in free.metrics
 
 

@@ -158,7 +158,8 @@ def _sampled(run: Rollout) -> Certificate:
     )  # fmt: skip
     nan = np.full(run.t.shape, np.nan)
     traces = Traces(*(nan for _ in Traces._fields))._replace(
-        t=run.t, V=run.V, xi=run.xi, xi_bound=np.full(run.xi.shape, np.nan), e2=np.linalg.norm(run.e2, axis=1),
+        t=np.asarray(run.t), V=np.asarray(run.V), xi=np.asarray(run.xi), xi_bound=np.full(run.xi.shape, np.nan),
+        e2=np.linalg.norm(run.e2, axis=1),
         f_tilde=np.linalg.norm(run.disturbance - run.disturbance_estimate, axis=1), held=np.ones(run.t.shape, bool),
     )  # fmt: skip
     return Certificate(_heading(scenario), (*lines, *measured), certificate.numbers, traces, joints=joint_names(scenario.plant, run.n))

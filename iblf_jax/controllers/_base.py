@@ -7,6 +7,7 @@ V1, whether a guard or a limit was at work.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -29,11 +30,16 @@ class Setting(NamedTuple):
 
     def tube(self, t: jax.Array, *, acceleration: bool = True) -> Tube:
         """Reference, bounds and their rates at time t [s]; arguments as `bounds.tube_at`."""
-        return tube_at(self.reference, self.bounds, t, acceleration=acceleration)
+        return _tube(self.reference, self.bounds, t, acceleration)
 
     def speed_limits(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The bounds on the velocities at time t [s], (n,) each [rad/s]; only where there are any."""
         return speed_limits_at(self.reference, self.velocity_bounds, t)  # type: ignore[arg-type]
+
+
+@partial(jax.jit, static_argnums=3, inline=True)  # so that it is traced once for all that ask at a time
+def _tube(reference: Reference, bounds: Bounds, t: jax.Array, acceleration: bool) -> Tube:
+    return tube_at(reference, bounds, t, acceleration=acceleration)
 
 
 class Command(NamedTuple):

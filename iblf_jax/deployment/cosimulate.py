@@ -215,9 +215,8 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
                 now += h
                 if change < end - NEARLY * dt:
                     asked, arrived = commands[arrived], arrived + 1
-    told = jax.tree.map(lambda *x: np.stack(x), *states)
-    columns: list[Any] = [np.stack(column) if isinstance(column[0], np.ndarray | int) else () for column in zip(*rows, strict=True)]
-    return _Motion._make([*columns, told, broken])
+    columns: list[Any] = [jax.tree.map(lambda *x: np.stack(x), *column) for column in zip(*rows, strict=True)]
+    return _Motion._make([*columns, jax.tree.map(lambda *x: np.stack(x), *states), broken])
 
 
 @jax.jit

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from iblf_jax.core import checks
@@ -134,10 +135,9 @@ class Stages:
         self.state = self.moved(h, self.slopes, weights)
 
     def moved(self, h: float, slopes: list, weights: tuple[float, ...]) -> Any:
-        """The state after h [s]; a state that is nothing stays so."""
-        if not slopes or isinstance(self.state, tuple):
-            return self.state
-        return self.state + h * sum(w * np.asarray(slope) for w, slope in zip(weights, slopes, strict=False))
+        """The state after h [s]."""
+        steps = [h * weight for weight in weights[: len(slopes)]]
+        return jax.tree.map(lambda x, *rates: x + sum(w * rate for w, rate in zip(steps, rates, strict=True)), self.state, *slopes)
 
 
 # ------------------------------------------------------------------------------------------------------- the model and its joints

@@ -15,7 +15,6 @@ from iblf_jax.engine.plan import Shape
 from iblf_jax.engine.step import (
     Carry,
     Inputs,
-    Kick,
     Outcome,
     Probe,
     Probed,
@@ -139,8 +138,12 @@ def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
 
 def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]:
     """The carry before the first step, and what a `Probe` has found at the start."""
-    around = batch.each(lambda inputs: probed(jnp.zeros_like(inputs.dt), initial_state(inputs.scenario)))
-    found = _probed(executor, batch, around)
+
+    def around(inputs):
+        unseen = accuracy.unseen(inputs.scenario, method, inputs.dt, inputs.steps)
+        return probed(jnp.zeros_like(inputs.dt), initial_state(inputs.scenario), unseen)
+
+    found = _probed(executor, batch, batch.each(around))
     return batch.each(lambda inputs, found: start(inputs, method, found.jacobian), found), found
 
 
@@ -159,10 +162,12 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
 
     def critical(inputs, carry):
         instants = ((carry.nearest.t, carry.nearest.state), (inputs.dt * inputs.steps, carry.state))
-        return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant) for instant in instants))
+        nothing = accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant, nothing) for instant in instants))
 
-    def judged(inputs, carry, kicked, at_start, later):
-        return verdict(inputs, run.method, carry, kicked, jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later))
+    def judged(inputs, carry, at_start, later):
+        instants = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later)
+        return verdict(inputs, run.method, carry, at_start.unseen, instants)
 
     # Both instants of a run are probed as two runs, by the program that probed the start.
     lane = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.lane]
@@ -173,8 +178,7 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
     else:
         later = _probed(executor, twice, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), apart))
         later = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), later)
-    unseen = batch.each(lambda inputs: accuracy.unseen(inputs.scenario, run.method, inputs.dt, inputs.steps))
-    return batch.each(judged, carry, executor(Kick(), batch, unseen, 1, None)[0], at_start, later)
+    return batch.each(judged, carry, at_start, later)
 
 
 def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:

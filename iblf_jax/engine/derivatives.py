@@ -128,7 +128,7 @@ def pushed(function: Callable, directions: Directions, scenario, before: Differe
 
 def without_flags(sample: Sample) -> Any:
     """The numbers of a sample; its flags have no derivative."""
-    return {name: x for name, x in sample._asdict().items() if name not in FLAG_FIELDS}
+    return {name: x for name, x in vars(sample).items() if name not in FLAG_FIELDS}
 
 
 def preaccumulated(scenario, directions: Directions, eps: jax.Array, like: LoopState) -> Callable:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
-from iblf_jax.engine.batch import Batch, Executor, carry_shapes, run_all
+from iblf_jax.engine.batch import Batch, Executor, begin, carry_shapes, run_all
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
@@ -109,13 +109,25 @@ def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, ne
     return Batch.of(inputs, varied, shape, run.mechanism)
 
 
-def run_lowered(name: str, batch: Batch, run: Run) -> Outcome:
-    """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core."""
+def _program(batch: Batch, run: Run) -> Program:
+    """What a step of a run does."""
+    return program_of(TimeStep.of(run), batch, carry_shapes(batch, run.method)).program
+
+
+def run_lowered(name: str, batch: Batch, run: Run, program: Program | None = None, go: Callable[..., Any] | None = None) -> Any:
+    """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core.
+
+    Args:
+      name: of the executor.
+      batch, run: what to run.
+      program: of its step, where the caller has it.
+      go: what is done, a function (executor, batch, run); `run_all` if not given.
+    """
     if name == "native":
-        program, _ = program_of(TimeStep.of(run), batch, carry_shapes(batch, run.method))
+        program = program or _program(batch, run)
         native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
     try:
-        return run_all(executor_named(name), batch, run)
+        return (go or run_all)(executor_named(name), batch, run)
     except BaseException:
         stop_compilers()
         raise
@@ -192,8 +204,8 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
     inputs = inputs_of(scenario, folds, dt, run, noise)
     batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)
 
-    def run_on(name):
-        return jax.tree.map(lambda x: x[0], run_lowered(name, batch, run))
+    def run_on(name, program=None):
+        return jax.tree.map(lambda x: x[0], run_lowered(name, batch, run, program))
 
     def on_scan():
         return _scanned(inputs, None, False, lambda batch: run_all(scan, batch, run))
@@ -205,9 +217,8 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
     if name is None:
         return on_scan()
     try:
-        step = TimeStep.of(run)
-        program, _ = program_of(step, batch, carry_shapes(batch, run.method))
-        return run_on(name) if plan.lowers_one_run(name, _nodes(name, program)) else on_scan()
+        program = _program(batch, run)
+        return run_on(name, program) if plan.lowers_one_run(name, _nodes(name, program)) else on_scan()
     except (UnsupportedError, ToolchainError):
         return on_scan()
 
@@ -319,6 +330,12 @@ def chosen_backend(
     return _chosen_backend(backend, run, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
 
 
+def _up_to_the_end(executor: Executor, batch: Batch, run: Run) -> Any:
+    """What needs kernels of a batch: the verdict at the end takes none of its own."""
+    carry, _ = begin(executor, batch, run.method)
+    return executor(TimeStep.of(run), batch, carry, run.steps + 1, None)
+
+
 @lru_cache(maxsize=64)
 def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
     """`chosen_backend` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
@@ -327,7 +344,7 @@ def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], s
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
 
         def run_on(name):
-            run_lowered(name, _lowered_batch(inputs_of(scenario, folds, dt, run), varied, run), run)
+            run_lowered(name, _lowered_batch(inputs_of(scenario, folds, dt, run), varied, run), run, go=_up_to_the_end)
             return name
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))

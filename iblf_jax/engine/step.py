@@ -276,6 +276,8 @@ class Probed(NamedTuple):
     """Of the power iteration."""
     jacobian: jax.Array
     """By the numbers that `accuracy` watches, (m', m') [1/s]."""
+    unseen: accuracy.Unseen
+    """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass matrix."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,7 +306,8 @@ class Probe:
             growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
         column = jnp.arange(watched.size, dtype=index.dtype) == index
         jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
-        return Probed(carry.time, x, growth, jacobian), ()
+        unseen = keep_if(index == 0, accuracy.kicked(inputs.scenario, carry.unseen), carry.unseen)
+        return Probed(carry.time, x, growth, jacobian, unseen), ()
 
 
 def probe_steps(scenario: Scenario) -> int:
@@ -323,19 +326,10 @@ def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
     return stability.growth_rate_by(probed.jacobian) if complete else stability.growth_rate(probed.growth)
 
 
-def probed(time: jax.Array, state: LoopState) -> Probed:
+def probed(time: jax.Array, state: LoopState, unseen: accuracy.Unseen) -> Probed:
     """The carry of a `Probe`."""
     x, watched = ravel_pytree(surroundings(state))[0], accuracy.places(state).size
-    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype)))
-
-
-@dataclasses.dataclass(frozen=True)
-class Kick:
-    """What the torque that the stages did not see accelerates, in one step, as it takes the robot's mass matrix."""
-
-    def __call__(self, inputs: Inputs, carry: accuracy.Unseen, index: jax.Array, form: Form):
-        """The carry with accelerations; nothing is recorded."""
-        return accuracy.kicked(inputs.scenario, carry), ()
+    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype), unseen))
 
 
 def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
@@ -353,17 +347,17 @@ def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
     return finished(folds, jax.lax.scan(update, _begun(folds, first), samples)[0])
 
 
-def verdict(inputs: Inputs, method: str, carry: Carry, kicked: accuracy.Unseen, instants: Probed) -> Outcome:
+def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, instants: Probed) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
 
     Args:
       inputs: of the run.
       method: the integrator.
       carry: after the last step.
-      kicked: what a `Kick` has found.
-      instants: what a `Probe` has found at some of them.
+      unseen: what a `Probe` has found for the run.
+      instants: what it has found at some of them.
     """
-    estimate = accuracy.between_stages(carry.accuracy, kicked)
+    estimate = accuracy.between_stages(carry.accuracy, unseen)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     status = carry.status | flag(inputs.dt * mode > integrators.tableau(method).stability, Status.STEP_TOO_LARGE)

@@ -34,10 +34,11 @@ from iblf_jax.core.drafts import draft, remove_abandoned
 from iblf_jax.core.progress import told
 
 COMPILER_FLAGS = (
-    "-x", "c++", "-std=gnu++17", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math",
-    "-ffp-contract=fast", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden", "-w",
+    "-x", "c++", "-std=gnu++17", "-nostdinc++", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno",
+    "-fno-trapping-math", "-ffp-contract=fast", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden", "-w",
 )  # fmt: skip
-"""NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only."""
+"""NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  The headers are C's: C++ makes of `math.h` a tenth of a
+second more to read."""
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""
 VERSION_TIMEOUT = 20.0

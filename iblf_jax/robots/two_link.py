@@ -11,6 +11,7 @@ m l1 l2 to p3, m l1 to p4 and m l2 to p5.  (Some papers print p4 with lc2 in pla
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -67,6 +68,7 @@ class TwoLink:
         """Number of joints, 2."""
         return 2
 
+    @partial(jax.jit, inline=True)  # so that it is traced once for all that is made of it
     def lumped(self) -> LumpedParameters:
         """p1 ... p5 (head of this module), the payload included."""
         m1, m2 = self.mass[0], self.mass[1]

@@ -27,7 +27,9 @@ What the stages of a step cannot see, a reference or a disturbance that goes thr
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -89,6 +91,7 @@ def places(state: LoopState) -> np.ndarray:
     return np.concatenate(_watched(state, jax.tree.unflatten(structure, numbered)))
 
 
+@partial(jax.jit, static_argnames="n", inline=True)  # so that it is traced once
 def response(jacobian: jax.Array, n: int) -> jax.Array:
     """R from the Jacobian by the numbers that are watched, (m, m) [1/s]; 0 where there is none."""
     inner = jacobian[n:, n:]
@@ -204,33 +207,34 @@ def unseen(scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Arra
     scenario, dt = jax.lax.stop_gradient((scenario, dt))
     own, exact = (np.asarray(weights, dt.dtype)[:, None] for weights in (table.b, [w for _, w in GAUSS]))
     places = jnp.asarray([*table.c, *(place for place, _ in GAUSS), 1.0], dt.dtype)
-    stages = slice(len(table.c))
-
-    def at(index: jax.Array):
-        start = index.astype(dt.dtype) * dt
-        here = scenario.setting.tube(start)
-
-        def signals(t: jax.Array):
-            tube = scenario.setting.tube(t)
-            torque = scenario.disturbance.torque(t, here.q_d, here.dq_d, at_time(scenario.plant, t), scenario.model)
-            ends = jnp.concatenate([tube.q_d, tube.lower, tube.upper])
-            return ends, jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper]), torque
-
-        ends, rates, torques = jax.vmap(signals)(start + places * dt)
-        rate = jnp.sum(own * rates[stages], axis=0)
-        # The difference of two positions is rounded, the more so the later it is: that much is no error.
-        noise = 4.0 * jnp.finfo(dt.dtype).eps * (jnp.abs(ends[0]) + start * jnp.abs(rate)) / dt
-        missed = jnp.maximum(jnp.abs(rate - (ends[-1] - ends[0]) / dt) - noise, 0.0)
-        push = jnp.abs(jnp.sum(own * torques[stages], axis=0) - jnp.sum(exact * torques[len(table.c) : -1], axis=0))
-        return jnp.max(missed.reshape(3, n), axis=0), push, here.upper - here.lower
-
+    stages, others = slice(len(table.c)), slice(len(table.c), -1)
     # Steps in the places of the golden section, so that they share no period with a signal.
     spread = jnp.asarray(np.arange(INSTANTS) * 0.6180339887498949 % 1.0, dt.dtype)
-    indices = jnp.floor(spread * jnp.asarray(steps, spread.dtype)).astype(jnp.int32)
-    missed, push, width = jax.vmap(at)(indices)
-    missed = jnp.max(missed, axis=0)
+    starts = jnp.floor(spread * jnp.asarray(steps, spread.dtype)) * dt
+    times = starts[:, None] + places * dt
+
+    def at_all(signal: Callable, *args: jax.Array) -> Any:
+        """A signal at all places of all steps, (INSTANTS, places, ...), from arrays with these two axes."""
+        found = jax.vmap(signal)(*(x.reshape(times.size, *x.shape[2:]) for x in args))
+        return jax.tree.map(lambda x: x.reshape(*times.shape, *x.shape[1:]), found)
+
+    def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
+        return scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
+
+    tube = at_all(scenario.setting.tube, times)
+    ends = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
+    rates = jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper], axis=-1)
+    # The first stage of every method is at the start of the step.
+    torques = at_all(torque, times, *(jnp.broadcast_to(x[:, :1], x.shape) for x in (tube.q_d, tube.dq_d)))
+    rate = jnp.sum(own * rates[:, stages], axis=1)
+    # The difference of two positions is rounded, the more so the later it is: that much is no error.
+    noise = 4.0 * jnp.finfo(dt.dtype).eps * (jnp.abs(ends[:, 0]) + starts[:, None] * jnp.abs(rate)) / dt
+    missed = jnp.maximum(jnp.abs(rate - (ends[:, -1] - ends[:, 0]) / dt) - noise, 0.0)
+    missed = jnp.max(missed.reshape(-1, n), axis=0)
+    push = jnp.abs(jnp.sum(own * torques[:, stages], axis=1) - jnp.sum(exact * torques[:, others], axis=1))
+    width = jnp.min((tube.upper - tube.lower)[:, 0], axis=0)
     # A sampled law reads them at its samples: what they do between is no error of the step.
-    return Unseen(missed if scenario.sampling is None else jnp.zeros_like(missed), jnp.max(push, axis=0), jnp.min(width, axis=0))
+    return Unseen(missed if scenario.sampling is None else jnp.zeros_like(missed), jnp.max(push, axis=0), width)
 
 
 def kicked(scenario: Scenario, found: Unseen) -> Unseen:

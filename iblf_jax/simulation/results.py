@@ -16,7 +16,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import OPTIONAL, SIGNALS
+from iblf_jax.simulation.signals import Signals
 
 
 @jax.tree_util.register_dataclass
@@ -63,14 +63,9 @@ class Metrics(Mapping):
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 
 
-_FIELDS: Any = [(name, jax.Array) for name in SIGNALS if name not in OPTIONAL]
-_FIELDS += [(name, Any, dataclasses.field(default=(), kw_only=True)) for name in OPTIONAL]
-_Signals: Any = dataclasses.make_dataclass("_Signals", _FIELDS, frozen=True, eq=False)
-
-
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rollout(_Signals):
+class Rollout(Signals):
     """One run of a scenario, or many: every array below has a leading run axis then.
 
     Its signals, `run.t`, `run.q`, `run.tau` ..., are those of `simulation.signals`, (T,) or (T, n) for T recorded samples and n joints;

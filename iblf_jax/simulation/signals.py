@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 
 class Recorded(NamedTuple):
-    """Marks a signal that runs record: its SI unit, and what it is in words."""
+    """What a signal is that runs record: its SI unit, and its meaning in words."""
 
     unit: str
     meaning: str
 
 
-class Sample(NamedTuple):
-    """The loop at one instant: what is recorded, and what else metrics fold over.  Vectors are (n,)."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Signals:
+    """What runs record.  At an instant vectors are (n,); of a run the time axis comes before."""
 
     t: Annotated[Array, Recorded("s", "time")]
-    dt: Array
-    """The time that this sample stands for in a sum over time, () [s]: the step, and 0 for the last sample."""
     q: Annotated[Array, Recorded("rad", "joint position")]
     dq: Annotated[Array, Recorded("rad/s", "joint velocity")]
     tau: Annotated[Array, Recorded("N m", "applied torque")]
@@ -33,18 +34,27 @@ class Sample(NamedTuple):
     lower: Annotated[Array, Recorded("rad", "lower bound of q")]
     upper: Annotated[Array, Recorded("rad", "upper bound of q")]
     alpha: Annotated[Array, Recorded("rad/s", "virtual velocity")]
-    gravity: Array
-    """G0(q), what holding the model still takes [N m]."""
     disturbance: Annotated[Array, Recorded("N m", "lumped uncertain term f")]
     """Of (2.1)."""
     disturbance_estimate: Annotated[Array, Recorded("N m", "estimate of the uncertain term")]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
+    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = dataclasses.field(default=(), kw_only=True)
+    """`()` where velocities have no bounds."""
+    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = dataclasses.field(default=(), kw_only=True)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sample(Signals):
+    """The loop at one instant: what is recorded, and what else metrics fold over."""
+
+    dt: Array
+    """The time that this sample stands for in a sum over time, () [s]: the step, and 0 for the last sample."""
+    gravity: Array
+    """G0(q), what holding the model still takes [N m]."""
     guard_active: Array
     saturated: Array
-    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = ()
-    """`()` where velocities have no bounds."""
-    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = ()
 
 
 def has_speed_limits(sample: Sample) -> bool:
@@ -57,10 +67,5 @@ def speed_margin(sample: Sample, velocity: Array) -> Array:
     return jnp.minimum(velocity - sample.dq_lower, sample.dq_upper - velocity)
 
 
-SIGNALS: dict[str, Recorded] = {
-    name: hint.__metadata__[0] for name, hint in get_type_hints(Sample, include_extras=True).items() if hasattr(hint, "__metadata__")
-}
+SIGNALS: dict[str, Recorded] = {name: hint.__metadata__[0] for name, hint in get_type_hints(Signals, include_extras=True).items()}
 """Name of a recorded signal -> its unit and meaning, time first."""
-
-OPTIONAL = tuple(name for name in SIGNALS if name in Sample._field_defaults)
-"""Signals that some scenarios have: `()` in others."""

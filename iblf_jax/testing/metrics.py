@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -68,8 +69,8 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
 
 def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """The floating-point parts of a run, and its flags."""
-    moving = {k: v for k, v in samples._asdict().items() if jnp.issubdtype(v.dtype, jnp.floating)}
-    return moving, {k: v for k, v in samples._asdict().items() if k not in moving}
+    moving = {k: v for k, v in vars(samples).items() if jnp.issubdtype(v.dtype, jnp.floating)}
+    return moving, {k: v for k, v in vars(samples).items() if k not in moving}
 
 
 def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> Sample:
@@ -102,9 +103,8 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     """On a run without any error or torque, nothing is NaN, and nor is any derivative."""
-    rest = jax.tree.map(lambda x: jnp.zeros_like(x), samples)._replace(
-        t=samples.t, dt=samples.dt, lower=samples.lower, upper=samples.upper, q=samples.q_d, q_d=samples.q_d
-    )
+    still, kept = jax.tree.map(jnp.zeros_like, samples), ("t", "dt", "lower", "upper", "q_d")
+    rest = dataclasses.replace(still, q=samples.q_d, **{name: getattr(samples, name) for name in kept})
     moving, flags = parts(rest)
 
     @jax.jit

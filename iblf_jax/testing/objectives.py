@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -66,7 +67,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float) -> None:
     step = duration / LENGTH
     some = samples(np.random.default_rng(4), joints_of(quantity), step)
     # Between whole steps, so that no sample stands where a quantity begins to count.
-    some = some._replace(t=some.t + 0.5 * step)
+    some = dataclasses.replace(some, t=some.t + 0.5 * step)
     for dtype in ("float64", "float32"):
         _structure(findings, *in_dtype((quantity, jax.tree.map(lambda x: x[0], some)), dtype))
     findings.stop_if_any()

@@ -19,7 +19,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import simulate
@@ -195,6 +194,8 @@ def influence(risk: Risk, losses: np.ndarray) -> np.ndarray:
 def _change(name: str, before: np.ndarray, after: np.ndarray, confidence: float) -> Change:
     if len(before) == 1:
         return Change(name, float(before[0]), float(after[0]), None, None)
+    from scipy import stats  # a second to import
+
     difference = after - before
     half = stats.norm.ppf(0.5 + confidence / 2) * difference.std(ddof=1) / np.sqrt(len(difference))
     return Change(name, float(before.mean()), float(after.mean()), float(difference.mean() - half), float(difference.mean() + half))
