@@ -45,6 +45,8 @@ class Sample(NamedTuple):
     dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = ()
     """`()` where velocities have no bounds."""
     dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = ()
+    slack: Annotated[Any, Recorded("rad/s^2", "how far the law's filter broke its own conditions")] = ()
+    """`()` under laws without a filter."""
 
 
 def has_speed_limits(sample: Sample) -> bool:
