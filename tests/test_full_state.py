@@ -281,3 +281,18 @@ def test_it_needs_bounds_to_keep():
         ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=None)
     with pytest.raises(ValueError, match="Q is Theorem 2's"):
         ij.certificates.counterexample(ij.presets.zhang_yan_2024_full_state(), {"controller.k1": ij.value(ij.uniform(1.0, 3.0))})
+
+
+def test_it_stands_beside_other_laws_with_the_margin_of_the_velocities():
+    scenario = ij.presets.zhang_yan_2024_full_state()
+    plain = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, reading="corrected")
+    filtered = controllers.SafetyFilter(law=plain, nearest="acceleration")
+    compared = ij.compare(scenario, {"full state": scenario.controller, "plain": plain, "filter": filtered}, duration=0.5, dt=5e-4)
+    rows = {row.law: row for row in compared.table["gains"]}
+    for name, run in compared.rollouts.items():
+        assert rows[name].velocity_margin == pytest.approx(float(jnp.min(run.metrics.velocity_margin)))
+    assert "velocity margin" in repr(compared)
+    assert "velocity_margin" in compared.to_pandas()
+    free = ij.compare(ij.presets.zhang_yan_2024(), ["integral"], duration=0.1)
+    assert "velocity margin" not in repr(free)
+    assert "velocity_margin" not in free.to_pandas()

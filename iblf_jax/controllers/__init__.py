@@ -9,6 +9,8 @@ from iblf_jax.controllers.computed_torque import ComputedTorque as ComputedTorqu
 from iblf_jax.controllers.dynamic_surface import DynamicSurface as DynamicSurface
 from iblf_jax.controllers.full_state import FullState as FullState
 from iblf_jax.controllers.pd_gravity import PDGravity as PDGravity
+from iblf_jax.controllers.reference_governor import ReferenceGovernor as ReferenceGovernor
+from iblf_jax.controllers.safety_filter import SafetyFilter as SafetyFilter
 from iblf_jax.controllers.saturated import Saturated as Saturated
 from iblf_jax.controllers.saturated import within_effort as within_effort
 from iblf_jax.controllers.systems import LAWS as LAWS
@@ -22,6 +24,8 @@ MEMBERS = {
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
     "saturated": Saturated,
+    "safety_filter": SafetyFilter,
+    "reference_governor": ReferenceGovernor,
 }
 """Every law by the name that a scenario file gives it."""
 
@@ -36,6 +40,8 @@ __all__ = [
     "DynamicSurface",
     "FullState",
     "PDGravity",
+    "ReferenceGovernor",
+    "SafetyFilter",
     "Saturated",
     "Setting",
     "law_by_name",

@@ -55,6 +55,8 @@ class Command(NamedTuple):
     """bool: the barrier's guard holds the slope."""
     saturated: jax.Array
     """bool: the torque was cut to a limit."""
+    slack: Any = ()
+    """By how much a filter had to break its own conditions, (n,) [rad/s^2]; `()` for laws that have none."""
 
 
 class Controller(Protocol):

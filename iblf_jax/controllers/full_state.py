@@ -50,8 +50,8 @@ class FullState:
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
       K2: gain of the velocity error, () or (n,) [1/s], > 0; an acceleration's, not a torque's as `Backstepping.K2`.
-      c: how hard the slope s2 is resisted while the observer has not found f, () or (n,) [rad^2/s^3; 1/s where phi is in rad^2/s^2],
-        > 0; the claim of case 2 asks for c > 1/(4 (kf - 1/2) lambda_min(M0)^2).
+      c: how hard the slope s2 is resisted while the observer has not found f, () or (n,) [rad^2/s^3] (1/s where phi is in
+        rad^2/s^2), > 0; the claim of case 2 asks for c > 1/(4 (kf - 1/2) lambda_min(M0)^2).
       o: margin under the roots of both kappas, () or (n,) [1/s^2], > 0, for barriers that have them and for no others; 0.1 for these, if
         not given.
       barrier: on e1, any `Barrier`; `Integral()` if not given.

@@ -42,6 +42,9 @@ class Status(enum.IntFlag):
     ALPHA_INFEASIBLE = 2048
     """The virtual velocity touched or left the velocities' bounds: there no law that follows it can keep them, and nothing is claimed."""
 
+    FILTER_INFEASIBLE = 4096
+    """A safety filter's conditions had no common torque at some time: the torque broke them by the least slack, which the run records."""
+
 
 VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED
 """The flags of a constraint that was not kept."""
@@ -68,6 +71,7 @@ _WORDS = {
     Status.GUARD_STAYED: "the guard stayed active beyond the first instant",
     Status.SAMPLING_TOO_SLOW: "the law is sampled too slowly",
     Status.VELOCITY_VIOLATED: "a velocity bound was violated",
+    Status.FILTER_INFEASIBLE: "the safety filter's conditions could not all be met",
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
 

@@ -134,7 +134,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
     failed = status & FAILED
-    told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW)
+    told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW | Status.FILTER_INFEASIBLE)
     if getattr(unwrapped(result.scenario.controller), "needs_velocity_bounds", False):
         told |= status & Status.ALPHA_INFEASIBLE
     if not told:
@@ -183,6 +183,11 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             f"From one period to the next the loop grows, by {float(metrics[RADIUS]):.4g} at the worst of the instants that were looked "
             "at. Sample faster (ij.recommended_period says how fast), shorten the delay, or lower controller.K2, observer.kf or the gains "
             "of the velocity's filter."
+        )
+    if status & Status.FILTER_INFEASIBLE:
+        texts.append(
+            f"At the recorded samples its accelerations were beyond what its conditions allow by up to {float(np.max(result.slack)):.3g} "
+            "rad/s^2 (run.slack). Raise controller.limit, or lower a1, a2 and a3, so that it brakes sooner."
         )
     if status & Status.ALPHA_INFEASIBLE:
         worst = f"by up to {-float(np.min(metrics['alpha_margin'])):.3g} rad/s" if "alpha_margin" in metrics else "at some time"

@@ -95,6 +95,8 @@ def sample_status(sample: Sample) -> jax.Array:
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
         | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
     )
+    if not isinstance(sample.slack, tuple):
+        found |= flag(jnp.any(sample.slack > 0), Status.FILTER_INFEASIBLE)
     if not has_speed_limits(sample):
         return found
     found |= flag(jnp.any(~(speed_margin(sample, sample.dq) > 0)), Status.VELOCITY_VIOLATED)

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.actuators import Ideal
+from iblf_jax.controllers import Command
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.robots import at_time, friction_torque
@@ -39,6 +40,12 @@ class Said(NamedTuple):
     f_hat: jax.Array
     guard_active: jax.Array
     saturated: jax.Array
+    slack: Any = ()
+
+
+def said_by(command: Command, f_hat: jax.Array) -> Said:
+    """What a command says besides its torque."""
+    return Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated, command.slack)
 
 
 class Held(NamedTuple):
@@ -76,9 +83,11 @@ def initial_state(scenario: Scenario) -> LoopState:
     if scenario.sampling is None:
         return state
     zero, no = jnp.zeros_like(q), jnp.zeros((n,), bool)
+    command = jax.eval_shape(scenario.controller.command, zero[0], q, dq, zero, scenario.setting, state.controller)[0]
+    slack = () if isinstance(command.slack, tuple) else zero
     commands = jnp.repeat(still[None], scenario.sampling.queue + 1, axis=0)
     sensor = scenario.sensor.init(q, dq, scenario.sampling.period)
-    return state._replace(held=Held(commands, sensor, Measurement(q, dq), Said(zero, zero, zero, no, no)))
+    return state._replace(held=Held(commands, sensor, Measurement(q, dq), Said(zero, zero, zero, no, no, slack)))
 
 
 def moving(state: LoopState) -> LoopState:
@@ -109,7 +118,7 @@ def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Arra
     command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
     after = _advanced(sampling, observer, (t, q, dq, command.tau, scenario.model, state.observer))
     commands = jnp.concatenate([command.tau[None], held.commands[:-1]])
-    said = Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated)
+    said = said_by(command, f_hat)
     controller = jax.tree.map(lambda x, dx: x + sampling.period * dx, state.controller, rate)
     return state._replace(controller=controller, observer=after, held=Held(commands, sensor, measured, said))
 
@@ -194,7 +203,7 @@ def evaluate(
     if scenario.sampling is None:
         f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
         command, controller_rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
-        asked, said = command.tau, Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated)
+        asked, said = command.tau, said_by(command, f_hat)
     else:
         asked, said = state.held.commands[0] if torque is None else torque, state.held.said
     delivered = scenario.actuator.deliver(asked, dq, state.actuator)
@@ -258,6 +267,7 @@ def observed(
         V=V,
         guard_active=said.guard_active,
         saturated=said.saturated | limited,
+        slack=said.slack,
         **dict(zip(("dq_lower", "dq_upper"), limits, strict=False)),
     )
 

@@ -42,6 +42,10 @@ class Signals:
     dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = dataclasses.field(default=(), kw_only=True)
     """`()` where velocities have no bounds."""
     dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = dataclasses.field(default=(), kw_only=True)
+    slack: Annotated[Any, Recorded("rad/s^2", "how far the law's filter broke its own conditions")] = dataclasses.field(
+        default=(), kw_only=True
+    )
+    """`()` under laws without a filter."""
 
 
 @jax.tree_util.register_dataclass

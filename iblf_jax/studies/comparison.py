@@ -38,6 +38,8 @@ class Row(NamedTuple):
     """Smallest distance to a bound [rad]."""
     xi_margin: float
     """1 - max |xi| [1]."""
+    velocity_margin: float
+    """Smallest distance of a velocity to its bound [rad/s]; NaN where velocities have none."""
     peak_torque: float
     """[N m]."""
     torque_rms: float
@@ -56,6 +58,7 @@ HEADINGS = (
     "rmse [rad]",
     "margin [rad]",
     "1-max|xi|",
+    "velocity margin [rad/s]",
     "peak tau [N m]",
     "rms tau [N m]",
     "above gravity",
@@ -78,6 +81,7 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
         worst("rmse"),
         worst("margin", np.min),
         worst("xi_margin", np.min),
+        worst("velocity_margin", np.min) if "velocity_margin" in m else math.nan,
         worst("peak_torque"),
         float(np.sqrt(np.sum(np.asarray(m["torque_rms"]) ** 2))),
         float(m["effort_above_gravity"]),
@@ -139,14 +143,16 @@ class Comparison:
         run = next(iter(self.rollouts.values()))
         parts = [f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt = {float(run.dt):g} s, {run.method}; worst joint"]
         for held, rows in self.table.items():
-            parts += ["", HELD[held], *tables.as_text([HEADINGS, *map(_cells, rows)], left=(0, len(HEADINGS) - 1)), *self.notes[held]]
+            lines = _columns(rows)
+            parts += ["", HELD[held], *tables.as_text(lines, left=(0, len(lines[0]) - 1)), *self.notes[held]]
         return "\n".join(parts)
 
     def _repr_html_(self) -> str:
         parts = []
         for held, rows in self.table.items():
             notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[held])
-            parts.append(f"<h4>{HELD[held]}</h4>{tables.as_html(HEADINGS, map(_cells, rows))}{notes}")
+            headings, *lines = _columns(rows)
+            parts.append(f"<h4>{HELD[held]}</h4>{tables.as_html(headings, lines)}{notes}")
         return "".join(parts)
 
     def to_pandas(self):
@@ -154,13 +160,23 @@ class Comparison:
         import pandas as pd
 
         lines = [{"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows]
-        return pd.DataFrame(lines).set_index(["held", "law"])
+        frame = pd.DataFrame(lines).set_index(["held", "law"])
+        return frame if frame.velocity_margin.notna().any() else frame.drop(columns="velocity_margin")
 
     def plot(self, joint: int = 0, **options):
         """Overlaid figure of all laws, at their gains and at equal effort.  Options as `plotting.comparison`."""
         from iblf_jax import plotting
 
         return plotting.comparison(self, joint, **options)
+
+
+def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
+    """Headings and lines, without the margin of velocities that have no bounds."""
+    lines = [HEADINGS, *map(_cells, rows)]
+    if any(math.isfinite(row.velocity_margin) for row in rows):
+        return lines
+    at = Row._fields.index("velocity_margin")
+    return [(*line[:at], *line[at + 1 :]) for line in lines]
 
 
 def _cells(row: Row) -> tuple[str, ...]:

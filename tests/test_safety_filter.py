@@ -1,0 +1,207 @@
+"""The safety filter: its torque beside a general solver's, what it keeps, and what it says where it cannot."""
+
+import dataclasses
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import bounds, controllers
+from iblf_jax.simulation.closed_loop import initial_state
+
+RUN = {"duration": 1.5, "dt": 1e-3}
+LIMITED = {"limit": [60.0, 40.0]}
+
+
+def falling(**changes):
+    """PD that overshoots: soft, from a fast start, towards a reference next to the bound."""
+    law = controllers.PDGravity(Kp=30.0, Kd=0.4)
+    scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
+    rest = ij.references.Sinusoid(offset=[0.4, 0.5], amplitude=0.0)
+    walls = bounds.Bounds(lower=bounds.Sinusoid(0.2, [0.02, 0.0], 2.0), upper=bounds.Sinusoid(0.9, [0.0, 0.05], 3.0))
+    parts = {"controller": law, "reference": rest, "bounds": walls, "initial": ij.Initial([0.75, 0.3], [0.4, -0.1])}
+    return ij.with_parts(scenario, **(parts | {"disturbance": ij.disturbances.Nothing()} | changes))
+
+
+def filtered(scenario, **options):
+    return ij.with_parts(scenario, controller=controllers.SafetyFilter(law=scenario.controller, **options))
+
+
+def walls_at(t):
+    """Bounds of `falling` with two rates, by hand: (3, 2) each."""
+    lower = np.array([[0.2 + 0.02 * np.sin(2 * t), 0.2], [0.04 * np.cos(2 * t), 0.0], [-0.08 * np.sin(2 * t), 0.0]])
+    upper = np.array([[0.9, 0.9 + 0.05 * np.sin(3 * t)], [0.0, 0.15 * np.cos(3 * t)], [0.0, -0.45 * np.sin(3 * t)]])
+    return lower, upper
+
+
+def box_at(t, q, dq, a1=10.0, a2=10.0):
+    return [x[2] + (a1 + a2) * (x[1] - dq) + a1 * a2 * (x[0] - q) for x in walls_at(t)]
+
+
+@pytest.fixture(scope="module")
+def alone():
+    with pytest.warns(ij.SimulationWarning, match="bound was violated"):
+        return ij.simulate(falling(), **RUN)
+
+
+@pytest.mark.parametrize("options", [{"nearest": "acceleration"}, pytest.param(LIMITED | {"method": "euler"}, marks=pytest.mark.slow)])
+def test_it_keeps_what_the_law_breaks(alone, options):
+    assert float(jnp.min(alone.metrics.margin)) < -0.01
+    options = dict(options)
+    method = options.pop("method", "rk4")
+    run = ij.simulate(filtered(falling(), **options), **RUN, method=method)
+    assert not int(run.status) & ~int(ij.Status.INACCURATE)
+    assert float(jnp.min(run.metrics.margin)) > 0
+    assert float(jnp.max(run.slack)) == 0
+    for k in range(0, len(run.t), 50):
+        low, high = box_at(float(run.t[k]), np.asarray(run.q[k]), np.asarray(run.dq[k]))
+        model = run.scenario.model
+        rest = run.tau[k] - model.coriolis(run.q[k], run.dq[k], run.dq[k]) - model.gravity(run.q[k])
+        ddq = np.linalg.solve(model.mass_matrix(run.q[k]), rest)
+        assert np.all(ddq <= high + 1e-6 * (1 + np.abs(high)))
+        assert np.all(ddq >= low - 1e-6 * (1 + np.abs(low)))
+
+
+def commands(scenario, t, q, dq):
+    """Torque of the filter and of the law in it, and the slack."""
+    law, zero = scenario.controller, jnp.zeros(2)
+    found, bare = (x.command(t, q, dq, zero, scenario.setting, ())[0] for x in (law, law.law))
+    return found.tau, bare.tau, found.slack
+
+
+def random_places(rng, count):
+    return rng.uniform(0, 3, count), rng.uniform([0.23, 0.21], [0.88, 0.84], (count, 2)), rng.uniform(-2, 2, (count, 2))
+
+
+def _elsewhere(qpsolvers, *args):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return qpsolvers.solve_qp(*args, solver="clarabel", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
+
+
+@pytest.mark.parametrize("options", [{"nearest": "acceleration"}, {}, LIMITED | {"nearest": "acceleration"}])
+def test_the_torque_is_the_nearest_by_a_general_solver(options, rng):
+    qpsolvers = pytest.importorskip("qpsolvers")
+    import scipy.sparse as sp
+
+    scenario, (t, q, dq) = filtered(falling(), **options), random_places(rng, 100)
+    tau, bare, slack = jax.jit(jax.vmap(lambda *x: commands(scenario, *x)))(t, q, dq)
+    changed, lost = 0, 0
+    for k in range(len(t)):
+        M = np.asarray(scenario.model.mass_matrix(q[k]))
+        inverse = np.linalg.inv(M)
+        rest = np.asarray(scenario.model.coriolis(q[k], dq[k], dq[k]) + scenario.model.gravity(q[k]))
+        low, high = box_at(t[k], q[k], dq[k])
+        H = np.eye(2) if options.get("nearest") != "acceleration" else inverse.T @ inverse
+        H = H / np.max(H)
+        G, h = [inverse, -inverse], [high + inverse @ rest, -low - inverse @ rest]
+        if "limit" in options:
+            G, h = [*G, np.eye(2), -np.eye(2)], [*h, np.array(options["limit"]), np.array(options["limit"])]
+        G, h = np.concatenate(G), np.concatenate(h)
+        args = (sp.csc_matrix(H), -H @ np.asarray(bare[k]), sp.csc_matrix(G), h)
+        other = _elsewhere(qpsolvers, *args)
+        if other is None:  # it has given up, or there is none
+            lost += 1
+            continue
+        if np.any(np.asarray(slack[k]) > 0):
+            assert np.max(G @ other - h) > 1e-9
+            continue
+        np.testing.assert_allclose(tau[k], other, rtol=0, atol=1e-7 * (1 + np.max(np.abs(other))))
+        changed += np.max(np.abs(tau[k] - bare[k])) > 1e-3
+    assert changed > 20
+    assert lost < 5 + np.sum(np.max(slack, axis=1) > 0)
+
+
+def test_the_law_is_passed_on_where_it_is_safe():
+    scenario = filtered(falling())
+    tau, bare, slack = commands(scenario, jnp.zeros(()), jnp.array([0.5, 0.5]), jnp.array([0.01, -0.01]))
+    np.testing.assert_array_equal(tau, bare)
+    np.testing.assert_array_equal(slack, 0.0)
+
+
+def test_velocity_bounds_are_kept_too():
+    speeds = bounds.Bounds(lower=bounds.Constant(-0.8), upper=bounds.Sinusoid(0.6, 0.05, 2.0))
+    scenario = falling(velocity_bounds=speeds)
+    with pytest.warns(ij.SimulationWarning, match="velocity bound was violated"):
+        bare = ij.simulate(scenario, **RUN)
+    assert float(jnp.min(bare.metrics.velocity_margin)) < -0.1
+    run = ij.simulate(filtered(scenario, nearest="acceleration"), **RUN)
+    assert not int(run.status) & int(ij.Status.VELOCITY_VIOLATED | ij.Status.BOUND_VIOLATED | ij.Status.FILTER_INFEASIBLE)
+    assert float(jnp.min(run.metrics.velocity_margin)) > 0
+
+
+def test_an_empty_box_is_flagged_with_its_slack():
+    narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
+    scenario = filtered(falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
+    with pytest.warns(ij.SimulationWarning, match=r"safety filter's conditions could not all be met.*rad/s\^2"):
+        run = ij.simulate(ij.with_parts(scenario, initial=ij.Initial([0.75, 0.84], [0.45, 0.45])), **RUN)
+    assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
+    worst = np.unravel_index(np.argmax(run.slack), run.slack.shape)
+    low, high = scenario.controller.box(run.t[worst[0]], run.q[worst[0]], run.dq[worst[0]], scenario.setting)
+    assert float(run.slack[worst]) == pytest.approx(0.5 * float(low[worst[1]] - high[worst[1]]))
+
+
+@pytest.mark.slow
+def test_too_little_torque_is_flagged_and_never_exceeded():
+    with pytest.warns(ij.SimulationWarning, match="safety filter"):
+        run = ij.simulate(filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler")
+    assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
+    assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([7.0, 2.0]) * (1 + 1e-9))
+    assert float(jnp.max(run.slack)) > 0.1
+
+
+@pytest.mark.slow
+def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
+    scenario = filtered(falling(), **LIMITED)
+    options = {"runs": 4, "duration": 0.05, "dt": 1e-3, "method": "euler", "progress": False}
+    perturbations = {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}
+    native, xla = (ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "xla"))
+    for name in ("margin", "peak_torque", "ise"):
+        np.testing.assert_allclose(native.metrics[name], xla.metrics[name], rtol=1e-7, atol=1e-10)
+    again_at = 3
+    again = native.replay(again_at)
+    np.testing.assert_array_equal(again.metrics.ise, native.metrics["ise"][again_at])
+
+
+def test_it_is_sampled_and_saved(tmp_path):
+    scenario = ij.with_parts(filtered(falling(), nearest="acceleration"), sampling=ij.Sampling(period=2e-3, delay=1e-3))
+    run = ij.simulate(scenario, **RUN)
+    assert float(jnp.min(run.metrics.margin)) > 0
+    assert run.slack.shape == run.q.shape
+    ij.save_scenario(filtered(falling(), **LIMITED), tmp_path / "s.toml")
+    again = ij.load_scenario(tmp_path / "s.toml")
+    assert jax.tree.structure(again) == jax.tree.structure(filtered(falling(), **LIMITED))
+    assert "controller.a1" in {p.path for p in ij.parameters(again)}
+
+
+def test_a_gradient_is_the_difference():
+    start = initial_state(filtered(falling()))
+
+    def torque(a1, q):
+        scenario = ij.with_parameters(filtered(falling()), {"controller.a1": a1})
+        return jnp.sum(commands(scenario, jnp.zeros(()), q, jnp.array([1.5, -1.0]))[0])
+
+    q, h = start.q + jnp.array([0.1, -0.05]), 1e-5
+    found = jax.jvp(torque, (8.0, q), (1.0, jnp.ones(2)))[1]
+    difference = (torque(8.0 + h, q + h) - torque(8.0 - h, q - h)) / (2 * h)
+    assert abs(float(found)) > 0.1
+    assert float(found) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_theorem_2_claims_nothing_while_it_works():
+    """The certificate of a barrier law within a filter leaves out the samples at which the torque was changed."""
+    base = dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), initial=ij.Initial([0.95, 0.6], [0.5, 0.0]))
+    scenario = filtered(base, nearest="acceleration", a1=20.0, a2=20.0)
+    certificate = ij.certify(scenario, duration=0.3, dt=1e-3)
+    assert 0 < certificate.numbers["samples_left_out"] < certificate.numbers["samples"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"), [({"nearest": "jerk"}, "acceleration"), ({"a1": -1.0}, "> 0"), ({"law": 3}, "SafetyFilter.law")]
+)
+def test_bad_ones_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        controllers.SafetyFilter(**{"law": controllers.PDGravity(Kp=1.0, Kd=1.0)} | options)
