@@ -17,6 +17,7 @@ from iblf_jax import presets as presets
 from iblf_jax import references as references
 from iblf_jax import robots as robots
 from iblf_jax import sensors as sensors
+from iblf_jax.bounds import Bounds as Bounds
 from iblf_jax.core import linalg as linalg
 from iblf_jax.core import pytree as pytree
 from iblf_jax.core import status as status

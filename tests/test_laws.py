@@ -367,3 +367,51 @@ def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_
     for wrong in ({}, {"l1": 1.0}, {"bandwidth": 1.0, "l1": 1.0, "l2": 1.0}):
         with pytest.raises(ValueError, match="bandwidth"):
             observers.ExtendedState(**wrong)
+
+
+# --------------------------------------------------------------------------------------------- laws for other constraints, on the backends
+
+
+def _constrained(name):
+    """The paper's arm under one of the laws that know of other constraints, or keep bounds in another way."""
+    full = ij.presets.zhang_yan_2024_full_state()
+    pd = controllers.PDGravity(Kp=60.0, Kd=20.0)
+    law = {
+        "full_state": full.controller,
+        "full_state_smooth": controllers.FullState(k1=2.0, K2=20.0, c=1.0, velocity_barrier=ij.barriers.Tan()),
+        "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
+        "reference_governor": controllers.ReferenceGovernor(law=pd),
+        "safety_filter": controllers.SafetyFilter(law=pd, nearest="acceleration"),
+    }[name]
+    return ij.with_parts(full, controller=law)
+
+
+CONSTRAINED = ("full_state", "full_state_smooth", "dynamic_surface", "reference_governor", "safety_filter")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_backends_agree_on_them_and_a_run_alone_is_that_of_a_batch(name):
+    scenario, spread = _constrained(name), {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}
+    options = {"runs": 5, "duration": 0.1, "dt": 5e-4, "progress": False, "seed": 3}
+    studies = {b: ij.monte_carlo(scenario, spread, backend=b, **options) for b in ("native", "xla", "vmap")}
+    for other in ("xla", "vmap"):
+        for metric in ("ise", "margin", "velocity_margin", "alpha_margin", "peak_torque"):
+            found, expected = (np.asarray(studies[b].metrics[metric]) for b in (other, "native"))
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12, err_msg=f"{other}: {metric}")
+        np.testing.assert_array_equal(studies[other].status, studies["native"].status)
+    alone = studies["native"].replay(2)
+    for metric in ("ise", "velocity_margin"):
+        np.testing.assert_array_equal(alone.metrics[metric], studies["native"].metrics[metric][2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "path"), [("full_state", "controller.c"), ("dynamic_surface", "controller.filter"), ("safety_filter", "controller.a1")]
+)
+def test_their_gains_can_be_tuned(name, path):
+    scenario = _constrained(name)
+    objective = ij.objectives.tracking() + 0.1 * ij.objectives.effort() + ij.objectives.velocity_margin_above(0.05)
+    result = ij.tune(scenario, [path], objective, duration=0.2, dt=5e-4, iterations=4, progress=False)
+    assert result.report.verdicts[0].verdict == "pass"
+    assert result.history["objective"][-1, 0] <= result.history["objective"][0, 0]

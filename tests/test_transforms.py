@@ -15,6 +15,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine import execute, native, plan, step, transformable
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.simulation.signals import OPTIONAL
 
 PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")
 NOMINAL = (2.0, 20.0, 0.1, 20.0, 1.5, 0.8, 0.0, 0.0)
@@ -163,7 +164,8 @@ def everything(scenario, **options):
 
     def run(values):
         made = ij.simulate(ij.with_parameters(scenario, values), **LIGHT, **options)
-        return {name: x for name, x in {**vars(made), **made.metrics}.items() if name in step.SIGNALS or name in made.metrics}
+        recorded = set(step.SIGNALS) - set(OPTIONAL)
+        return {name: x for name, x in {**vars(made), **made.metrics}.items() if name in recorded or name in made.metrics}
 
     def floats(values):
         return {name: x for name, x in run(values).items() if jnp.issubdtype(x.dtype, jnp.floating)}
