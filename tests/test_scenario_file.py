@@ -19,6 +19,7 @@ import pytest
 import tomli_w
 
 import iblf_jax as ij
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.files import scenario as scenario_file
 
 
@@ -41,13 +42,18 @@ def scenarios(draw) -> ij.Scenario:
     def one(family):
         return draw(st.sampled_from(list(family.values())))
 
-    plant = draw(st.sampled_from(TWO_JOINTS))
+    def both_sides():
+        return ij.bounds.Bounds(one(members.SIDES), one(members.SIDES))
+
+    plant, law = draw(st.sampled_from(TWO_JOINTS)), one(members.LAWS)
+    limited = getattr(unwrapped(law), "needs_velocity_bounds", False) or draw(st.booleans())
     scenario = ij.Scenario(
         plant=plant,
         model=draw(st.sampled_from([plant, *TWO_JOINTS])),
         reference=one(members.REFERENCES),
-        bounds=ij.bounds.Bounds(one(members.SIDES), one(members.SIDES)),
-        controller=one(members.LAWS),
+        bounds=both_sides(),
+        velocity_bounds=both_sides() if limited else None,
+        controller=law,
         observer=one(members.OBSERVERS),
         disturbance=one(members.DISTURBANCES),
         initial=ij.Initial(q=0.5),
