@@ -40,16 +40,20 @@ def scenarios(draw) -> ij.Scenario:
     def one(family):
         return draw(st.sampled_from(list(family.values())))
 
-    plant = draw(st.sampled_from(TWO_JOINTS))
+    plant, law = draw(st.sampled_from(TWO_JOINTS)), one(members.LAWS)
+    speeds = None
+    if getattr(law, "needs_velocity_bounds", False) or draw(st.booleans()):
+        speeds = ij.Bounds(one(members.SIDES), one(members.SIDES))
     scenario = ij.Scenario(
         plant=plant,
         model=draw(st.sampled_from([plant, *TWO_JOINTS])),
         reference=one(members.REFERENCES),
         bounds=ij.bounds.Bounds(one(members.SIDES), one(members.SIDES)),
-        controller=one(members.LAWS),
+        controller=law,
         observer=one(members.OBSERVERS),
         disturbance=one(members.DISTURBANCES),
         initial=ij.Initial(q=0.5),
+        velocity_bounds=speeds,
     )
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     dtype = draw(st.sampled_from(["float64", "float32"]))
