@@ -39,6 +39,8 @@ SPECIAL = {
     "tip_force": lambda cls: cls(amplitude=[1.0, 2.0], frequency=2.0),
     "funnel": lambda cls: cls(initial=0.4, final=0.2, rate=1.0),
     "constant": lambda cls: cls(0.95),
+    "reference_governor": lambda cls: cls(ij.controllers.PDGravity(Kp=60.0, Kd=20.0)),
+    "safety_filter": lambda cls: cls(PRESET.controller, nearest="acceleration"),
     "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
     "extended_state": lambda cls: cls(bandwidth=40.0),
 }
@@ -66,7 +68,8 @@ def with_member(family: str, name: str, cls):
         upper = PRESET.bounds.upper if name == "sinusoid" else part
         return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(PRESET.bounds.lower, upper))
     fields = {"robots": ("plant", "model")}.get(family, (family[:-1],))
-    return dataclasses.replace(PRESET, **dict.fromkeys(fields, part))
+    speeds = ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.0)) if getattr(part, "needs_velocity_bounds", False) else None
+    return dataclasses.replace(PRESET, velocity_bounds=speeds, **dict.fromkeys(fields, part))
 
 
 FAMILIES = ("barriers", "bounds", "controllers", "disturbances", "observers", "references", "robots")
