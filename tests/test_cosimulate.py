@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 from arm_cases import ARMS
@@ -9,6 +10,7 @@ from arm_cases import ARMS
 import iblf_jax as ij
 
 mujoco = pytest.importorskip("mujoco")
+from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
 PAPER = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0})
@@ -127,11 +129,39 @@ def _written(name: str, text: str) -> str:
     return name
 
 
+DRIVES = """<tendon><fixed name="wire"><joint joint="elbow" coef="1"/></fixed></tendon><actuator>
+  <position joint="elbow" kp="50"/> <position jointinparent="elbow" kp="50"/> <position tendon="wire" kp="50"/>
+  <general site="hand" gear="0 1 0 0 0 0" biastype="affine" biasprm="5 0 0"/> <motor joint="turntable"/></actuator>"""
+
+
 def test_a_models_own_drives_are_off():
-    text = two_link(PAPER.plant).replace("</worldbody>", '</worldbody><actuator><position joint="elbow" kp="50"/></actuator>')
-    driven = ij.cosimulate(PAPER, _written("driven.xml", text), period=1e-3, **TIMING)
-    plain = ij.cosimulate(PAPER, _written("plain.xml", two_link(PAPER.plant)), period=1e-3, **TIMING)
-    assert largest_difference(driven.q, plain.q) == 0.0
+    aside = '<body name="table" pos="3 0 0"><joint name="turntable" axis="0 0 1"/><geom size="0.1"/></body>'
+    site = '<site name="hand" pos="0.2 0 0"/>'
+    arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant)))
+    scenario = ij.with_parts(PAPER, robot=arm)
+    text = two_link(PAPER.plant, inside=site, outside=aside).replace("</worldbody>", f"</worldbody>{DRIVES}")
+    driven = ij.cosimulate(scenario, _written("driven.xml", text), period=1e-3, **TIMING)
+    plain = ij.cosimulate(scenario, _written("plain.xml", two_link(PAPER.plant)), period=1e-3, **TIMING)
+    assert largest_difference(driven.q, plain.q) < 1e-12
+
+
+GRIPPER = """<body name="left" pos="0.1 0 0"><joint name="l" type="slide" axis="0 1 0"/><geom size="0.01" mass="0.1"/></body>
+  <body name="right" pos="0.1 0 0"><joint name="r" type="slide" axis="0 -1 0"/><geom size="0.01" mass="0.1"/></body>"""
+AROUND = """<tendon><fixed name="split"><joint joint="l" coef="0.5"/><joint joint="r" coef="0.5"/></fixed></tendon>
+  <equality><joint joint1="l" joint2="r"/></equality><actuator><position tendon="split"/><position jointinparent="l"/></actuator>
+  <sensor><jointpos joint="l"/></sensor><keyframe><key name="home" qpos="0 0 0.01 0.01"/></keyframe>"""
+
+
+def test_a_gripper_goes_with_all_that_moves_it():
+    text = two_link(PAPER.plant, inside=GRIPPER).replace("</worldbody>", f"</worldbody>{AROUND}")
+    arm = ij.robots.load(_written("gripper.xml", text), tip="fore", locked={"l": 0.02, "r": 0.02})
+    scenario = ij.with_parts(PAPER, robot=arm, sampling=ij.Sampling(1e-3))
+    expected = ij.simulate(scenario, **TIMING)
+    found = ij.cosimulate(scenario, "gripper.xml", locked={"l": 0.02, "r": 0.02}, **TIMING)
+    assert largest_difference(found.q, expected.q) < 1e-9
+    tied = text.replace('joint="r" coef="0.5"', 'joint="elbow" coef="0.5"')
+    with pytest.raises(ValueError, match=r"tendon 'split'.*one or the other"):
+        ij.cosimulate(scenario, _written("tied.xml", tied), duration=0.1)
 
 
 def test_models_stay_as_they_are_and_other_integrators_come_near():
@@ -184,6 +214,20 @@ def test_records_and_films(tmp_path):
         assert film.n_frames == 6
 
 
+def test_films_may_follow_each_other(tmp_path):
+    """Without a display MuJoCo's renderer fails once, and ends the process at the second try."""
+    for ending in ("gif", "html"):
+        ij.cosimulate(PAPER, spec_of(PAPER.plant), period=1e-3, duration=0.05, dt=1e-3, film=tmp_path / f"arm.{ending}")
+        assert (tmp_path / f"arm.{ending}").stat().st_size > 1000
+
+
+def test_a_shorter_period_finds_room_for_its_commands():
+    slow = ij.with_parts(PAPER, sampling=ij.Sampling(4e-3, delay=4e-3))
+    run = ij.cosimulate(slow, spec_of(PAPER.plant), period=1e-3, duration=0.02, dt=1e-3)
+    expected = ij.simulate(ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, delay=4e-3)), duration=0.02, dt=1e-3)
+    assert largest_difference(run.q, expected.q) < 1e-12
+
+
 BAD = {
     "no period": ({}, {}, "period"),
     "steps": ({}, {"period": 1e-3, "dt": 3e-4}, "Take dt=0.00025"),
@@ -191,7 +235,11 @@ BAD = {
     "joints": ({"inside": FINGER}, {"period": 1e-3}, "3 joints that move"),
     "locked": ({}, {"period": 1e-3, "locked": {"wrist": 0.0}}, "wrist.*shoulder"),
     "floating": ({"outside": ""}, {"period": 1e-3, "locked": {"shoulder": 0.0}}, "1 joints that move"),
-    "film": ({}, {"period": 1e-3, "film": "arm.mp4"}, "gif"),
+    "too few": ({}, {"period": 1e-3, "locked": {"elbow": 0.0}}, "1 joints that move.*Only hinges"),
+    "film": ({}, {"period": 1e-3, "film": "arm.mp4"}, "film.*gif"),
+    "no number": ({}, {"period": 1e-3, "locked": {"elbow": float("nan")}}, "locked"),
+    "a word": ({}, {"period": 1e-3, "locked": {"elbow": "a"}}, "locked"),
+    "duration": ({}, {"period": 7e-4, "duration": 0.1}, r"Take duration=0\.10\d*\.$"),
 }
 
 
@@ -199,7 +247,23 @@ BAD = {
 def test_what_does_not_fit_is_named(case):
     parts, options, words = BAD[case]
     with pytest.raises(ValueError, match=words):
-        ij.cosimulate(PAPER, spec_of(PAPER.plant, **parts), duration=0.1, **options)
+        ij.cosimulate(PAPER, spec_of(PAPER.plant, **parts), **({"duration": 0.1} | options))
+
+
+def test_what_is_no_model_or_no_single_scenario_is_named():
+    with pytest.raises(ValueError, match=r"plant.*MjSpec"):
+        ij.cosimulate(PAPER, 3, duration=0.1, period=1e-3)
+    many = jax.tree.map(lambda x: np.stack([x, x]), PAPER)
+    with pytest.raises(ValueError, match="one scenario"):
+        ij.cosimulate(many, spec_of(PAPER.plant), duration=0.1, period=1e-3)
+
+
+def test_a_urdf_whose_meshes_are_not_there_touches_nothing():
+    shape = '<collision><geometry><mesh filename="package://nowhere/link.stl"/></geometry></collision></link>'
+    text = (ARMS / "ur5.urdf").read_text().replace("</link>", shape)
+    scenario = ij.with_parts(ij.presets.ur5(), sampling=ij.Sampling(1e-3))
+    with pytest.warns(UserWarning, match="shapes are left out"):
+        MujocoPlant(_written("meshed.urdf", text), tuple(scenario.plant.joints), 6, {}, "RK4")
 
 
 def test_files_and_names_that_do_not_fit():

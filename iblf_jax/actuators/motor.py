@@ -17,7 +17,9 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 class Motor:
     """v = clip(asked, +-limit);   y' = clip(bandwidth (v - y), +-rate_limit);   tau = clip(y, +-stall (1 - |q'|/no_load_speed)).
 
-    What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the no-load speed.
+    What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the no-load speed.  The lag is integrated with
+    the plant: behind a jump of the command the torque is right to 1e-5 of the jump where dt bandwidth <= 0.2 (rk4), the positions far
+    better.
 
     Args:
       bandwidth: of the current loop, () or (n,) [1/s], > 0; no lag if not given.

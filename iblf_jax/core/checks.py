@@ -402,8 +402,8 @@ def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
     return path
 
 
-def whole_steps(duration: Any, dt: Any) -> int:
-    """The number of steps of size `dt` in `duration`, or a ValueError that says which duration would do."""
+def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
+    """The number of steps of size `dt` in `duration`, or a ValueError that says which duration, or which dt if that is free, would do."""
     duration = positive_number("duration", duration, "s")
     dt = positive_number("dt", dt, "s")
     if not duration / dt <= MOST_STEPS:
@@ -412,9 +412,8 @@ def whole_steps(duration: Any, dt: Any) -> int:
     # A thousandth of a step is forgiven, so that a duration that has been through float32 is taken for what it was.
     if steps < 1 or abs(steps * dt - duration) > 1e-3 * dt + 1e-12 * duration:
         near = max(steps, 1)
-        raise fail(
-            "duration", duration, f"a whole number of steps dt = {dt:g} s", f"Take duration={near * dt:.12g} or dt={duration / near:.12g}."
-        )
+        remedy = f"Take duration={near * dt:.12g}" + (f" or dt={duration / near:.12g}." if dt_is_free else ".")
+        raise fail("duration", duration, f"a whole number of steps dt = {dt:g} s", remedy)
     return steps
 
 

@@ -28,7 +28,7 @@ from iblf_jax.robots import at_time
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import NEARLY, Sampling, check_step, has_noise, noise_key, normals
+from iblf_jax.simulation.sampling import NEARLY, Sampling, check_step, has_noise, noise_key, normals, under_way
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import SIGNALS
 
@@ -87,7 +87,7 @@ def cosimulate(
         checks.one_of("integrator", integrator, INTEGRATORS)
     scenario = canonical(_with_period(scenario, period))
     if not checks.is_concrete(scenario):
-        raise checks.fail("scenario", scenario, "numbers", "MuJoCo has no derivatives: call this outside of jit, vmap and grad.")
+        raise checks.fail("scenario", "traced values", "numbers", "MuJoCo has no derivatives: call this outside of jit, vmap and grad.")
     seed, throw = checks.seed(seed), checks.flag("throw", throw)
     names = tuple(getattr(scenario.plant, "joints", ()))
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
@@ -96,7 +96,7 @@ def cosimulate(
     own = float(sampling.period) / max(1, math.ceil(float(sampling.period) / robot.timestep - NEARLY))
     dt = own if dt is None else checks.positive_number("dt", dt, "s")
     check_step(scenario, dt)
-    steps = checks.whole_steps(duration, dt)
+    steps = checks.whole_steps(duration, dt, dt_is_free=False)
     record_every = checks.recorded_every(record_every, steps)
     write = None if film is None else _film_writer(film)
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario.n, velocity_bounds=scenario.velocity_bounds is not None)
@@ -113,20 +113,26 @@ def _film_writer(path: str | Path) -> Callable:
     from iblf_jax.deployment.film import film_run
     from iblf_jax.plotting.animation import film_path
 
-    return partial(film_run, path=film_path(path))
+    return partial(film_run, path=film_path(path, "film"))
 
 
 def _with_period(scenario: Scenario, period: float | None) -> Scenario:
     """The scenario, its law sampled with this period."""
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
+    if np.ndim(scenario.initial.q) != 1:
+        raise checks.fail(
+            "scenario", f"a batch, initial.q of shape {np.shape(scenario.initial.q)}", "one scenario", "Call it once for each."
+        )
     if period is None:
         if scenario.sampling is None:
             raise checks.fail("period", None, "the period of the law [s]", "MuJoCo's robot is driven by a sampled law: period=1e-3.")
         return scenario
     period = checks.positive_number("period", period, "s")
-    sampling = Sampling(period) if scenario.sampling is None else dataclasses.replace(scenario.sampling, period=period)
-    return dataclasses.replace(scenario, sampling=sampling)
+    if scenario.sampling is None:
+        return dataclasses.replace(scenario, sampling=Sampling(period))
+    queue = max(scenario.sampling.queue, under_way(float(scenario.sampling.delay), period))
+    return dataclasses.replace(scenario, sampling=dataclasses.replace(scenario.sampling, period=period, queue=queue))
 
 
 class _Motion(NamedTuple):

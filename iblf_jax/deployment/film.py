@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
+import subprocess
+import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +42,17 @@ def film_run(run: Rollout, robot: MujocoPlant, positions: np.ndarray, dt: float,
 
 def _renderer(robot: MujocoPlant) -> Any:
     """MuJoCo's renderer; None where nothing can be drawn."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return robot.mujoco.Renderer(robot.model, *SIZE)
-        except Exception:  # each graphics library has its own way to say that it is not there
-            return None
+    return robot.mujoco.Renderer(robot.model, *SIZE) if _can_draw() else None
+
+
+@cache
+def _can_draw() -> bool:
+    """Whether MuJoCo can draw on this machine, tried in a process of its own: without a display, the second try ends the process."""
+    words = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>')).render()"
+    try:
+        return subprocess.run([sys.executable, "-c", words], capture_output=True, timeout=60).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
 
 
 def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Iterator[np.ndarray]:

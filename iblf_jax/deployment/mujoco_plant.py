@@ -7,6 +7,8 @@ the same arm, such as the fingers of a gripper, is locked as `robots.load` locks
 from __future__ import annotations
 
 import copy
+import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +19,8 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.robots.description import Shown, read
-from iblf_jax.robots.tree import HINGE, JOINT, SLIDE, Tree, mujoco_package, unknown
+from iblf_jax.robots.load import locked_position
+from iblf_jax.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unknown
 
 INTEGRATORS = ("RK4", "Euler", "implicit", "implicitfast")
 
@@ -53,9 +56,10 @@ class MujocoPlant:
             model, joints = _locked(mujoco, _specification(mujoco, plant), plant, names, n, locked)
         self.model = model
         self.positions, self.speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        arm = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in joints}
         for a in range(model.nu):  # the law takes the place of the model's own drives
-            if model.actuator_trntype[a] == JOINT and model.actuator_trnid[a, 0] in joints:
-                model.actuator_gear[a] = 0.0
+            if arm & {int(model.body_rootid[body]) for body in _driven_bodies(mujoco, model, a)}:
+                model.actuator_gear[a] = model.actuator_gainprm[a] = model.actuator_biasprm[a] = 0.0
         if integrator is not None:
             model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
         # Else it would begin again from its first state where it fails, and no result would say so.
@@ -143,27 +147,55 @@ class Stages:
 # ------------------------------------------------------------------------------------------------------- the model and its joints
 
 
+def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
+    """The bodies that an actuator of the model acts on."""
+    kind, target = mujoco.mjtTrn(int(model.actuator_trntype[a])), int(model.actuator_trnid[a, 0])
+    if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        return [model.jnt_bodyid[target]]
+    if kind == mujoco.mjtTrn.mjTRN_BODY:
+        return [target]
+    if kind != mujoco.mjtTrn.mjTRN_TENDON:
+        return [model.site_bodyid[target]]
+    start, bodies, wraps = model.tendon_adr[target], [], mujoco.mjtWrap
+    of = {wraps.mjWRAP_JOINT: model.jnt_bodyid, wraps.mjWRAP_SITE: model.site_bodyid}
+    for w in range(start, start + model.tendon_num[target]):
+        if wraps(int(model.wrap_type[w])) != wraps.mjWRAP_PULLEY:
+            bodies.append(of.get(wraps(int(model.wrap_type[w])), model.geom_bodyid)[model.wrap_objid[w]])
+    return bodies
+
+
 def _specification(mujoco: Any, plant: Any) -> Any:
     """MuJoCo's specification, whole: with what collides."""
     if isinstance(plant, mujoco.MjSpec):
         return plant.copy()
+    if not isinstance(plant, str | os.PathLike):
+        raise checks.fail("plant", plant, "the path of an MJCF or URDF, a mujoco.MjSpec or a mujoco.MjModel")
     root, path = read(plant), Path(plant)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+        raise _refused(path, error) from None
     if root.tag == "robot":
-        _without_missing_meshes(mujoco, spec, path.parent)
+        _without_missing_meshes(spec, path)
     return spec
 
 
-def _without_missing_meshes(mujoco: Any, spec: Any, folder: Path) -> None:
+def _refused(plant: Any, error: ValueError) -> ValueError:
+    """What MuJoCo does not accept, in its words."""
+    name, words = plant if isinstance(plant, str | os.PathLike) else "plant", " ".join(str(error).split())
+    return ValueError(f"{name}: {words}" + (". Put the file where the model looks for it." if "opening file" in words else ""))
+
+
+def _without_missing_meshes(spec: Any, path: Path) -> None:
     """Takes the shapes of a URDF whose files are not there out of it: its links have their weights from numbers."""
+    folder = path.parent
     place = folder / spec.meshdir
     missing = {mesh.name for mesh in spec.meshes if not (place / (Path(mesh.file).name if spec.strippath else mesh.file)).exists()}
-    for geom in list(spec.geoms):
-        if geom.meshname in missing:
-            spec.delete(geom)
+    shapes = [geom for geom in spec.geoms if geom.meshname in missing]
+    if shapes:
+        warnings.warn(f"{path}: {len(shapes)} shapes are left out, as their meshes are not there: these touch nothing.", stacklevel=5)
+    for geom in shapes:
+        spec.delete(geom)
     for mesh in list(spec.meshes):
         if mesh.name in missing:
             spec.delete(mesh)
@@ -172,7 +204,7 @@ def _without_missing_meshes(mujoco: Any, spec: Any, folder: Path) -> None:
 def _joints(tree: Tree, names: tuple[str, ...], n: int, locked: Mapping[str, float]) -> tuple[list[int], dict[int, float]]:
     """The joints to drive, and where those stay that are locked: the given ones, and what else moves on the same arm."""
     m = tree.model
-    held = {tree.joint(name): float(position) for name, position in locked.items()}
+    held = {tree.joint(name): locked_position(name, position) for name, position in locked.items()}
     movable = [j for j in range(m.njnt) if m.jnt_type[j] in (HINGE, SLIDE) and j not in held]
     if names:
         for name in names:
@@ -180,10 +212,13 @@ def _joints(tree: Tree, names: tuple[str, ...], n: int, locked: Mapping[str, flo
                 raise unknown("plant", name, "a model that has the scenario's joints", tree.joint_names)
         joints = [tree.joint_names.index(name) for name in names]
         for j in joints:
+            if j in held:
+                raise checks.fail("locked", tree.joint_names[j], "joints that the scenario does not move")
             if j not in movable:
-                raise checks.fail(f"joint {tree.joint_names[j]!r}", Shown("locked or no hinge or slide"), "a joint that is driven")
+                raise checks.fail(f"joint {tree.joint_names[j]!r}", Shown("a free joint or a ball"), "a hinge or slide")
     elif len(movable) != n:
-        remedy = "Lock the others, or name the scenario's joints: robots.load does."
+        more = "Lock the others, or name the scenario's joints: robots.load does."
+        remedy = more if len(movable) > n else "Only hinges and slides count."
         raise checks.fail("plant", Shown(f"{len(movable)} joints that move"), f"{n}, as the scenario has", remedy)
     else:
         joints = movable
@@ -201,8 +236,7 @@ def _compiled(spec: Any, plant: Any) -> Any:
     try:
         return spec.compile()
     except ValueError as error:
-        name = plant if isinstance(plant, str | Path) else "plant"
-        raise ValueError(f"{name}: {' '.join(str(error).split())}") from None
+        raise _refused(plant, error) from None
 
 
 def _locked(mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float]) -> tuple[Any, list[int]]:
@@ -218,14 +252,31 @@ def _locked(mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, 
     mujoco.mj_kinematics(whole, data)
     for body in {int(whole.jnt_bodyid[j]) for j in held}:
         _weld(mujoco, whole, data, spec, body, held)
-    gone = [joint for joint in spec.joints if joint.id in held]
-    known = {joint.name for joint in gone}
-    coupled = [x for x in spec.equalities if x.type == mujoco.mjtEq.mjEQ_JOINT and {x.name1, x.name2} & known]
-    driven = [x for x in spec.actuators if x.trntype == mujoco.mjtTrn.mjTRN_JOINT and x.target in known]
-    for x in (*coupled, *driven, *list(spec.sensors), *gone):
+    for x in _in_the_way(mujoco, spec, held):
         spec.delete(x)
     left = [j for j in range(whole.njnt) if j not in held]
     return _compiled(spec, plant), [left.index(j) for j in joints]
+
+
+def _in_the_way(mujoco: Any, spec: Any, held: dict[int, float]) -> list[Any]:
+    """The locked joints, and what cannot be without them: tendons over them, what couples, drives or senses these, keyframes."""
+    gone = [joint for joint in spec.joints if joint.id in held]
+    tendons = []
+    for tendon in spec.tendons:
+        wrapped = [wrap.target for wrap in tendon.path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
+        if any(joint.id in held for joint in wrapped):
+            if not all(joint.id in held for joint in wrapped):
+                got = Shown("a tendon over a joint that is locked and one that moves")
+                raise checks.fail(
+                    f"tendon {tendon.name!r}", got, "one or the other", "Take it out of the model, or lock or drive all of its joints."
+                )
+            tendons.append(tendon)
+    known = {x.name for x in gone} - {""}, {x.name for x in tendons} - {""}
+    of_joints = {mujoco.mjtEq.mjEQ_JOINT: 0, mujoco.mjtEq.mjEQ_TENDON: 1}
+    coupled = [x for x in spec.equalities if x.type in of_joints and {x.name1, x.name2} & known[of_joints[x.type]]]
+    kinds = {mujoco.mjtTrn.mjTRN_JOINT: 0, mujoco.mjtTrn.mjTRN_JOINTINPARENT: 0, mujoco.mjtTrn.mjTRN_TENDON: 1}
+    driven = [x for x in spec.actuators if x.trntype in kinds and x.target in known[kinds[x.trntype]]]
+    return [*coupled, *driven, *spec.sensors, *spec.keys, *tendons, *gone]
 
 
 def _weld(mujoco: Any, model: Any, data: Any, spec: Any, body: int, held: dict[int, float]) -> None:
@@ -235,9 +286,12 @@ def _weld(mujoco: Any, model: Any, data: Any, spec: Any, body: int, held: dict[i
     if all(held.get(j) == model.qpos0[model.jnt_qposadr[j]] for j in own):
         return
     element = spec.bodies[body]
-    if not all(j in held for j in own) or element.frame is not None:
-        remedy = "Write each joint into a body of its own, without a <frame>."
-        raise checks.fail(f"body {element.name!r}", Shown("a locked joint beside one that moves, or in a <frame>"), "locked alone", remedy)
+    if not all(j in held for j in own):
+        got, remedy = "a locked joint beside one that moves", "Write each into a body of its own, or lock it at its reference."
+        raise checks.fail(f"body {element.name!r}", Shown(got), "joints that are locked alone", remedy)
+    if element.frame is not None:
+        remedy = "Write the body without the <frame>, or lock its joint at its reference."
+        raise checks.fail(f"body {element.name!r}", Shown("a joint locked in a <frame>"), "a body without one", remedy)
     parent, back, turned = int(model.body_parentid[body]), np.zeros(4), np.zeros(4)
     mujoco.mju_negQuat(back, data.xquat[parent])
     mujoco.mju_mulQuat(turned, back, data.xquat[body])

@@ -56,13 +56,13 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
         return write_film(list(_pictures(Scene(curves, *motions_of(curves, t)))), path, fps)
 
 
-def film_path(path: str | Path) -> Path:
-    """The path of a film, checked."""
-    path = checks.file_path("path", path)
+def film_path(path: str | Path, field: str = "path") -> Path:
+    """The path of a film, checked; `field` is what the caller calls it."""
+    path = checks.file_path(field, path)
     if path.is_dir():
-        raise checks.fail("path", str(path), "the path of a file", "It is a folder.")
+        raise checks.fail(field, str(path), "the path of a file", "It is a folder.")
     if path.suffix.lower() not in WRITERS:
-        raise checks.fail("path", str(path), f"a file ending of {' or '.join(WRITERS)}")
+        raise checks.fail(field, str(path), f"a file ending of {' or '.join(WRITERS)}")
     return path
 
 

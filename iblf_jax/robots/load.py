@@ -104,7 +104,7 @@ class _Chain(NamedTuple):
     def picked(tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], repairs: Repairs) -> _Chain:
         """The chain from base to tip."""
         first = 0 if base is None else tree.body(base, "base")
-        held = {tree.joint(name): _position(name, value) for name, value in locked.items()}
+        held = {tree.joint(name): locked_position(name, value) for name, value in locked.items()}
         last, at_tip = tree.frame(tip) if tip is not None else (tree.only_tip(first, held), (np.zeros(3), np.eye(3)))
         way = tree.way(first, last)
         if way is None:
@@ -179,7 +179,8 @@ class _Chain(NamedTuple):
         )
 
 
-def _position(name: str, value: Any) -> float:
+def locked_position(name: str, value: Any) -> float:
+    """Where a joint is locked [rad or m], checked."""
     number = checks.as_floats(f"locked[{name!r}]", value)
     checks.check_values(f"locked[{name!r}]", number, None)
     if number.shape != ():
