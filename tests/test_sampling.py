@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -360,3 +361,13 @@ def test_a_sampled_step_is_explained():
     counts = [ij.explain(ij.with_parts(PAPER, sampling=ij.Sampling(2e-3), sensor=s)).counts for s in (ij.sensors.Ideal(), sensor)]
     plain, noisy = (sum(sum(counter.values()) for counter in c.values()) for c in counts)
     assert 0 < plain < noisy
+
+
+@pytest.mark.parametrize("velocity", [ij.sensors.FilteredDifference(cutoff=[300.0, 2000.0]), ij.sensors.Tracking(bandwidth=2000.0)])
+def test_a_filter_above_the_nyquist_frequency_is_told_with_the_number(velocity):
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(2e-3), sensor=ij.sensors.Encoder(velocity=velocity))
+    with pytest.warns(UserWarning, match=r"2000 rad/s is above the Nyquist frequency of sampling.period, 1571 rad/s"):
+        canonical(scenario)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        canonical(ij.with_parameters(scenario, {"sampling.period": 1e-3}))

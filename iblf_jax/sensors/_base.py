@@ -9,6 +9,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import numpy as np
+
+from iblf_jax.core import checks
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
@@ -26,7 +29,8 @@ class Measurement(NamedTuple):
 class Sensor(Protocol):
     """What the package asks of a sensor.
 
-    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on it.
+    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on it.  It may have a method
+    `advice(period)`, a list of warnings.
     """
 
     @property
@@ -51,7 +55,7 @@ class Sensor(Protocol):
 
 
 class Velocity(Protocol):
-    """How a velocity follows from measured positions."""
+    """How a velocity follows from measured positions.  It may have a method `advice(period)`, a list of warnings."""
 
     @property
     def draws(self) -> int:
@@ -73,3 +77,14 @@ class Velocity(Protocol):
           state: of the sample before.
         """
         ...
+
+
+def above_nyquist(name: str, cutoff: jax.Array, period: jax.Array) -> list[str]:
+    """What to tell a user whose filter is faster than what is sampled; nothing for traced values."""
+    if not checks.is_concrete((cutoff, period)) or not np.any(np.asarray(cutoff) > np.pi / np.asarray(period)):
+        return []
+    highest, nyquist = float(np.max(np.asarray(cutoff))), np.pi / float(period)
+    name = f"sensor.velocity.{name} = {highest:g} rad/s"
+    return [
+        f"{name} is above the Nyquist frequency of sampling.period, {nyquist:.4g} rad/s: it smooths nothing. Lower it, or sample faster."
+    ]

@@ -42,6 +42,10 @@ class Encoder:
         """One for the position if it has noise, and the velocity's."""
         return (self.noise is not None) + self.velocity.draws
 
+    def advice(self, period: jax.Array) -> list[str]:
+        """The velocity's warnings."""
+        return getattr(self.velocity, "advice", lambda period: [])(period)
+
     @property
     def unrounded(self) -> Encoder:
         """The same without counts."""

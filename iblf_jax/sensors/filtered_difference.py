@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.sensors._base import above_nyquist
 
 
 class FilteredDifferenceValues(NamedTuple):
@@ -31,6 +32,10 @@ class FilteredDifference:
 
     cutoff: Leaf = leaf("rad/s", sign="positive")
     draws: ClassVar[int] = 0
+
+    def advice(self, period: jax.Array) -> list[str]:
+        """A warning about a cutoff that is above the Nyquist frequency."""
+        return above_nyquist("cutoff", self.cutoff, period)
 
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> FilteredDifferenceValues:
         """Settled at the velocity dq."""

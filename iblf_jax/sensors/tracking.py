@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.sensors._base import above_nyquist
 
 
 class TrackingValues(NamedTuple):
@@ -33,6 +34,10 @@ class Tracking:
 
     bandwidth: Leaf = leaf("rad/s", sign="positive")
     draws: ClassVar[int] = 0
+
+    def advice(self, period: jax.Array) -> list[str]:
+        """A warning about a bandwidth that is above the Nyquist frequency."""
+        return above_nyquist("bandwidth", self.bandwidth, period)
 
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> TrackingValues:
         """Settled at the velocity dq."""

@@ -238,9 +238,11 @@ def canonical(scenario: Scenario) -> Scenario:
     scenario = _typed(scenario, dtype)
     if checks.is_concrete(scenario):
         _check_start(scenario)
-        for part in (scenario.controller, scenario.observer):
-            for text in getattr(part, "advice", list)():
-                warnings.warn(text, stacklevel=3)
+        advice = [text for part in (scenario.controller, scenario.observer) for text in getattr(part, "advice", list)()]
+        if scenario.sampling is not None:
+            advice += getattr(scenario.sensor, "advice", lambda period: [])(scenario.sampling.period)
+        for text in advice:
+            warnings.warn(text, stacklevel=3)
     return scenario
 
 
