@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import iblf_jax as ij
+from iblf_jax.simulation.signals import Signals
 
 
 class Arm3D:
@@ -21,6 +22,10 @@ class Arm3D:
         up = jnp.concatenate([jnp.ones(1), jnp.sin(lift)])
         links = 0.3 * jnp.stack([out * jnp.cos(q[0]), out * jnp.sin(q[0]), up], axis=-1)
         return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(links, axis=0)])
+
+
+ALWAYS = [field.name for field in dataclasses.fields(Signals) if field.default is dataclasses.MISSING]
+"""The signals that every run has."""
 
 
 @dataclasses.dataclass(eq=False)

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import PAPER, SHORT
+from made_up_runs import ALWAYS
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import execute, native, plan, step, transformable
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.simulation.signals import OPTIONAL
 
 PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")
 NOMINAL = (2.0, 20.0, 0.1, 20.0, 1.5, 0.8, 0.0, 0.0)
@@ -164,7 +164,7 @@ def everything(scenario, **options):
 
     def run(values):
         made = ij.simulate(ij.with_parameters(scenario, values), **LIGHT, **options)
-        recorded = set(step.SIGNALS) - set(OPTIONAL)
+        recorded = set(ALWAYS)
         return {name: x for name, x in {**vars(made), **made.metrics}.items() if name in recorded or name in made.metrics}
 
     def floats(values):
