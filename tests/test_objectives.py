@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.engine.step import folded
 from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.testing import ContractError
-from iblf_jax.testing.metrics import folded, samples
+from iblf_jax.testing.metrics import samples
 from iblf_jax.tuning import quantities
 from iblf_jax.tuning.quantities import MetricResult, Quantities
 
@@ -38,13 +39,13 @@ class Swing:
 def test_a_result_of_a_metric_is_weighted_and_summed(rng):
     """On the samples of a run, against the metrics themselves."""
     run = samples(rng)
-    tracking, swing, torque = (folded(fold, run) for fold in (ij.metrics.Tracking(), Swing(), ij.metrics.Torque()))
+    tracking, swing, torque = (folded((fold,), run) for fold in (ij.metrics.Tracking(), Swing(), ij.metrics.Torque()))
     parts = (
         MetricResult(ij.metrics.Tracking(), "iae"),
         MetricResult(Swing(), "swing", [2.0, 0.5]),
         MetricResult(ij.metrics.Torque(), "effort"),
     )
-    found = folded(Quantities(parts), run)
+    found = folded((Quantities(parts),), run)
     expected = [tracking["iae"].sum(), swing["swing"] @ np.array([2.0, 0.5]), torque["effort"]]
     np.testing.assert_allclose(found["tuning_exact"], expected, rtol=1e-12)
     np.testing.assert_array_equal(found["tuning_smooth"], found["tuning_exact"])

@@ -25,10 +25,10 @@ from iblf_jax.disturbances import Nothing
 from iblf_jax.engine.simulate import report
 from iblf_jax.engine.step import folded, sample_status
 from iblf_jax.robots import at_time
-from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled
+from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled_if_due
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import NEARLY, Sampling, check_step, has_noise, noise_key, normals, under_way
+from iblf_jax.simulation.sampling import NEARLY, Instant, Sampling, check_step, has_noise, noise_key, under_way
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import SIGNALS
 
@@ -154,11 +154,10 @@ class _Motion(NamedTuple):
     """Whether the state ran away; it stands still from there."""
 
 
-@partial(jax.jit, static_argnames="draws")
-def _law(scenario: Scenario, t, state: LoopState, index, noise, draws: int) -> LoopState:
+@jax.jit
+def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
     """The state after a sample."""
-    normal = normals(noise, index, draws, scenario.n).astype(state.q.dtype)
-    return sampled(scenario, t, state, normal)
+    return sampled_if_due(scenario, t, state, Instant(index, jnp.zeros_like(index)), noise)
 
 
 @jax.jit
@@ -198,7 +197,7 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
                 rows.append(rows[-1])
                 continue
             if index % every == 0:
-                state = _law(scenario, t, state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)), len(commands), noise, scenario.sensor.draws)
+                state = _law(scenario, t, state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)), len(commands), noise)
                 states.append(state)
                 commands.append(np.asarray(state.held.commands[0]))
             # Where the next command arrives within the step, MuJoCo makes two of it.

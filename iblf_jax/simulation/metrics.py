@@ -123,6 +123,12 @@ class Settling:
         return {"settling_time": jnp.where(acc.outside, jnp.inf, acc.last_outside), "overshoot": acc.overshoot}
 
 
+def _first_outside(acc: Any, margin: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Time and joint of the first violation, after an instant with these margins."""
+    first = jnp.any(~(margin > 0)) & (acc.joint < 0)
+    return jnp.where(first, t, acc.time), jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.joint)
+
+
 class _MarginState(NamedTuple):
     margin: jax.Array
     xi: jax.Array
@@ -153,12 +159,10 @@ class Margin:
     def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
         margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
-        first = jnp.any(~(margin > 0)) & (acc.joint < 0)
         return _MarginState(
             jnp.minimum(acc.margin, margin),
             jnp.minimum(acc.xi, 1.0 - jnp.abs(sample.xi)),
-            jnp.where(first, sample.t, acc.time),
-            jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.joint),
+            *_first_outside(acc, margin, sample.t),
         )
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
@@ -204,12 +208,10 @@ class VelocityMargin:
     def update(self, acc: _SpeedState, sample: Sample) -> _SpeedState:
         """Adds one sample."""
         margin = speed_margin(sample, sample.dq)
-        first = jnp.any(~(margin > 0)) & (acc.joint < 0)
         return _SpeedState(
             jnp.minimum(acc.margin, margin),
             jnp.minimum(acc.alpha, speed_margin(sample, sample.alpha)),
-            jnp.where(first, sample.t, acc.time),
-            jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.joint),
+            *_first_outside(acc, margin, sample.t),
         )
 
     def finish(self, acc: _SpeedState) -> dict[str, jax.Array]:

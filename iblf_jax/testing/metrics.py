@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.engine.step import folded
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of
@@ -35,11 +36,11 @@ def check_fold(fold: Any) -> None:
         findings.stop_if_any()
 
         def outputs(fold, moving, flags):
-            return folded(fold, samples_from(moving, flags))
+            return folded((fold,), samples_from(moving, flags))
 
         some = samples(np.random.default_rng(4))
         moving, flags = parts(some)
-        result = jax.jit(folded)(fold, some)
+        result = jax.jit(folded)((fold,), some)
         for name, value in result.items():
             findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
         finite = {name for name, value in result.items() if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)}
@@ -78,13 +79,6 @@ def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> 
     return Sample(**numbers, **flags)
 
 
-def folded(fold: Any, samples: Sample) -> dict[str, jax.Array]:
-    """What a fold makes of a run."""
-    first = jax.tree.map(lambda x: x[0], samples)
-    acc, _ = jax.lax.scan(lambda acc, sample: (fold.update(acc, sample), None), fold.init(first), samples)
-    return fold.finish(acc)
-
-
 def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
     first = jax.tree.map(lambda x: x[0], samples)
     kind = f" ({first.t.dtype})"
@@ -110,7 +104,7 @@ def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     @jax.jit
     def both(fold, moving):
         def floats(fold, moving):
-            result = folded(fold, samples_from(moving, flags))
+            result = folded((fold,), samples_from(moving, flags))
             return {k: v for k, v in result.items() if jnp.issubdtype(v.dtype, jnp.floating)}
 
         values, pull = jax.vjp(floats, fold, moving)

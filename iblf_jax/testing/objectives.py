@@ -13,6 +13,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.engine.derivatives import Outer
 from iblf_jax.engine.simulate import simulate
+from iblf_jax.engine.step import folded
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,
@@ -25,7 +26,7 @@ from iblf_jax.testing._contract import (
     scenario_or_the_papers,
     shape_of,
 )
-from iblf_jax.testing.metrics import LENGTH, at_rest, folded, parts, samples, samples_from
+from iblf_jax.testing.metrics import LENGTH, at_rest, parts, samples, samples_from
 from iblf_jax.tuning.objectives import Objective, Requirement, complete
 from iblf_jax.tuning.quantities import Quantities, Quantity
 
@@ -76,13 +77,13 @@ def _quantity(findings: Findings, quantity: Any, duration: float) -> None:
     fold = Quantities((quantity,))
 
     def outputs(fold, moving):
-        return {"the smooth value": folded(fold, samples_from(moving, in_dtype(flags, moving["q"].dtype)))["tuning_smooth"]}
+        return {"the smooth value": folded((fold,), samples_from(moving, in_dtype(flags, moving["q"].dtype)))["tuning_smooth"]}
 
-    exact = jax.jit(folded)(fold, some)["tuning_exact"]
+    exact = jax.jit(folded)((fold,), some)["tuning_exact"]
     findings.require(np.all(np.isfinite(exact)), f"the exact value is not finite on an ordinary run: {np.asarray(exact)}")
     probe(findings, outputs, fold, (moving,))
     at_rest(findings, fold, some)
-    largest = np.max(jax.jit(folded)(fold, some)["tuning_pieces"])
+    largest = np.max(jax.jit(folded)((fold,), some)["tuning_pieces"])
     findings.require(np.allclose(largest, exact), f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}")
     if hasattr(quantity, "hessian"):
         _second_order(findings, quantity, moving, flags)
