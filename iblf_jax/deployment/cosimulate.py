@@ -85,7 +85,7 @@ def cosimulate(
     """
     if integrator is not None:
         checks.one_of("integrator", integrator, INTEGRATORS)
-    scenario = canonical(_with_period(scenario, period))
+    scenario = canonical(with_period(scenario, period))
     if not checks.is_concrete(scenario):
         raise checks.fail("scenario", "traced values", "numbers", "MuJoCo has no derivatives: call this outside of jit, vmap and grad.")
     seed, throw = checks.seed(seed), checks.flag("throw", throw)
@@ -116,7 +116,7 @@ def _film_writer(path: str | Path) -> Callable:
     return partial(film_run, path=film_path(path, "film"))
 
 
-def _with_period(scenario: Scenario, period: float | None) -> Scenario:
+def with_period(scenario: Scenario, period: float | None) -> Scenario:
     """The scenario, its law sampled with this period."""
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")

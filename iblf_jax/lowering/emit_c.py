@@ -3,12 +3,13 @@ each function that the program calls (the closed loop of an arm).
 
 The text is plain statements, one a node, and the same for every target; the headers around it say what it means.  On a CPU `c/vector.h`
 makes of a name a vector of runs, `c/mathlib.h` has the elementary functions and `c/driver.h` the loops and threads; on a GPU
-`c/scalar.h` makes of it the number of one thread's run, and `c/kernels.h` has the kernels.
+`c/scalar.h` makes of it the number of one thread's run, and `c/kernels.h` has the kernels.  Out of the package `c/plain.h` makes of it a
+number of C99, and `plain_function` gives the function alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 
 import numpy as np
@@ -67,6 +68,8 @@ class _Emitter:
             i: tables.setdefault(self._numbers(node), f"table_{len(tables)}") for i, node in enumerate(program.nodes) if node.op == "lookup"
         }
         self.calls = calls
+        self.end: list[str] = []
+        """What stands at the end of every function."""
 
     def _numbers(self, lookup: Node) -> str:
         """The bits of its table, which are constants for every compiler; infinity is a function's result for some."""
@@ -102,7 +105,7 @@ class _Emitter:
 
     def function(self, head: str) -> str:
         """The C function of the statements so far."""
-        body, self.lines = "\n".join(self.lines), []
+        body, self.lines = "\n".join([*self.lines, *self.end]), []
         return f"{head} {{\n{body}\n}}\n"
 
 
@@ -131,6 +134,41 @@ def source(
     parts += [*functions, _constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
     parts += [_advance_in_segments(e, segment, *layout) if segment else _advance(e, *layout)]
     return "\n".join([*parts, *map(header, after)])
+
+
+def plain_function(
+    program: Program, name: str, parameters: Sequence[str], inputs: Mapping[str, Sequence[str]], outputs: Sequence[str], segment: int
+) -> str:
+    """One C99 function of one run, for the names of `c/plain.h`.
+
+    Args:
+      program: what it computes; without calls, which `passes.written_out` takes away.
+      name: of the function, and the beginning of those that it is cut into.
+      parameters: C declarations, `const F *q`.
+      inputs: operation that stands for an input -> what C calls each of these numbers.
+      outputs: places of the numbers that are carried and of the samples; none of them is an input.
+      segment: operations above which it is cut, into functions of so many.
+    """
+    tables = dict[str, str]()
+    e = _Emitter(program, tables, Calls(program, Layout.of(program)))
+    e.tables = {i: f"{name}_{table}" for i, table in e.tables.items()}
+    names = {i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs}
+    wanted = [*(o for _, o in program.carry), *program.samples]
+    seen = [p.split()[-1].lstrip("*") for p in parameters]
+    parts = list[str]()
+    if len(program.nodes) > segment:
+        segments = _Segments(e, names, segment, name, tuple(parameters))
+        e.end = [f"  (void){x};" for x in [*seen, "x", "y"]]
+        calls = segments.add(sorted(set(wanted)), kept=False)
+        parts, names = segments.functions, segments.names
+        e.lines = [segments.room, *(f"  {call}" for call in calls)]
+        e.statements(names, wanted)
+    else:
+        e.statements(names, wanted)
+        e.end = [f"  (void){x};" for x in seen]
+    e.lines += [f"  {place} = {names[i]};" for place, i in zip(outputs, wanted, strict=True)]
+    parts.append(e.function(f"static void {name}({', '.join([*parameters, 'F *RESTRICT r'])})"))
+    return "\n".join([*(f"TABLE {name}_{table}[] = {{{numbers}}};" for numbers, table in tables.items()), *parts])
 
 
 def header(name: str) -> str:
@@ -218,7 +256,7 @@ class _Segments:
     def __init__(self, e: _Emitter, names: dict[int, str], size: int, name: str, parameters: tuple[str, ...]):
         """`name` begins those of the functions; `parameters` are what they see of the function that calls them."""
         self.e, self.names, self.size, self.name = e, names, size, name
-        places = ("F *__restrict__ x", "I *__restrict__ y")
+        places = ("F *RESTRICT x", "I *RESTRICT y")
         self.head = f"SEPARATE void {{}}({', '.join([*parameters, *places])})"
         self.arguments = f"({', '.join(p.split()[-1].lstrip('*') for p in [*parameters, *places])})"
         self.functions: list[str] = []

@@ -75,7 +75,7 @@ class LoopState(NamedTuple):
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; torques that are under way then are those that hold the model still."""
     q, dq, n = scenario.initial.q, scenario.initial.dq, scenario.n
-    state = LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), _stepping(scenario).init(q, dq, scenario.model))
+    state = LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), stepping_observer(scenario).init(q, dq, scenario.model))
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
     still = scenario.model.gravity(q)
@@ -110,20 +110,45 @@ def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Arra
       state: at t.
       normal: what the sensor draws, (draws, n).
     """
-    sampling: Any = scenario.sampling
     held = state.held
-    measured, sensor = scenario.sensor.measure(state.q, state.dq, normal, sampling.period, held.sensor)
-    q, dq, observer = measured.q, measured.dq, _stepping(scenario)
-    f_hat = observer.estimate(t, q, dq, scenario.model, state.observer)
-    command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
-    after = _advanced(sampling, observer, (t, q, dq, command.tau, scenario.model, state.observer))
-    commands = jnp.concatenate([command.tau[None], held.commands[:-1]])
-    said = said_by(command, f_hat)
-    controller = jax.tree.map(lambda x, dx: x + sampling.period * dx, state.controller, rate)
-    return state._replace(controller=controller, observer=after, held=Held(commands, sensor, measured, said))
+    measured, sensor = scenario.sensor.measure(state.q, state.dq, normal, scenario.sampling.period, held.sensor)  # type: ignore[union-attr]
+    answer = answered(scenario, t, measured, state.controller, state.observer)
+    commands = jnp.concatenate([answer.command.tau[None], held.commands[:-1]])
+    return state._replace(
+        controller=answer.controller, observer=answer.observer, held=Held(commands, sensor, measured, said_by(answer.command, answer.f_hat))
+    )
 
 
-def _stepping(scenario: Scenario) -> Any:
+class Answer(NamedTuple):
+    """What a sampled law and its observer make of a measurement."""
+
+    command: Command
+    f_hat: jax.Array
+    controller: Any
+    """State of the law at the next sample."""
+    observer: Any
+    """State of the observer there."""
+
+
+def answered(scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any) -> Answer:
+    """What law and observer make of what was measured at the start of a period: this is what runs on a robot's computer.
+
+    Args:
+      scenario: with a sampling.
+      t: start of the period, () [s].
+      measured: there.
+      controller, observer: states there.
+    """
+    sampling: Any = scenario.sampling
+    q, dq, stepping = measured.q, measured.dq, stepping_observer(scenario)
+    f_hat = stepping.estimate(t, q, dq, scenario.model, observer)
+    command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, controller)
+    after = _advanced(sampling, stepping, (t, q, dq, command.tau, scenario.model, observer))
+    moved = jax.tree.map(lambda x, dx: x + sampling.period * dx, controller, rate)
+    return Answer(command, f_hat, moved, after)
+
+
+def stepping_observer(scenario: Scenario) -> Any:
     """The observer as it runs: in a sampled loop, the one whose step of Euler has the poles, where that is asked for."""
     sampling, observer = scenario.sampling, scenario.observer
     if sampling is not None and sampling.observer == "poles" and hasattr(observer, "at_period"):

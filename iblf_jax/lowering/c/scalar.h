@@ -32,6 +32,7 @@ typedef union { real f; integer i; } word;
 #define INLINE static __device__ __forceinline__
 #define FUNCTION INLINE
 #define SEPARATE INLINE
+#define RESTRICT __restrict__
 #define TABLE static __device__ const integer
 #define MASK(comparison) (-(I)(comparison))
 #define AT(x, l) (x)

@@ -36,6 +36,7 @@ typedef union { real f; integer i; } word;
 #define INLINE static inline __attribute__((always_inline))
 #define FUNCTION static
 #define SEPARATE static __attribute__((noinline))
+#define RESTRICT __restrict__
 #define TABLE static const integer
 #define MASK(comparison) (comparison)
 #define AT(x, l) (x)[l]

@@ -1,0 +1,140 @@
+"""Parameters as a C struct whose fields are the paths of leaves; and what may stand in C's names, comments and strings.
+
+Nothing that comes from a file or a user's class reaches code unescaped: a name keeps letters, digits and underscores, a comment is a JSON
+string in ASCII that cannot end it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.lowering.program import Program
+from iblf_jax.simulation.paths import parameters, parse
+from iblf_jax.simulation.scenario import Scenario
+
+RESERVED = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return
+    short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof bool true false class new delete this
+    template namespace private public protected virtual operator using try catch throw export import
+    real integer F I FN NAN INFINITY SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux unix""".split()
+)
+"""Words of C and C++, of their headers, and of the generated code."""
+
+
+def identifier(name: str) -> str:
+    """A C identifier for a Python name."""
+    text = "".join(c if re.fullmatch(r"[A-Za-z0-9_]", c) else f"_u{ord(c):x}_" for c in name)
+    return f"{text}_" if text in RESERVED or not re.match(r"[A-Za-z_]", text) else text
+
+
+def comment(text: str) -> str:
+    """Text that can stand in a C comment, whatever is in it: ASCII without the marks of comments, trigraphs or a line's end."""
+    return json.dumps(text)[1:-1].replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("\\", "|")
+
+
+def number(x: float, is_float: bool) -> str:
+    """A C literal of exactly this number."""
+    if math.isinf(x):
+        return "-INFINITY" if x < 0 else "INFINITY"
+    return f"{float(np.float32(x)) if is_float else float(x)!r}{'f' if is_float else ''}"
+
+
+class Field(NamedTuple):
+    """One leaf that the code reads."""
+
+    path: str
+    names: tuple[str, ...]
+    """Of the structs that hold it, and its own."""
+    shape: tuple[int, ...]
+    unit: str
+    value: np.ndarray
+
+    @property
+    def place(self) -> str:
+        """Where it is in the struct of all parameters: `controller.K2`."""
+        return ".".join(self.names)
+
+
+class Parameters(NamedTuple):
+    """The leaves that programs read."""
+
+    fields: tuple[Field, ...]
+    numbers: tuple[str, ...]
+    """What C calls each number of the scenario, leaf after leaf; "" for those that are not read."""
+
+    @staticmethod
+    def of(scenario: Scenario, programs: Iterable[Program]) -> Parameters:
+        """Those of a scenario that any of the programs reads, as fields of a struct `p` points to."""
+        read = {node.value for program in programs for node in program.nodes if node.op == "shared"}
+        fields, numbers = list[Field](), list[str]()
+        for leaf in parameters(scenario, named=False):
+            size = math.prod(leaf.shape)
+            if read.isdisjoint(range(len(numbers), len(numbers) + size)):
+                numbers += [""] * size
+                continue
+            names = tuple(_field_name(token) for token in parse(leaf.path))
+            fields.append(Field(leaf.path, names, leaf.shape, leaf.unit, np.asarray(leaf.value)))
+            numbers += [f"p->{fields[-1].place}{_index(place)}" for place in np.ndindex(leaf.shape)]
+        assert len(numbers) == sum(np.size(x) for x in jax.tree.leaves(scenario))
+        return Parameters(tuple(fields), tuple(numbers))
+
+    def declaration(self, real: str, joints: Sequence[str] = ()) -> str:
+        """The members of the struct, of the type `real`."""
+        return "\n".join(_members(_nested(self.fields), 1, real, joints)) or f"  {real} none;"
+
+    def defaults(self, is_float: bool) -> str:
+        """Their values, as C's initialiser."""
+        return _initialiser(_nested(self.fields), is_float) if self.fields else "{0}"
+
+
+def _field_name(token: str | int) -> str:
+    return f"part_{token}" if isinstance(token, int) else identifier(token)
+
+
+def _index(place: tuple[int, ...]) -> str:
+    return "".join(f"[{i}]" for i in place)
+
+
+def _nested(fields: Sequence[Field]) -> dict[str, Any]:
+    """The fields as a tree of structs."""
+    tree: dict[str, Any] = {}
+    for field in fields:
+        *outer, last = field.names
+        node = tree
+        for name in outer:
+            node = node.setdefault(name, {})
+            if isinstance(node, Field):
+                raise checks.fail("scenario", field.path, "paths that differ as names of C")
+        if last in node:
+            raise checks.fail("scenario", field.path, "paths that differ as names of C")
+        node[last] = field
+    return tree
+
+
+def _members(tree: dict[str, Any], depth: int, real: str, joints: Sequence[str]) -> list[str]:
+    lines, indent = list[str](), "  " * depth
+    for name, part in tree.items():
+        if isinstance(part, Field):
+            of = f", joint by joint: {', '.join(map(str, joints))}" if joints and part.shape[:1] == (len(joints),) else ""
+            lines.append(f"{indent}{real} {name}{_index(part.shape)};  /* {comment(part.path)} [{comment(part.unit)}]{comment(of)} */")
+        else:
+            lines += [f"{indent}struct {{", *_members(part, depth + 1, real, joints), f"{indent}}} {name};"]
+    return lines
+
+
+def _initialiser(part: Any, is_float: bool, depth: int = 0) -> str:
+    if isinstance(part, dict):
+        inner = ",\n".join(f"{'  ' * (depth + 1)}.{name} = {_initialiser(x, is_float, depth + 1)}" for name, x in part.items())
+        return f"{{\n{inner}\n{'  ' * depth}}}"
+    value = part.value if isinstance(part, Field) else part
+    if value.ndim == 0:
+        return number(float(value), is_float)
+    return "{" + ", ".join(_initialiser(x, is_float) for x in value) + "}"

@@ -1,0 +1,192 @@
+"""A law or a closed loop as an FMU: FMI 3.0 for co-simulation, with the binary of this platform and its sources."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import uuid
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+
+from iblf_jax import __version__
+from iblf_jax.deployment.build import build, c_compiler, fmi_platform
+from iblf_jax.deployment.c_names import Parameters
+from iblf_jax.deployment.loop_program import OUTPUTS
+from iblf_jax.deployment.write_c import REFERENCE, Law, Written, filled, title_of
+from iblf_jax.deployment.write_loop import WrittenLoop
+from iblf_jax.simulation.scenario import Scenario
+
+FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
+BASE = {"rad": (0, 0, 0, 1), "m": (0, 1, 0, 0), "s": (0, 0, 1, 0), "kg": (1, 0, 0, 0), "N": (1, 1, -2, 0)}
+"""Exponents of kg, m, s, rad."""
+FIXED = ("sampling.period",)
+"""Parameters that the FMU is built for."""
+
+
+class Variable(NamedTuple):
+    """One variable of an FMU besides time."""
+
+    name: str
+    causality: str
+    unit: str
+    shape: tuple[int, ...]
+    start: np.ndarray | None = None
+
+
+def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
+    """Exponents of kg, m, s, rad of a unit such as "N m s/rad" or "kg m^2"; None for what is no product of these."""
+    found = [0, 0, 0, 0]
+    above, _, below = unit.partition("/")
+    for sign, words in ((1, above), (-1, below)):
+        for word in words.replace("(", " ").replace(")", " ").split():
+            name, _, power = word.partition("^")
+            if name == "1":
+                continue
+            if name not in BASE or not (power or "1").lstrip("-").isdigit():
+                return None
+            for k, exponent in enumerate(BASE[name]):
+                found[k] += sign * int(power or 1) * exponent
+    return tuple(found)  # type: ignore[return-value]
+
+
+def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
+    """What an importer sees of a law alone."""
+    n = law.scenario.n
+    start = [np.asarray(x, float) for x in law.vectors.first]
+    names = [("q", "rad"), ("dq", "rad/s")] + list(zip(REFERENCE if law.told_reference else (), ("rad", "rad/s", "rad/s^2"), strict=False))
+    inputs = [Variable(name, "input", unit, (n,), x) for (name, unit), x in zip(names, start, strict=True)]
+    outputs = [Variable(name, "output", unit, (n,)) for name, unit in (("tau", "N m"), ("alpha", "rad/s"), ("f_hat", "N m"))]
+    return [*_settable(parameters), *inputs, *outputs, Variable("status", "output", "1", ())]
+
+
+def loop_variables(scenario: Scenario, parameters: Parameters) -> list[Variable]:
+    """What an importer sees of a closed loop."""
+    outputs = [Variable(name, "output", unit, (scenario.n,)) for name, unit in OUTPUTS.items()]
+    return [*_settable(parameters), *outputs, Variable("status", "output", "1", ())]
+
+
+def _settable(parameters: Parameters) -> list[Variable]:
+    return [
+        Variable(field.path, "constant" if field.path in FIXED else "parameter", field.unit, field.shape, np.asarray(field.value, float))
+        for field in parameters.fields
+    ]
+
+
+def model_description(name: str, title: str, token: str, step: float, variables: Sequence[Variable]) -> str:
+    """The XML that says what an FMU is."""
+    root = Xml.Element(
+        "fmiModelDescription",
+        fmiVersion="3.0", modelName=name, instantiationToken=token, description=title, generationTool=f"iblf_jax {__version__}",
+    )  # fmt: skip
+    Xml.SubElement(
+        root, "CoSimulation", modelIdentifier=name, canHandleVariableCommunicationStepSize="true", canGetAndSetFMUState="true",
+        fixedInternalStepSize=repr(step),
+    )  # fmt: skip
+    units = {v.unit: unit_exponents(v.unit) for v in variables}
+    known = {"s": BASE["s"]} | {unit: x for unit, x in units.items() if x is not None and any(x)}
+    definitions = Xml.SubElement(root, "UnitDefinitions")
+    for unit, powers in sorted(known.items()):
+        base = {k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p}
+        Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", **base)
+    Xml.SubElement(root, "DefaultExperiment", startTime="0", stopTime="20", stepSize=repr(step))
+    listed = Xml.SubElement(root, "ModelVariables")
+    Xml.SubElement(
+        listed, "Float64", name="time", valueReference="0", causality="independent", variability="continuous", unit="s", description="time"
+    )
+    for k, v in enumerate(variables, start=1):
+        kinds = {
+            "parameter": {"causality": "parameter", "variability": "tunable"},
+            "constant": {"causality": "local", "variability": "constant"},
+            "input": {"causality": "input", "variability": "continuous"},
+            "output": {"causality": "output", "variability": "discrete"},
+        }[v.causality]
+        start = {} if v.start is None else {"start": " ".join(map(repr, np.ravel(v.start).tolist())).replace("inf", "INF")}
+        unit = {"unit": v.unit} if v.unit in known else {}
+        element = Xml.SubElement(listed, "Float64", name=v.name, valueReference=str(k), **kinds, **unit, **start)
+        for size in v.shape:
+            Xml.SubElement(element, "Dimension", start=str(size))
+    structure = Xml.SubElement(root, "ModelStructure")
+    outputs = [str(k) for k, v in enumerate(variables, start=1) if v.causality == "output"]
+    for kind in ("Output", "InitialUnknown"):
+        for reference in outputs:
+            Xml.SubElement(structure, kind, valueReference=reference)
+    Xml.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, encoding="unicode") + "\n"
+
+
+def source_of(name: str, title: str, token: str, variables: Sequence[Variable], block: str, values: dict[str, Any]) -> str:
+    """The C around a law or a loop."""
+    table, place, starts = list[str](), 0, list[str]()
+    for v in variables:
+        size = math.prod(v.shape)
+        table.append(f"  {{{place}, {size}, {int(v.causality in ('parameter', 'input'))}}},")
+        place += size
+    counts = {kind: sum(math.prod(v.shape) for v in variables if v.causality in kinds) for kind, kinds in _KINDS.items()}
+    begin = 0
+    for v in (v for v in variables if v.causality == "input" and v.start is not None):
+        starts += [f"  f->inputs[{begin + i}] = {x!r};\n" for i, x in enumerate(np.ravel(v.start).tolist())]
+        begin += math.prod(v.shape)
+    return filled(
+        "fmi3.c",
+        {"title": title, "version": __version__, "name": name, "token": token, "variables": len(variables), "variable_table": "\n".join(table),
+         "parameter_count": counts["parameters"], "inputs": counts["inputs"], "outputs": counts["outputs"], "starts": "".join(starts),
+         "block": filled(block, values)},
+    )  # fmt: skip
+
+
+_KINDS = {"parameters": ("parameter", "constant"), "inputs": ("input",), "outputs": ("output",)}
+
+BUILD = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiBuildDescription fmiVersion="3.0">
+  <BuildConfiguration modelIdentifier="{name}">
+    <SourceFileSet language="C99">
+      <SourceFile name="{name}.c"/>
+      <SourceFile name="{name}_fmi3.c"/>
+    </SourceFileSet>
+  </BuildConfiguration>
+</fmiBuildDescription>
+"""
+
+
+def law_fmu(law: Law, made: Written, path: Path) -> None:
+    """Writes a law as an FMU; raises ToolchainError."""
+    n, name, step = law.scenario.n, law.name, float(law.scenario.sampling.period)  # type: ignore[union-attr]
+    given = "".join(f", q + {k * n}" for k in (2, 3, 4)) if law.told_reference else ""
+    values = {
+        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": given,
+        "dq": f"q + {n}" if law.programs.reads_velocity else "NULL",
+    }  # fmt: skip
+    sources = {file: made.files[file] for file in (f"{name}.h", f"{name}.c")}
+    _package(path, name, title_of(law.scenario), step, law_variables(law, made.parameters), "fmu_law.c", values, sources)
+
+
+def loop_fmu(scenario: Scenario, made: WrittenLoop, settings: Sequence[float], path: Path) -> None:
+    """Writes a closed loop as an FMU; raises ToolchainError."""
+    name = made.values["name"]
+    values = {"name": name, "step": repr(settings[0]), "setting_values": ", ".join(map(repr, settings))}
+    title = f"the closed loop of {made.values['title']}"
+    _package(path, name, title, settings[0], loop_variables(scenario, made.parameters), "fmu_loop.c", values, made.files)
+
+
+def _package(path: Path, name: str, title: str, step: float, variables: list[Variable], block: str, values: dict[str, Any], sources: dict[str, str]) -> None:
+    """The archive: description, sources, and the binary that is built of them here."""
+    text = "\n".join(sources[key] for key in sorted(sources))
+    token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, text + repr(values))}}}"
+    sources = sources | {f"{name}_fmi3.c": source_of(name, title, token, variables, block, values)}
+    system, suffix = fmi_platform()
+    with tempfile.TemporaryDirectory() as folder:
+        for file, content in sources.items():
+            (Path(folder) / file).write_text(content)
+        build([*c_compiler(), *FLAGS, f"{name}.c", f"{name}_fmi3.c", "-lm", "-o", f"{name}{suffix}"], Path(folder))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", model_description(name, title, token, step, variables))
+            archive.write(Path(folder) / f"{name}{suffix}", f"binaries/{system}/{name}{suffix}")
+            for file, content in sources.items():
+                archive.writestr(f"sources/{file}", content)
+            archive.writestr("sources/buildDescription.xml", BUILD.format(name=name))
