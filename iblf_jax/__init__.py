@@ -64,6 +64,8 @@ if TYPE_CHECKING:
     from iblf_jax.certificates import Counterexample as Counterexample
     from iblf_jax.certificates import certify as certify
     from iblf_jax.deployment.cosimulate import cosimulate as cosimulate
+    from iblf_jax.deployment.export import Exported as Exported
+    from iblf_jax.deployment.export import export as export
     from iblf_jax.engine.period import recommended_period as recommended_period
     from iblf_jax.files.tuning import load_tuning as load_tuning
     from iblf_jax.files.tuning import save_tuning as save_tuning
@@ -100,6 +102,8 @@ _ON_FIRST_USE = {
     "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "distributed": ("iblf_jax.studies.distributed", None),
+    "export": ("iblf_jax.deployment.export", "export"),
+    "Exported": ("iblf_jax.deployment.export", "Exported"),
     "falsify": ("iblf_jax.tuning", "falsify"),
     "Front": ("iblf_jax.tuning", "Front"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),

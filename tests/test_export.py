@@ -1,15 +1,23 @@
-"""Laws out of Python: the C of every law and observer against JAX, and what a folder holds."""
+"""Laws and closed loops out of Python: the C of every law and observer against JAX, FMUs against FMPy, modules against wasmtime."""
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import subprocess
+import sys
+import warnings
 
+import arm_cases
+import fmpy
 import jax
 import jax.numpy as jnp
 import members
 import numpy as np
 import pytest
+import wasmtime
+from fmpy.validation import validate_fmu
 
 import iblf_jax as ij
 from iblf_jax.deployment.control_law import Told, control_law, sample, start
@@ -43,7 +51,11 @@ def walk(scenario, dtype, seed=0):
 
 @pytest.fixture(scope="module")
 def base():
-    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3), velocity_bounds=ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5)))
+    scenario = ij.with_parts(
+        ij.presets.zhang_yan_2024(),
+        sampling=ij.Sampling(1e-3),
+        velocity_bounds=ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5)),
+    )
     return scenario
 
 
@@ -68,15 +80,238 @@ def against_jax(folder, scenario, *, told_reference=False, dtype="float64"):
     tau = np.asarray(jax.jit(answers)(scenario, first, asked))[::CHECKED]
     rows = [np.asarray(x) for x in asked[1:] if not isinstance(x, tuple)]
     vectors = Vectors(tuple(x[0] for x in rows), rows[0], rows[1], tuple(rows[2:]), tau)
-    law = Law(scenario, control_law(scenario, told_reference), "iblf_law", told_reference, vectors, (), None)
+    joints = getattr(scenario.model, "joints", ())
+    law = Law(scenario, control_law(scenario, told_reference), "iblf_law", told_reference, vectors, joints, None)
     made = written(law)
     folder.mkdir(exist_ok=True)
     for name, text in made.files.items():
         (folder / name).write_text(text)
-    print(built_and_run(folder, *SANE))
+    built_and_run(folder, *SANE)
     return made
 
 
 @pytest.mark.parametrize(("law", "observer"), CASES)
 def test_every_law_and_observer_gives_in_c_what_it_gives_in_jax(base, tmp_path, law, observer):
     against_jax(tmp_path, ij.with_parts(base, controller=members.LAWS[law], observer=members.OBSERVERS[observer]))
+
+
+@pytest.mark.parametrize("velocity", members.VELOCITIES)
+@pytest.mark.parametrize("told_reference", [False, True])
+def test_velocities_follow_by_the_filter_of_the_scenario(base, tmp_path, velocity, told_reference):
+    sensor = ij.sensors.Encoder(counts=4096, velocity=members.VELOCITIES[velocity])
+    lab = ij.with_parts(base, sensor=sensor, observer=members.OBSERVERS["momentum"])
+    against_jax(tmp_path, lab, told_reference=told_reference)
+    asks = "const iblf_law_real *q_d" in (tmp_path / "iblf_law.h").read_text()
+    assert asks == told_reference
+    assert ("NULL, " in (tmp_path / "selftest.c").read_text()) == (velocity != "measured")
+
+
+@pytest.mark.parametrize("step", ["euler", "poles"])
+def test_floats_and_every_step_of_an_observer(base, tmp_path, step):
+    lab = ij.with_parts(base, sampling=ij.Sampling(1e-3, observer=step), observer=members.OBSERVERS["momentum"])
+    against_jax(tmp_path, lab, dtype="float32")
+
+
+HOSTILE = ("*/ int main(void) { return 7; } /*", 'a\\\n#error no "); system(1); //', "??/\n\u00e9\u2028 $name ${joints} %s")
+
+
+def test_names_from_files_stay_in_comments(tmp_path):
+    n = len(HOSTILE)
+    scenario = ij.Scenario(
+        arm_cases.random_arm(n, seed=2, joints=HOSTILE),
+        ij.references.Sinusoid(0.1, 0.2),
+        ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(1.0)),
+        ij.controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
+        ij.Initial(q=0.1),
+        observer=ij.observers.Momentum(kf=20.0),
+        sampling=ij.Sampling(1e-3),
+    )
+    made = against_jax(tmp_path, scenario)
+    assert made.stack_bytes < 65_536
+    text = (tmp_path / "iblf_law.h").read_text()
+    assert text.isascii() and "int main" in text
+
+
+def test_what_cannot_be_written_says_why(base, tmp_path):
+    @ij.component
+    class Endless:
+        """A law whose loop has no fixed length."""
+
+        gain: ij.Leaf = ij.leaf("1")
+
+        def init(self, q, dq, setting):
+            return ()
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            x = jax.lax.while_loop(lambda x: x[0] < 1.0, lambda x: x + self.gain, q)
+            no = jnp.zeros(q.shape, bool)
+            return ij.controllers.Command(x, dq, 0 * q, no, no), ()
+
+    with pytest.raises(ValueError, match="no fixed length"):
+        ij.export(ij.with_parts(base, controller=Endless(1.0)), tmp_path)
+    with pytest.raises(ValueError, match="period"):
+        ij.export(ij.presets.zhang_yan_2024(), tmp_path)
+    for wrong in ({"target": "rust"}, {"dtype": "half"}, {"name": "int"}, {"name": "a b"}, {"reference": "none"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            ij.export(base, tmp_path, **wrong)
+
+
+def test_a_users_law_goes_out_without_a_name_in_files(base, tmp_path):
+    @ij.component
+    class Proportional:
+        """tau = G0 + gain (q_d - q) - q'."""
+
+        gain: ij.Leaf = ij.leaf("N m/rad")
+
+        def init(self, q, dq, setting):
+            return ()
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            tube = setting.tube(t)
+            no = jnp.zeros(q.shape, bool)
+            return ij.controllers.Command(setting.model.gravity(q) + self.gain * (tube.q_d - q) - dq, dq, 0 * q, no, no), ()
+
+    made = against_jax(tmp_path, ij.with_parts(base, controller=Proportional([30.0, 20.0])))
+    assert "scenario.toml" not in made.files and "scenario.toml" not in made.files["README.md"]
+    assert "controller.gain" in [field.path for field in made.parameters.fields]
+
+
+MAIN = """
+#include "arm_law.h"
+#include <stdio.h>
+int main(void) {
+  arm_law_parameters p = arm_law_defaults;
+  arm_law_state s;
+  const double q[2] = {0.75, 0.7}, dq[2] = {0.1, -0.2};
+  double tau[2];
+  int k, status = 0;
+  p.controller.K2[0] = 33.0;
+  p.model.mass[1] = 1.5;
+  p.bounds.upper.offset[0] = 0.6;
+  if (arm_law_init(&p, &s, q, dq)) return 1;
+  for (k = 0; k < 3; k++) status = arm_law_step(&p, &s, 0.002 * k, q, dq, tau);
+  printf("%.17g %.17g %d\\n", tau[0], tau[1], status);
+  return 0;
+}
+"""
+
+
+def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path):
+    scenario = ij.presets.zhang_yan_2024()
+    made = ij.export(scenario, tmp_path / "first", period=2e-3, name="arm_law")
+    shutil.move(made.folder, tmp_path / "moved")
+    folder = tmp_path / "moved"
+    assert sorted(x.name for x in folder.iterdir()) == sorted(made.files)
+    assert "ok: torque within" in built_and_run(folder, "-O2", name="arm_law")
+    assert "ok: torque within" in built_and_run(folder, "-O2", name="arm_law", compiler=(sys.executable, "-m", "ziglang", "cc"))
+    if shutil.which("cmake"):
+        for command in (["cmake", "-B", "build"], ["cmake", "--build", "build"], ["build/selftest"]):
+            subprocess.run(command, cwd=folder, check=True, capture_output=True)
+
+    subprocess.run(["gcc", "-std=c99", "-O0", "-fstack-usage", "-c", "arm_law.c"], cwd=folder, check=True)
+    frames = {row.split()[0].split(":")[-1]: int(row.split()[1]) for row in (folder / "arm_law.su").read_text().splitlines()}
+    assert frames["arm_law_step"] + frames["arm_law_sample"] < made.sizes["stack, without optimisation"] < 2 * sum(frames.values())
+
+    (folder / "main.c").write_text(MAIN)
+    subprocess.run(["gcc", "-std=c99", "-O1", "arm_law.c", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
+    *tau, status = map(float, subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True).stdout.split())
+    assert int(status) & 2, "the second bound was put below the position"
+
+    lab = canonical(ij.load_scenario(folder / "scenario.toml"))
+    lab = ij.with_parameters(lab, {"controller.K2[0]": 33.0, "model.mass[1]": 1.5, "bounds.upper.offset[0]": 0.6})
+    told = Told(jnp.zeros(()), jnp.asarray([0.75, 0.7]), jnp.asarray([0.1, -0.2]))
+    memory = start(lab, told)[0]
+    for k in range(3):
+        memory, said = sample(lab, told._replace(t=jnp.asarray(0.002 * k)), memory)
+    np.testing.assert_allclose(tau, said.tau, rtol=1e-12)
+
+
+def test_a_law_that_does_not_hold_is_told(tmp_path):
+    with pytest.warns(UserWarning, match="recommended_period"):
+        ij.export(ij.presets.zhang_yan_2024(), tmp_path, period=0.05)
+
+
+LAB = {
+    "sampling": lambda: ij.Sampling(2e-3, delay=5e-4),
+    "sensor": lambda: ij.sensors.Encoder(ij.sensors.FilteredDifference(300.0), counts=8192, noise=1e-4),
+    "actuator": lambda: ij.actuators.Motor(bandwidth=300.0, limit=60.0),
+}
+
+
+@pytest.fixture(scope="module")
+def lab():
+    gains = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
+    return ij.with_parts(gains, **{name: make() for name, make in LAB.items()})
+
+
+def test_a_closed_loop_as_an_fmu_is_simulate(lab, tmp_path):
+    ij.export(lab, tmp_path, target="fmu-loop", dt=1e-3, seed=4)
+    file = str(tmp_path / "iblf_loop.fmu")
+    assert validate_fmu(file) == []
+    run = ij.simulate(lab, duration=1.0, dt=1e-3, seed=4, record_every=10)
+    names = {"q": run.q, "tau": run.tau, "f_hat": run.disturbance_estimate, "lower": run.lower}
+    found = fmpy.simulate_fmu(file, stop_time=1.0, step_size=1e-3, output_interval=1e-2, output=[*names, "status"])
+    for name, expected in names.items():
+        np.testing.assert_allclose(found[name], expected, atol=1e-10, err_msg=name)
+    changed = fmpy.simulate_fmu(file, stop_time=1.0, output_interval=1e-2, output=["q"], start_values={"controller.K2": [5.0, 4.0]})
+    other = ij.simulate(ij.with_parameters(lab, {"controller.K2": [5.0, 4.0]}), duration=1.0, dt=1e-3, seed=4, record_every=10)
+    np.testing.assert_allclose(changed["q"], other.q, atol=1e-10)
+    with pytest.raises(Exception, match=r"fmi3DoStep|error"):
+        fmpy.simulate_fmu(file, stop_time=0.01, step_size=1e-3, output_interval=1.5e-3)
+
+
+def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
+    lab = ij.with_parts(lab, sampling=ij.Sampling(2e-3), actuator=ij.actuators.Ideal())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ij.export(lab, tmp_path, target="fmu")
+    file = str(tmp_path / "iblf_law.fmu")
+    assert validate_fmu(file) == []
+    run = ij.simulate(lab, duration=0.5, dt=2e-3)
+    told = np.zeros(run.t.size, [("time", float), ("q", float, (2,)), ("dq", float, (2,))])
+    told["time"], told["q"], told["dq"] = run.t, run.measured.q, run.measured.dq
+    found = fmpy.simulate_fmu(file, stop_time=0.5, step_size=2e-3, output_interval=2e-3, output=["tau", "f_hat"], input=told)
+    np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
+
+
+def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
+    ij.export(lab, tmp_path, target="wasm", dt=1e-3, seed=4)
+    store = wasmtime.Store()
+    module = wasmtime.Module.from_file(store.engine, str(tmp_path / "iblf_loop.wasm"))
+    assert list(module.imports) == []
+    loop = wasmtime.Instance(store, module, []).exports(store)
+    table = json.loads((tmp_path / "iblf_loop.json").read_text())
+
+    def put(place, values):
+        loop["memory"].write(store, np.asarray(values, float).tobytes(), place)
+
+    loop["_initialize"](store)
+    loop["defaults"](store)
+    put(loop["settings"](store), table["settings"])
+
+    def run():
+        loop["start"](store)
+        rows = loop["run"](store, 1001, 10)
+        place = loop["records"](store)
+        numbers = np.frombuffer(loop["memory"].read(store, place, place + 8 * rows * table["record"]), float).reshape(rows, -1)
+        return {x["name"]: numbers[:, x["offset"] : x["offset"] + x["size"]] for x in table["records"]}
+
+    expected = ij.simulate(lab, duration=1.0, dt=1e-3, seed=4, record_every=10)
+    found = run()
+    np.testing.assert_allclose(found["q"], expected.q, atol=1e-10)
+    np.testing.assert_allclose(found["tau"], expected.tau, atol=1e-10)
+
+    k1 = next(x for x in table["parameters"] if x["path"] == "controller.k1")
+    put(loop["parameters"](store) + 8 * k1["offset"], [3.0, 1.5])
+    slower = ij.simulate(ij.with_parameters(lab, {"controller.k1": [3.0, 1.5]}), duration=1.0, dt=1e-3, seed=4, record_every=10)
+    np.testing.assert_allclose(run()["q"], slower.q, atol=1e-10)
+
+
+def test_the_command_line_exports(tmp_path, capsys):
+    from iblf_jax.cli import main
+
+    assert main(["export", "zhang_yan_2024", "--out", str(tmp_path), "--period", "0.002", "--dtype", "float", "--reference", "told"]) == 0
+    assert re.search(r"stack, without optimisation: \d+ bytes", capsys.readouterr().out)
+    assert "ok: torque within" in built_and_run(tmp_path, "-O2")
+    assert main(["export", "zhang_yan_2024", "--out", str(tmp_path), "--target", "exe"]) == 2
+    assert "target" in capsys.readouterr().err

@@ -28,7 +28,9 @@ def c_compiler() -> list[str]:
             return [path]
     if not wanted and importlib.util.find_spec("ziglang"):
         return zig()
-    raise ToolchainError("there is no C compiler" + (f" {wanted!r} ($CC)" if wanted else ' (cc, gcc, clang; pip install "iblf_jax[export]" has one)'))
+    raise ToolchainError(
+        "there is no C compiler" + (f" {wanted!r} ($CC)" if wanted else ' (cc, gcc, clang; pip install "iblf_jax[export]" has one)')
+    )
 
 
 def zig() -> list[str]:

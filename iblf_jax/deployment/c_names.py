@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -21,10 +21,13 @@ from iblf_jax.simulation.paths import parameters, parse
 from iblf_jax.simulation.scenario import Scenario
 
 RESERVED = frozenset(
-    """auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return
-    short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof bool true false class new delete this
-    template namespace private public protected virtual operator using try catch throw export import
-    real integer F I FN NAN INFINITY SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux unix""".split()
+    re.findall(
+        r"\w+",
+        """auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return
+        short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof bool true false class new delete
+        this template namespace private public protected virtual operator using try catch throw export import
+        real integer F I FN NAN INFINITY SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux unix""",
+    )
 )
 """Words of C and C++, of their headers, and of the generated code."""
 
@@ -84,7 +87,7 @@ class Parameters(NamedTuple):
             fields.append(Field(leaf.path, names, leaf.shape, leaf.unit, np.asarray(leaf.value)))
             numbers += [f"p->{fields[-1].place}{_index(place)}" for place in np.ndindex(leaf.shape)]
         assert len(numbers) == sum(np.size(x) for x in jax.tree.leaves(scenario))
-        return Parameters(tuple(fields), tuple(numbers))
+        return Parameters(tuple(_in_order(_nested(fields))), tuple(numbers))
 
     def declaration(self, real: str, joints: Sequence[str] = ()) -> str:
         """The members of the struct, of the type `real`."""
@@ -117,6 +120,12 @@ def _nested(fields: Sequence[Field]) -> dict[str, Any]:
             raise checks.fail("scenario", field.path, "paths that differ as names of C")
         node[last] = field
     return tree
+
+
+def _in_order(tree: dict[str, Any]) -> Iterator[Field]:
+    """The fields as they stand in the struct."""
+    for part in tree.values():
+        yield from (part,) if isinstance(part, Field) else _in_order(part)
 
 
 def _members(tree: dict[str, Any], depth: int, real: str, joints: Sequence[str]) -> list[str]:

@@ -24,13 +24,16 @@ from iblf_jax.sensors import Ideal, Measurement
 from iblf_jax.simulation.closed_loop import answered, stepping_observer
 from iblf_jax.simulation.scenario import Scenario
 
+
 @component
 class GivenReference:
     """A reference that is told at every sample: q_d(s) = q_d + q_d' (s - t) + q_d" (s - t)^2 / 2.
 
     Args:
       t: time of the sample, () [s].
-      q_d, dq_d, ddq_d: reference there, (n,) each [rad, rad/s, rad/s^2].
+      q_d: reference there, () or (n,) [rad].
+      dq_d: its velocity, () or (n,) [rad/s].
+      ddq_d: its acceleration, () or (n,) [rad/s^2].
     """
 
     t: Leaf = leaf("s", shape="scalar")

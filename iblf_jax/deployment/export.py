@@ -7,7 +7,6 @@ import math
 import re
 import warnings
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +77,8 @@ def export(
         (tau_k, z_(k+1)) = law(t_k, y_k, z_k)
 
     "c": law, observer and velocity filter as one C99 file and its header, without allocation, global state or anything but libm, with
-    `name_init` and `name_step`; gains and model are a struct whose fields are the paths of the leaves, filled in; a self-test with 20 s of a
-    simulated run; how to build it.  "fmu": the same law as `name.fmu`, FMI 3.0 for co-simulation, with the binary of this platform.
+    `name_init` and `name_step`; gains and model are a struct whose fields are the paths of the leaves, filled in; a self-test with 20 s
+    of a simulated run; how to build it.  "fmu": the same law as `name.fmu`, FMI 3.0 for co-simulation, with the binary of this platform.
     "fmu-loop": the whole closed loop as one.  "wasm": the whole closed loop as `name.wasm` for a browser, and `name.json`, the table of its
     parameters and records.
 
@@ -155,7 +154,9 @@ def _available(dtype: str) -> str:
     """JAX's name of a type of C, if JAX computes in it."""
     wanted = TYPES[dtype]
     if jnp.zeros((), wanted).dtype != wanted:
-        raise checks.fail("dtype", dtype, '"float", as JAX computes in float32 here', 'Call jax.config.update("jax_enable_x64", True) first.')
+        raise checks.fail(
+            "dtype", dtype, '"float", as JAX computes in float32 here', 'Call jax.config.update("jax_enable_x64", True) first.'
+        )
     return wanted
 
 
@@ -211,7 +212,7 @@ def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
 def _reference(scenario: Scenario, t: jax.Array) -> tuple[jax.Array, ...]:
     """The scenario's own reference and its derivatives at times (K,), (K, n) each."""
     tube = jax.vmap(scenario.setting.tube)(t)
-    return tube.q_d, tube.dq_d, tube.ddq_d
+    return tube.q_d, tube.dq_d, tube.ddq_d  # type: ignore[return-value]
 
 
 @jax.jit

@@ -58,7 +58,8 @@ def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
     """What an importer sees of a law alone."""
     n = law.scenario.n
     start = [np.asarray(x, float) for x in law.vectors.first]
-    names = [("q", "rad"), ("dq", "rad/s")] + list(zip(REFERENCE if law.told_reference else (), ("rad", "rad/s", "rad/s^2"), strict=False))
+    told = zip(REFERENCE, ("rad", "rad/s", "rad/s^2"), strict=True) if law.told_reference else ()
+    names = [("q", "rad"), ("dq", "rad/s"), *told]
     inputs = [Variable(name, "input", unit, (n,), x) for (name, unit), x in zip(names, start, strict=True)]
     outputs = [Variable(name, "output", unit, (n,)) for name, unit in (("tau", "N m"), ("alpha", "rad/s"), ("f_hat", "N m"))]
     return [*_settable(parameters), *inputs, *outputs, Variable("status", "output", "1", ())]
@@ -91,7 +92,7 @@ def model_description(name: str, title: str, token: str, step: float, variables:
     known = {"s": BASE["s"]} | {unit: x for unit, x in units.items() if x is not None and any(x)}
     definitions = Xml.SubElement(root, "UnitDefinitions")
     for unit, powers in sorted(known.items()):
-        base = {k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p}
+        base: dict[str, Any] = {k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p}
         Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", **base)
     Xml.SubElement(root, "DefaultExperiment", startTime="0", stopTime="20", stepSize=repr(step))
     listed = Xml.SubElement(root, "ModelVariables")
@@ -99,15 +100,15 @@ def model_description(name: str, title: str, token: str, step: float, variables:
         listed, "Float64", name="time", valueReference="0", causality="independent", variability="continuous", unit="s", description="time"
     )
     for k, v in enumerate(variables, start=1):
-        kinds = {
+        kinds: dict[str, Any] = {
             "parameter": {"causality": "parameter", "variability": "tunable"},
             "constant": {"causality": "local", "variability": "constant"},
             "input": {"causality": "input", "variability": "continuous"},
             "output": {"causality": "output", "variability": "discrete"},
         }[v.causality]
-        start = {} if v.start is None else {"start": " ".join(map(repr, np.ravel(v.start).tolist())).replace("inf", "INF")}
-        unit = {"unit": v.unit} if v.unit in known else {}
-        element = Xml.SubElement(listed, "Float64", name=v.name, valueReference=str(k), **kinds, **unit, **start)
+        first: dict[str, Any] = {} if v.start is None else {"start": " ".join(map(repr, np.ravel(v.start).tolist())).replace("inf", "INF")}
+        unit_of: dict[str, Any] = {"unit": v.unit} if v.unit in known else {}
+        element = Xml.SubElement(listed, "Float64", name=v.name, valueReference=str(k), **kinds, **unit_of, **first)
         for size in v.shape:
             Xml.SubElement(element, "Dimension", start=str(size))
     structure = Xml.SubElement(root, "ModelStructure")
@@ -128,15 +129,25 @@ def source_of(name: str, title: str, token: str, variables: Sequence[Variable], 
         place += size
     counts = {kind: sum(math.prod(v.shape) for v in variables if v.causality in kinds) for kind, kinds in _KINDS.items()}
     begin = 0
-    for v in (v for v in variables if v.causality == "input" and v.start is not None):
-        starts += [f"  f->inputs[{begin + i}] = {x!r};\n" for i, x in enumerate(np.ravel(v.start).tolist())]
+    for v in (v for v in variables if v.causality == "input"):
+        starts += [f"  f->inputs[{begin + i}] = {x!r};\n" for i, x in enumerate(np.ravel(np.asarray(v.start)).tolist())]
         begin += math.prod(v.shape)
     return filled(
         "fmi3.c",
-        {"title": title, "version": __version__, "name": name, "token": token, "variables": len(variables), "variable_table": "\n".join(table),
-         "parameter_count": counts["parameters"], "inputs": counts["inputs"], "outputs": counts["outputs"], "starts": "".join(starts),
-         "block": filled(block, values)},
-    )  # fmt: skip
+        {
+            "title": title,
+            "version": __version__,
+            "name": name,
+            "token": token,
+            "variables": len(variables),
+            "variable_table": "\n".join(table),
+            "parameter_count": counts["parameters"],
+            "inputs": counts["inputs"],
+            "outputs": counts["outputs"],
+            "starts": "".join(starts),
+            "block": filled(block, values),
+        },
+    )
 
 
 _KINDS = {"parameters": ("parameter", "constant"), "inputs": ("input",), "outputs": ("output",)}
@@ -173,7 +184,9 @@ def loop_fmu(scenario: Scenario, made: WrittenLoop, settings: Sequence[float], p
     _package(path, name, title, settings[0], loop_variables(scenario, made.parameters), "fmu_loop.c", values, made.files)
 
 
-def _package(path: Path, name: str, title: str, step: float, variables: list[Variable], block: str, values: dict[str, Any], sources: dict[str, str]) -> None:
+def _package(
+    path: Path, name: str, title: str, step: float, variables: list[Variable], block: str, values: dict[str, Any], sources: dict[str, str]
+) -> None:
     """The archive: description, sources, and the binary that is built of them here."""
     text = "\n".join(sources[key] for key in sorted(sources))
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, text + repr(values))}}}"

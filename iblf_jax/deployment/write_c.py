@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from importlib.resources import files
 from string import Template
 from typing import Any, NamedTuple
@@ -15,12 +16,14 @@ from iblf_jax import __version__
 from iblf_jax.deployment.c_names import Parameters, comment, number
 from iblf_jax.deployment.control_law import FLAGS, ControlLaw
 from iblf_jax.lowering.emit_c import header, plain_function
+from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.program import INPUTS, Program
 from iblf_jax.simulation.scenario import Scenario
 
 SEGMENT = 500
-"""Operations of a function, at most: compilers' time grows with the square of its length, and the stack of one without optimisation with it."""
-ELEMENTARY = frozenset("sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p logistic pow cbrt erf erfc".split())
+"""Operations of a function, at most: compilers' time grows with the square of its length, and so does its stack without optimisation."""
+LONG = 16
+"""Cost (`operations.OPERATIONS`) above which an operation is an elementary function."""
 REFERENCE = ("q_d", "dq_d", "ddq_d")
 LOOKUP = """static F f_lookup(const I *table, I size, I i) {
   F x;
@@ -42,11 +45,11 @@ def filled(template: str, values: dict[str, Any]) -> str:
 def operations_of(program: Program) -> Counter[str]:
     """How many operations a call makes, by what they cost on a processor without vectors."""
     counts: Counter[str] = Counter()
+    roots = {"div": "divisions", "sqrt": "square roots", "rsqrt": "square roots"}
     for node in program.nodes:
-        if node.op in INPUTS or node.op == "const":
-            continue
-        names = {"div": "divisions", "sqrt": "square roots", "rsqrt": "square roots"}
-        counts["elementary functions" if node.op in ELEMENTARY else names.get(node.op, "sums, products and choices")] += 1
+        if node.op not in INPUTS and node.op != "const":
+            cost = OPERATIONS[node.op].cost
+            counts[roots.get(node.op, "sums, products and choices" if cost is not None and cost <= LONG else "elementary functions")] += 1
     return counts
 
 
@@ -128,32 +131,58 @@ def written(law: Law) -> Written:
     seen += [f"const F *{x}" for x in REFERENCE] if law.told_reference else []
     inputs = {"shared": parameters.numbers, "lane": lane, "carry": [f"m[{k}]" for k in range(size)]}
     results = len(programs.start.samples), size + len(programs.sample.samples)
-    start, sample = (
-        plain_function(program, f"{name}_{what}", seen[:1] + seen[2:] if what == "start" else seen, inputs, [f"r[{k}]" for k in range(count)], SEGMENT)
-        for what, program, count in (("start", programs.start, results[0]), ("sample", programs.sample, results[1]))
-    )
+    start = plain_function(programs.start, f"{name}_start", [seen[0], *seen[2:]], inputs, _places(results[0]), SEGMENT)
+    sample = plain_function(programs.sample, f"{name}_sample", seen, inputs, _places(results[1]), SEGMENT)
     operations = operations_of(programs.sample)
     state_bytes = real_bytes * (max(size, 1) + 3 * n)
     parameter_bytes = real_bytes * max(1, sum(math.prod(f.shape) for f in parameters.fields))
     stack_bytes = max(stack_of(start, real_bytes), stack_of(sample, real_bytes)) + real_bytes * results[1]
-    values = {
-        "name": name, "upper": name.upper(), "guard": f"{name.upper()}_H", "version": __version__, "joints": n,
-        "title": title_of(scenario), "type": "float" if law.is_float else "double", "integer": "int32_t" if law.is_float else "int64_t",
-        "suffix": "name##f" if law.is_float else "name", "period": "sampling.period", "operations": told(operations),
-        "parameters": parameters.declaration(f"{name}_real", law.joints), "defaults": parameters.defaults(law.is_float),
+    keep = "memcpy(s->memory, result, sizeof s->memory);\n{}" if size else ""
+    values = shared_values(scenario, name, programs.sample.dtype, parameters, law.joints, start, sample) | {
+        "period": "sampling.period",
+        "operations": told(operations),
         "memory": "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(programs.memory)) or "       nothing\n",
-        "memory_size": max(size, 1), "memory_count": size, "plain": words_for(start + sample), "flags": len(FLAGS),
-        "lookup": LOOKUP if "f_lookup(" in start + sample else "", "start": start, "sample": sample,
-        "keep_start": "memcpy(s->memory, result, sizeof s->memory);\n  " if size else "",
-        "keep_sample": "memcpy(s->memory, result, sizeof s->memory);\n    " if size else "",
-        "default_dq": "if (dq == NULL) dq = still;" if not programs.reads_velocity else "(void)still;",
+        "memory_size": max(size, 1),
+        "memory_count": size,
+        "flags": len(FLAGS),
+        "keep_start": keep.format("  "),
+        "keep_sample": keep.format("    "),
+        "default_dq": "(void)still;" if programs.reads_velocity else "if (dq == NULL) dq = still;",
         "dq_argument": "dq" if programs.reads_velocity else "NULL",
         "dq_note": "" if programs.reads_velocity else "\n   dq is the velocity that the filter starts with; NULL for 0.",
         **_reference_text(law.told_reference, name, n),
-    }  # fmt: skip
+    }
     texts = {f"{name}.h": filled("law.h", values), f"{name}.c": filled("law.c", values)}
-    texts |= _around(law, values, Counter(operations), (state_bytes, parameter_bytes, stack_bytes))
+    texts |= _around(law, values, (state_bytes, parameter_bytes, stack_bytes))
     return Written(texts, operations, state_bytes, parameter_bytes, stack_bytes, parameters)
+
+
+def _places(count: int) -> list[str]:
+    return [f"r[{k}]" for k in range(count)]
+
+
+def shared_values(
+    scenario: Scenario, name: str, dtype: np.dtype, parameters: Parameters, joints: Sequence[str], start: str, sample: str
+) -> dict[str, Any]:
+    """What the templates of laws and loops ask for alike; `start` and `sample` are generated functions."""
+    is_float = dtype == np.float32
+    return {
+        "name": name,
+        "upper": name.upper(),
+        "guard": f"{name.upper()}_H",
+        "version": __version__,
+        "joints": scenario.n,
+        "title": title_of(scenario),
+        "type": "float" if is_float else "double",
+        "integer": "int32_t" if is_float else "int64_t",
+        "suffix": "name##f" if is_float else "name",
+        "parameters": parameters.declaration(f"{name}_real", joints),
+        "defaults": parameters.defaults(is_float),
+        "plain": words_for(start + sample),
+        "lookup": LOOKUP if "f_lookup(" in start + sample else "",
+        "start": start,
+        "sample": sample,
+    }
 
 
 def title_of(scenario: Scenario) -> str:
@@ -176,23 +205,32 @@ def _reference_text(told_reference: bool, name: str, n: int) -> dict[str, str]:
     }
 
 
-def _around(law: Law, values: dict[str, Any], operations: Counter[str], sizes: tuple[int, int, int]) -> dict[str, str]:
+def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> dict[str, str]:
     """Self-test, how to build it, README."""
     v, reads, period = law.vectors, law.programs.reads_velocity, float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    told_reference = bool(v.reference)
-    of = "".join(f", {x}[k]" for x in REFERENCE) if told_reference else ""
+    of = "".join(f", {x}[k]" for x in REFERENCE) if v.reference else ""
+    told_velocity = "It is told positions and velocities."
+    row = "\n| `scenario.toml` | what it was written from; `ij.export` with it writes this again |"
     values |= {
-        "samples": len(v.q), "duration": f"{len(v.q) * period:g}", "checked": CHECKED,
-        "rounds": max(1, ROUNDS_FOR // len(v.q)), "tolerance": "1e-4" if law.is_float else "1e-10",
-        "dq_of_k": "dq[k]" if reads else "NULL", "dq_of_0": "dq[0]" if reads else "NULL", "reference_of_k": of,
-        "reference_of_0": of.replace("[k]", "[0]"), "first_reference": "".join(f", first_{x}" for x in REFERENCE) if told_reference else "",
-        "state_bytes": sizes[0], "parameter_bytes": sizes[1], "stack_bytes": sizes[2], "period": repr(period),
-        "velocity": "It is told positions and velocities." if reads else "It is told positions alone; velocities follow by the scenario's filter.",
+        "samples": len(v.q),
+        "duration": f"{len(v.q) * period:g}",
+        "rounds": max(1, ROUNDS_FOR // len(v.q)),
+        "tolerance": "1e-4" if law.is_float else "1e-10",
+        "dq_of_k": "dq[k]" if reads else "NULL",
+        "dq_of_0": "dq[0]" if reads else "NULL",
+        "reference_of_k": of,
+        "reference_of_0": of.replace("[k]", "[0]"),
+        "first_reference": "".join(f", first_{x}" for x in REFERENCE) if v.reference else "",
+        "state_bytes": sizes[0],
+        "parameter_bytes": sizes[1],
+        "stack_bytes": sizes[2],
+        "period": repr(period),
+        "velocity": told_velocity if reads else "It is told positions alone; velocities follow by the scenario's filter.",
         "inside": _inside(law),
-        "reference": "The reference q_d, q_d', q_d'' is told at every sample." if told_reference else "The reference is inside, a function of t.",
-        "scenario_row": "" if law.file is None else "\n| `scenario.toml` | what it was written from; `ij.export` with it writes this again |",
+        "reference": "The reference is told at every sample." if v.reference else "The reference is inside, a function of t.",
+        "scenario_row": "" if law.file is None else row,
         "time_note": "Time as a float loses a millisecond after four hours: start again before.  " if law.is_float else "",
-    }  # fmt: skip
+    }
     arrays = {"q": v.q, "torque": v.tau} | ({"dq": v.dq} if reads else {}) | dict(zip(REFERENCE, v.reference, strict=bool(v.reference)))
     return {
         "selftest.c": filled("selftest.c", values),
