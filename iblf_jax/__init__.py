@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from iblf_jax.files.tuning import load_tuning as load_tuning
     from iblf_jax.files.tuning import save_tuning as save_tuning
     from iblf_jax.files.tuning import tune_file as tune_file
+    from iblf_jax.reports import report as report
     from iblf_jax.studies import distributed as distributed
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
@@ -114,6 +115,7 @@ _ON_FIRST_USE = {
     "plotting": ("iblf_jax.plotting", None),
     "recommended_dt": ("iblf_jax.studies.recommended", "recommended_dt"),
     "recommended_period": ("iblf_jax.engine.period", "recommended_period"),
+    "report": ("iblf_jax.reports", "report"),
     "save_tuning": ("iblf_jax.files.tuning", "save_tuning"),
     "Sensitivity": ("iblf_jax.studies.sensitivity", "Sensitivity"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),

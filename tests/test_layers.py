@@ -19,14 +19,15 @@ LAYER_OF = {
 """Module or folder at the root of the package -> its layer."""
 
 UPWARD = {
-    "certificates/result.py": {"plotting"},
-    "simulation/results.py": {"files", "plotting"},
-    "studies/comparison.py": {"plotting"},
-    "studies/study.py": {"plotting"},
+    "certificates/result.py": {"plotting", "reports"},
+    "simulation/results.py": {"files", "plotting", "reports"},
+    "simulation/scenario.py": {"reports"},
+    "studies/comparison.py": {"plotting", "reports"},
+    "studies/study.py": {"plotting", "reports"},
     "tuning/_pareto.py": {"plotting"},
-    "tuning/result.py": {"files", "plotting"},
+    "tuning/result.py": {"files", "plotting", "reports"},
 }
-"""File -> the higher modules that it imports inside a method: `.plot()`, `.save()`, `.to_xarray()`.  There are no others."""
+"""File -> the higher modules that it imports inside a method: `.plot()`, `.save()`, `.to_xarray()`, `_repr_html_()`.  No others do."""
 
 ONLY_IN = {
     "matplotlib": ("plotting",),

@@ -7,7 +7,6 @@ smallest, and the verdict.  "Not applicable" is a verdict of its own: no claim w
 from __future__ import annotations
 
 import dataclasses
-import html
 import math
 from typing import Any, NamedTuple
 
@@ -122,16 +121,19 @@ class Certificate:
     def __repr__(self) -> str:
         rows = [("", "equation", "verdict", "margin", "value", "where the margin is smallest"), *self._rows()]
         notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
-        return "\n".join(
-            [f"Certificate: {self.verdict}  ({self._subject()})", *tables.as_text(rows), *(["notes", *notes] if notes else [])]
-        )
+        return "\n".join([f"Certificate: {self.verdict}  ({self.subject})", *tables.as_text(rows), *(["notes", *notes] if notes else [])])
 
     def _repr_html_(self) -> str:
+        from iblf_jax import reports
+
+        return reports.card(self)
+
+    def table_html(self) -> str:
+        """Its lines as an HTML table, those that fail in bold."""
         heading = ("", "equation", "verdict", "margin", "value", "where", "checked", "note")
         rows = [(*row, line.statement, line.note) for line, row in zip(self.lines, self._rows(), strict=True)]
         failing = [i for i, line in enumerate(self.lines) if line.verdict == FAILS]
-        title = f"<b>Certificate: {html.escape(self.verdict)}</b> ({html.escape(self._subject())})"
-        return title + tables.as_html(heading, rows, failing)
+        return tables.as_html(heading, rows, failing)
 
     def _notes(self) -> dict[str, list[str]]:
         """Each note and the lines that it belongs to."""
@@ -141,7 +143,9 @@ class Certificate:
                 notes.setdefault(line.note, []).append(line.name)
         return notes
 
-    def _subject(self) -> str:
+    @property
+    def subject(self) -> str:
+        """What was judged, in words."""
         return self.heading + (f"; {len(self.runs)} runs, worst {self.worst_run}" if self.runs else "")
 
     def _rows(self) -> list[tuple[str, str, str, str, str, str]]:

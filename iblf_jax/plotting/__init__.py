@@ -16,6 +16,7 @@ from iblf_jax.plotting._figures import phase_portrait as phase_portrait
 from iblf_jax.plotting._figures import positions as positions
 from iblf_jax.plotting._figures import save as save
 from iblf_jax.plotting._figures import torques as torques
+from iblf_jax.plotting._figures import tube as tube
 from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
 from iblf_jax.plotting._figures import velocities as velocities
 from iblf_jax.plotting._figures import velocity_errors as velocity_errors

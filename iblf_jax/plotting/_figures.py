@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,7 +20,9 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct
 from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, show, transient_end
+from iblf_jax.robots import joint_names
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario
 
 Runs = Rollout | Mapping[str, Rollout]
 
@@ -82,6 +86,39 @@ def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figu
     n, quantity = curves[0].run.n, QUANTITIES[field]
     rows = [PanelRow(quantity, joint, f"{curves[0].called(joint)}\n{_style.label(quantity.symbol, quantity.unit)}") for joint in range(n)]
     return _rows_with_zoom(title, curves, rows, zoom, 1.75 if n <= 3 else 1.25)
+
+
+@_style.styled()
+def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
+    """Reference and start of every joint in its tube, before anything is run.
+
+    Args:
+      scenario: one scenario.
+      duration: how much of it [s].
+
+    Returns:
+      The figure, one row a joint.
+
+    Raises:
+      ValueError: something that is no scenario, or a duration that is no time.
+    """
+    if not isinstance(scenario, Scenario) or scenario.initial.q.ndim != 1:
+        raise checks.fail("scenario", type(scenario).__name__, "one Scenario", "Make one with ij.presets or ij.Scenario.")
+    t = np.linspace(0.0, checks.positive_number("duration", duration, "s"), POINTS)
+    tube = jax.vmap(scenario.setting.tube)(jnp.asarray(t, scenario.initial.q.dtype))
+    figure = _style.new_figure(7.2, 0.6 + 1.4 * scenario.n)
+    panels = figure.subplots(scenario.n, 1, sharex=True, squeeze=False)[:, 0]
+    for i, (axes, name) in enumerate(zip(panels, joint_names(scenario.plant, scenario.n), strict=True)):
+        axes.fill_between(t, tube.lower[:, i], tube.upper[:, i], color=_style.tube(), linewidth=0, zorder=0)
+        for k, side in enumerate((tube.lower, tube.upper)):
+            axes.plot(t, side[:, i], color=_style.bound(), linewidth=1.0, label="_" if k else "bounds")
+        axes.plot(t, tube.q_d[:, i], **_style.reference(), label="reference $q_d$")
+        axes.plot(0.0, scenario.initial.q[i], "o", color=_style.colour(0), clip_on=False, zorder=5, label="start")
+        axes.set_ylabel(f"{name}\n{_style.label('$q$', 'rad')}")
+        axes.margins(x=0)
+    panels[-1].set_xlabel(_style.label("$t$", "s"))
+    _style.legend_below(figure, 3, of=[panels[0]])
+    return figure
 
 
 def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:

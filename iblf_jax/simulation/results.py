@@ -133,6 +133,11 @@ class Rollout(Signals):
         accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube" if RELATIVE in self.metrics else ""
         return f"Rollout({shape}; status: {describe(int(self.status))}{accuracy})"
 
+    def _repr_html_(self) -> str:
+        from iblf_jax import reports
+
+        return reports.card(self)
+
     def to_xarray(self):
         """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its attributes."""
         from iblf_jax.files.rollouts import rollout_to_xarray

@@ -138,6 +138,11 @@ class Scenario:
         """What the law knows: model, reference and bounds."""
         return Setting(self.model, self.reference, self.bounds, self.velocity_bounds)
 
+    def _repr_html_(self) -> str:
+        from iblf_jax import reports
+
+        return reports.card(self)
+
 
 def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     """The scenario with whole parts exchanged by name: `with_parts(scenario, observer=Momentum(kf=20.0), disturbance=Step(1.0, 5.0))`.

@@ -148,12 +148,18 @@ class Comparison:
         return "\n".join(parts)
 
     def _repr_html_(self) -> str:
-        parts = []
+        from iblf_jax import reports
+
+        return reports.card(self)
+
+    def tables_html(self) -> dict[str, str]:
+        """What is held equal -> its HTML table and notes."""
+        found = {}
         for held, rows in self.table.items():
             notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[held])
             headings, *lines = _columns(rows)
-            parts.append(f"<h4>{HELD[held]}</h4>{tables.as_html(headings, lines)}{notes}")
-        return "".join(parts)
+            found[HELD[held]] = tables.as_html(headings, lines) + notes
+        return found
 
     def to_pandas(self):
         """A `pandas.DataFrame` (pandas comes with xarray), one line a law and table, columns as `Row`."""

@@ -347,3 +347,8 @@ class Study:
         lines += [f"  flags, of which a run may have several: {'; '.join(flags)}"] if flags else []
         lines += [f"  {self.included}"]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from iblf_jax import reports
+
+        return reports.card(self)

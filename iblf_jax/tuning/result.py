@@ -299,3 +299,8 @@ class TuneResult:
         peaks = [np.max(np.asarray(run.metrics.peak_torque)) for run in self.nominal]
         lines.append(f"  peak torque of the nominal run: {peaks[0]:.5g} -> {peaks[1]:.5g} N m")
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from iblf_jax import reports
+
+        return reports.card(self)

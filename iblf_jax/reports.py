@@ -1,0 +1,249 @@
+"""Results that show themselves: a card in a notebook, `report` a page of its own.
+
+Both are made of the same parts (`Shown`): what it is, tables, and figures, which are drawn only where they are asked for.  A result of
+another kind than those below is shown by its text, and its figure if it has a `plot`.
+"""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import html
+import io
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks, tables
+from iblf_jax.robots import joint_names
+from iblf_jax.simulation.paths import get, parameters, unit_at
+from iblf_jax.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from iblf_jax.certificates import Certificate
+    from iblf_jax.simulation.results import Rollout
+    from iblf_jax.studies.comparison import Comparison
+    from iblf_jax.studies.study import Study
+    from iblf_jax.tuning import TuneResult
+
+CARD_DPI, PAGE_DPI = 60, 110
+"""Dots per inch of a figure, in a notebook and on a page."""
+
+STYLE = """body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2rem; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; font-size: 0.85rem; }
+td, th { padding: 0.15rem 0.6rem; border-bottom: 1px solid #eee; text-align: left; }
+img { max-width: 100%; } pre { background: #f6f6f6; padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
+.wide { overflow-x: auto; } footer { margin-top: 3rem; color: #777; font-size: 0.8rem; }"""
+
+
+class Shown(NamedTuple):
+    """What a result has to show."""
+
+    title: str
+    words: Sequence[str]
+    """Lines of plain text below the title."""
+    tables: Mapping[str, str]
+    """Heading -> table in HTML; the first `on_card` are on the card too."""
+    figures: Mapping[str, Callable[[], Figure]]
+    """Heading -> what draws it; the first is on the card too."""
+    scenario: Scenario | None
+    on_card: int = 1
+
+
+def _parts_of(scenario: Scenario) -> str:
+    """What a scenario is made of, as a table."""
+    rows = []
+    for name in vars(scenario):
+        part = getattr(scenario, name)
+        if part is None or (name == "model" and part is scenario.plant):
+            continue
+        inner = getattr(part, getattr(type(part), "wraps", None) or "barrier", None)
+        kind = type(part).__name__ + (f" ({type(inner).__name__})" if inner is not None else "")
+        rows.append((name, kind, ", ".join(f"{p.path} = {_short(p.value)}" for p in parameters(part, named=False)[:MOST_LEAVES])))
+    return tables.as_html(("part", "kind", "parameters"), rows)
+
+
+MOST_LEAVES = 4
+"""Leaves of a part that a scenario's table shows."""
+
+
+def _short(value: Any) -> str:
+    if not checks.is_concrete(value):
+        return "traced"
+    return np.array2string(np.asarray(value), precision=4, threshold=7, edgeitems=2, separator=", ").replace("\n", "")
+
+
+def _scenario(scenario: Scenario) -> Shown:
+    from iblf_jax import plotting
+
+    figures = (
+        {"Reference in its tube": lambda: plotting.tube(scenario)} if checks.is_concrete(scenario) and scenario.initial.q.ndim == 1 else {}
+    )
+    every = parameters(scenario, named=False)
+    every_leaf = tables.as_html(("path", "unit", "value"), [(p.path, p.unit, _short(p.value)) for p in every])
+    words = [f"{scenario.n} joints: {', '.join(joint_names(scenario.plant, scenario.n))}"]
+    return Shown("Scenario", words, {"Parts": _parts_of(scenario), "Parameters": every_leaf}, figures, scenario)
+
+
+def _rollout(run: Rollout) -> Shown:
+    from iblf_jax import plotting
+
+    if not checks.is_concrete(run) or run.is_batch:
+        return Shown("Rollout", [repr(run)], {}, {}, None)
+    rows = [(name, run.metrics.units.get(name, ""), *(f"{x:.4g}" for x in np.ravel(value))) for name, value in run.metrics.items()]
+    rows = [(*row, *[""] * (2 + run.n - len(row)))[: 2 + run.n] for row in rows]
+    table = tables.as_html(("metric", "unit", *joint_names(run.scenario.plant, run.n)), rows)
+    figures: dict[str, Callable[[], Figure]] = {
+        "Positions": lambda: plotting.positions(run),
+        "Overview": lambda: plotting.overview(run),
+        "Relative errors": lambda: plotting.errors(run),
+        "Torques": lambda: plotting.torques(run),
+        "Uncertain terms": lambda: plotting.uncertain_terms(run),
+    }
+    return Shown("Run", [repr(run)], {"Metrics": table}, figures, run.scenario)
+
+
+def _perturbation(drawn: Any) -> str:
+    """A perturbation in words: "factor uniform, low 0.8, high 1.2"."""
+    distribution = drawn.distribution
+    numbers = [f"{p.path} {_short(p.value)}" for p in parameters(distribution, named=False)]
+    return ", ".join([f"{drawn.kind} {type(distribution).__name__.lower()}", *numbers, *(["shared"] if drawn.shared else [])])
+
+
+def _study(study: Study) -> Shown:
+    from iblf_jax import plotting
+    from iblf_jax.studies.statistics import SMALLER_IS_WORSE
+
+    if not checks.is_concrete(study):
+        return Shown("Study", [repr(study)], {}, {}, None)
+    quantiles = study.quantiles((0.05, 0.5, 0.95))
+    rows = []
+    for name in map(str, quantiles.data_vars):
+        values = np.asarray(quantiles[name]).reshape(3, -1)
+        worst = (np.argmin if name in SMALLER_IS_WORSE else np.argmax)(values[1])
+        rows.append((name, study.metrics.units.get(name, ""), *(f"{x:.4g}" for x in values[:, worst])))
+    of_metrics = tables.as_html(("metric, of the worst joint", "unit", "5 %", "median", "95 %"), rows)
+    drawn = tables.as_html(("path", "perturbation"), [(path, _perturbation(x)) for path, x in study.perturbations.items()])
+    first = "margin" if "margin" in study.metrics else next(iter(study.metrics))
+    figures: dict[str, Callable[[], Figure]] = {f"Distribution of {first}": lambda: plotting.histograms(study, [first])}
+    if first == "margin":  # makes some of the runs again
+        figures["At a glance"] = lambda: plotting.study_overview(study)
+    figures["Every metric"] = lambda: plotting.histograms(study)
+    return Shown("Study", repr(study).splitlines(), {"Metrics": of_metrics, "Perturbed": drawn}, figures, study.scenario)
+
+
+def _certificate(found: Certificate) -> Shown:
+    return Shown(
+        f"Certificate: {found.verdict}", [found.subject], {"Line by line": found.table_html()}, {"Along the run": found.plot}, None
+    )
+
+
+def _comparison(found: Comparison) -> Shown:
+    first = next(iter(found.rollouts.values())).scenario
+    return Shown("Comparison", [repr(found).splitlines()[0]], found.tables_html(), {"Side by side": found.plot}, first, on_card=2)
+
+
+def _tuning(found: TuneResult) -> Shown:
+    rows = [(path, unit_at(found.start, path), _short(get(found.start, path)), _short(value)) for path, value in found.values.items()]
+    gains = tables.as_html(("tuned", "unit", "before", "after"), rows)
+    words = [*repr(found).splitlines()[:1], *str(found.report).splitlines()]
+    return Shown("Tuning", words, {"Gains": gains}, {"The search, and runs before and after": found.plot}, found.scenario)
+
+
+KINDS: dict[str, Callable[[Any], Shown]] = {
+    "Scenario": _scenario,
+    "Rollout": _rollout,
+    "Study": _study,
+    "Certificate": _certificate,
+    "Comparison": _comparison,
+    "TuneResult": _tuning,
+}
+"""Class of a result -> its parts; by name, so that what is not looked at is not imported."""
+
+
+def shown(result: Any) -> Shown:
+    """The parts of a result."""
+    maker = KINDS.get(type(result).__name__)
+    if maker is not None:
+        return maker(result)
+    figures = {"Figure": result.plot} if callable(getattr(result, "plot", None)) else {}
+    return Shown(type(result).__name__, repr(result).splitlines(), {}, figures, getattr(result, "scenario", None))
+
+
+def _image(figure: Figure, dpi: int, words: str) -> str:
+    """A figure as part of a page."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=dpi)
+    data = base64.b64encode(picture.getvalue()).decode()
+    return f'<img alt="{html.escape(words, quote=True)}" src="data:image/png;base64,{data}">'
+
+
+def _lines(words: Sequence[str]) -> str:
+    return f"<pre>{html.escape(chr(10).join(words))}</pre>" if len(words) > 1 else "".join(f"<p>{html.escape(x)}</p>" for x in words)
+
+
+def card(result: Any) -> str:
+    """What a notebook shows of a result: title, words, its first table and its first figure, as HTML."""
+    parts = shown(result)
+    text = [f"<b>{html.escape(parts.title)}</b>", _lines(parts.words), *list(parts.tables.values())[: parts.on_card]]
+    for name, draw in list(parts.figures.items())[:1]:
+        text.append(_image(draw(), CARD_DPI, name))
+    return f"<div>{''.join(text)}</div>"
+
+
+def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
+    """Writes a result as one HTML file that needs nothing else: words, tables, figures, the scenario and the versions.
+
+    Args:
+      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, or any other result of this package.
+      path: the file, ".html"; its folder must exist.
+      title: the heading; the kind of the result if not given.
+
+    Returns:
+      The path of the file.
+
+    Raises:
+      ValueError: a title that is no text, a path that ends otherwise, or an object that is no result.
+      OSError: the file cannot be written.
+
+    Source: design of this package.
+    """
+    if title is not None:
+        checks.word("title", title, "a text")
+    path = checks.file_to_write("path", path)
+    if path.suffix not in (".html", ".htm"):
+        raise checks.fail("path", str(path), 'a file that ends in ".html"')
+    if not type(result).__module__.startswith("iblf_jax"):
+        raise checks.fail("result", result, "a result of this package", "Such as what ij.simulate or ij.tune returns.")
+    path.write_text(_page(shown(result), title), encoding="utf-8")
+    return path
+
+
+def _page(parts: Shown, title: str | None) -> str:
+    import iblf_jax
+    from iblf_jax.files.scenario import scenario_to_toml
+
+    heading = html.escape(title or parts.title)
+    body = [f"<h1>{heading}</h1>", *([f"<p>{html.escape(parts.title)}</p>"] if title else []), _lines(parts.words)]
+    for name, table in parts.tables.items():
+        body.append(f'<h2>{html.escape(name)}</h2><div class="wide">{table}</div>')
+    for name, draw in parts.figures.items():
+        body.append(f"<h2>{html.escape(name)}</h2>{_image(draw(), PAGE_DPI, name)}")
+    if parts.scenario is not None:
+        try:
+            text = scenario_to_toml(parts.scenario)
+        except ValueError:  # a batch, or a class that files have no name for
+            text = repr(parameters(parts.scenario, named=False))
+        body.append(f"<h2>As a file</h2><details><summary>the scenario</summary><pre>{html.escape(text)}</pre></details>")
+    made = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    versions = f"iblf_jax {iblf_jax.__version__}, jax {jax.__version__}, numpy {np.__version__}, Python {platform.python_version()}"
+    body.append(f"<footer>{made}; {versions}</footer>")
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{heading}</title><style>{STYLE}</style>'
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>\n'

@@ -1,0 +1,105 @@
+"""Results show themselves: cards in notebooks, pages that need nothing else."""
+
+from __future__ import annotations
+
+import re
+
+import arm_cases
+import jax
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+
+SHORT = {"duration": 0.2, "dt": 2e-3}
+
+
+@pytest.fixture(scope="module")
+def results():
+    scenario = ij.presets.zhang_yan_2024()
+    drawn = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25), shared=True)}
+    return {
+        "Scenario": scenario,
+        "Rollout": ij.simulate(scenario, **SHORT),
+        "Study": ij.monte_carlo(scenario, drawn, runs=16, progress=False, **SHORT),
+        "Certificate": ij.certify(scenario, **SHORT),
+        "Comparison": ij.compare(scenario, ["integral", "log"], **SHORT),
+        "TuneResult": ij.tune(scenario, ["controller.K2"], ij.objectives.tracking() + ij.objectives.effort(), **SHORT),
+    }
+
+
+SAYS = {
+    "Scenario": ["K2 = [20., 20.]", "Backstepping (Integral)"],
+    "Rollout": ["rmse", "joint 1"],
+    "Study": ["16 runs", "xi_margin"],
+    "Certificate": ["inequality, case 2", "Backstepping"],
+    "Comparison": ["rmse [rad]", "Held equal"],
+    "TuneResult": ["controller.K2", "before", "[20., 20.]"],
+}
+
+
+@pytest.mark.parametrize("kind", SAYS)
+def test_a_card_has_words_a_table_and_a_picture(results, kind):
+    result = results[kind]
+    text = result._repr_html_()
+    assert type(result).__name__ == kind
+    assert text.count("<table>") == (2 if kind == "Comparison" else 1)
+    assert "data:image/png;base64," in text and len(text) < 300_000
+    for words in SAYS[kind]:
+        assert words in text, words
+
+
+@pytest.mark.parametrize("kind", SAYS)
+def test_a_page_needs_nothing_else(results, kind, tmp_path):
+    result = results[kind]
+    path = ij.report(result, tmp_path / "page.html", title="A <title>")
+    text = path.read_text()
+    assert "A &lt;title&gt;" in text and "A <title>" not in text
+    assert all(source.startswith("data:") for source in re.findall(r'(?:src|href)="([^"]*)', text))
+    assert f"iblf_jax {ij.__version__}" in text and f"jax {jax.__version__}" in text
+    for words in SAYS[kind]:
+        assert words in text, words
+    assert ("[controller]" in text) == (kind != "Certificate"), "the scenario as a file, of what keeps it"
+    assert ("factor uniform, low 0.8, high 1.25, shared" in text) == (kind == "Study")
+
+
+def test_numbers_are_those_of_the_result(results):
+    run, study = results["Rollout"], results["Study"]
+    assert f"{float(run.metrics.rmse[0]):.4g}" in run._repr_html_()
+    worst = np.quantile(np.asarray(study.metrics.margin), 0.5, axis=0).min()
+    row = re.search(r"<td[^>]*>margin</td>.*?</tr>", study._repr_html_())[0]
+    assert f"{worst:.4g}" in row
+
+
+def test_names_from_files_are_escaped(tmp_path):
+    names = ("<script>alert(1)</script>", '"><img src=x>')
+    robot = arm_cases.random_arm(2, seed=3, prismatic=0.0, joints=names)
+    around = ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(1.0))
+    law = ij.controllers.PDGravity(Kp=20.0, Kd=5.0)
+    scenario = ij.Scenario(robot, ij.references.Sinusoid(0.1, 0.2), around, law, ij.Initial(q=0.1))
+    for text in (scenario._repr_html_(), ij.report(scenario, tmp_path / "a.html").read_text()):
+        assert "<script>" not in text and "<img src=x>" not in text and "&lt;script&gt;" in text
+
+
+def test_what_is_traced_or_many_shows_in_words(results):
+    seen = []
+
+    @jax.jit
+    def look(run):
+        seen.append(run._repr_html_())
+        seen.append(run.scenario._repr_html_())
+        return run.q
+
+    look(results["Rollout"])
+    assert "being traced" in seen[0] and "<img" not in seen[1]
+
+
+def test_other_results_and_bad_arguments(results, tmp_path):
+    front = ij.explain(results["Scenario"])
+    assert "operations" in ij.report(front, tmp_path / "b.html").read_text()
+    with pytest.raises(ValueError, match="html"):
+        ij.report(results["Rollout"], tmp_path / "page.pdf")
+    with pytest.raises(ValueError, match="result"):
+        ij.report(3.0, tmp_path / "page.html")
+    with pytest.raises(FileNotFoundError):
+        ij.report(results["Rollout"], tmp_path / "no" / "page.html")
