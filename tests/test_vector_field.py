@@ -1,4 +1,4 @@
-"""`vector_field`: the closed loop in other libraries' solvers, as docs/how_to_other_solvers.md shows it."""
+"""`vector_field`: the closed loop in other libraries' solvers, as docs/how_to/other_solvers.md shows it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from members import LAWS, OBSERVERS
 import iblf_jax as ij
 from iblf_jax.simulation.closed_loop import initial_state, rate
 
-PAGE = (ROOT / "docs" / "how_to_other_solvers.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "how_to" / "other_solvers.md").read_text(encoding="utf-8")
 LAW_WITH_MEMORY = {"controller": LAWS["adaptive_rbf"], "observer": OBSERVERS["extended_state"]}
 
 

@@ -1,0 +1,101 @@
+"""Builds the site: `python docs/build.py`; the result is out/site/html/index.html.
+
+Pages are put together in out/site/source: what stands in this folder, the notebooks and the gallery as the tests have executed them (what
+is missing or older than its source is executed here), and pages that are made of docstrings, of the status flags, of the barriers, of
+CONTRIBUTING and of the benchmarks' results.  Any warning of Sphinx is an error.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import nbformat
+
+SITE = ROOT / "out" / "site"
+SOURCE = SITE / "source"
+EXECUTED = SITE / "notebooks"
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def digest(notebook: Path) -> str:
+    """What an executed notebook says of the one that it was made from."""
+    return hashlib.sha256(notebook.read_bytes()).hexdigest()[:16]
+
+
+def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
+    """A notebook with its outputs, run in a folder; kept for the site."""
+    from nbclient import NotebookClient
+
+    found = nbformat.read(notebook, as_version=4)
+    NotebookClient(found, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+    found.metadata["source_digest"] = digest(notebook)
+    EXECUTED.mkdir(parents=True, exist_ok=True)
+    nbformat.write(found, EXECUTED / notebook.name)
+    return found
+
+
+def is_executed(notebook: Path) -> bool:
+    """Whether this notebook, as it is now, was executed."""
+    path = EXECUTED / notebook.name
+    return path.exists() and nbformat.read(path, as_version=4).metadata.get("source_digest") == digest(notebook)
+
+
+def assemble() -> None:
+    """Puts all pages together."""
+    import barriers
+    import flags
+    import gallery
+    import reference
+
+    shutil.rmtree(SOURCE, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", SOURCE, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    shutil.copy(ROOT / "docs" / "conf.py", SOURCE)
+
+    (SOURCE / "tutorials").mkdir()
+    work = SITE / "work"
+    work.mkdir(exist_ok=True)
+    for notebook in NOTEBOOKS:
+        if not is_executed(notebook):
+            execute(notebook, work)
+        shutil.copy(EXECUTED / notebook.name, SOURCE / "tutorials")
+    listed = "\n".join(notebook.stem for notebook in NOTEBOOKS)
+    words = "The notebooks of the repository, in order, as the tests have run them."
+    (SOURCE / "tutorials" / "index.md").write_text(f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n")
+
+    for script in gallery.SCRIPTS:
+        if not gallery.is_made(script):
+            gallery.page(script)
+    shutil.copytree(gallery.MADE, SOURCE / "gallery")
+    (SOURCE / "gallery" / "index.md").write_text(gallery.index())
+
+    reference.write(SOURCE / "reference")
+    flags.write(SOURCE / "how_to")
+    barriers.write(SOURCE / "theory")
+    shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "benchmarks.md")
+    guide = (ROOT / "CONTRIBUTING.md").read_text()
+    (SOURCE / "contributing.md").write_text(guide)
+
+
+def main() -> int:
+    """Assembles and builds; Sphinx's exit code."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    assemble()
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", str(SOURCE), str(SITE / "html")]
+    code = subprocess.run(command, check=False).returncode
+    print(f"written to {SITE.relative_to(ROOT) / 'html' / 'index.html'}" if code == 0 else "the site was not built")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

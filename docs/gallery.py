@@ -1,0 +1,89 @@
+"""The gallery: every script of examples/gallery is run once, and becomes a page with its text, its figures and what it printed.
+
+The tests run the scripts with `page`, which keeps what they made in `out/site/gallery`; `docs/build.py` takes it from there, and runs what
+is missing or older than its script.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import hashlib
+import io
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
+MADE = ROOT / "out" / "site" / "gallery"
+DPI = 110
+
+
+def digest(script: Path) -> str:
+    """What a page says of the script that it was made from."""
+    return hashlib.sha256(script.read_bytes()).hexdigest()[:16]
+
+
+def is_made(script: Path) -> bool:
+    """Whether the page of this script, as it is now, is there."""
+    page = MADE / f"{script.stem}.md"
+    return page.exists() and digest(script) in page.read_text()
+
+
+def page(script: Path) -> list[Path]:
+    """Runs a script and writes its page; the pictures that it made."""
+    MADE.mkdir(parents=True, exist_ok=True)
+    text = script.read_text()
+    title, _, rest = ast.get_docstring(ast.parse(text)).partition(": ")
+    code = text.split('"""', 2)[2].strip()
+    blocks = [block.strip() for block in f"\n{code}".split("\n# %%")]
+    lines = [f"<!-- {digest(script)} -->", f"# {title}", "", f"{rest[0].upper()}{rest[1:]}", ""]
+    names: dict[str, Any] = {"__name__": "__main__"}
+    pictures: list[Path] = []
+    before = Path.cwd()
+    os.chdir(MADE)
+    try:
+        for k, block in enumerate(blocks):
+            words, _, source = block.partition("\n") if k else ("", "", block)
+            printed, seen = io.StringIO(), {id(x) for x in names.values()}
+            with contextlib.redirect_stdout(printed), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                exec(compile(source, str(script), "exec"), names)
+            lines += [words.strip(), ""] if words else []
+            lines += ["```python", source.strip(), "```", ""]
+            for name, value in list(names.items()):
+                if id(value) not in seen and (found := _picture(value, f"{script.stem}_{name}")):
+                    pictures.append(found)
+                    lines += [f"![{title}: {name}]({found.name})", ""]
+            if printed.getvalue().strip():
+                lines += ["```text", printed.getvalue().rstrip(), "```", ""]
+    finally:
+        os.chdir(before)
+    (MADE / f"{script.stem}.md").write_text("\n".join(lines), encoding="utf-8")
+    return pictures
+
+
+def _picture(value: Any, stem: str) -> Path | None:
+    """The file of a figure or a film; None of anything else."""
+    if isinstance(value, Path) and value.suffix == ".gif":
+        return MADE / value.name
+    if not hasattr(value, "savefig"):
+        return None
+    path = MADE / f"{stem}.png"
+    value.savefig(path, dpi=DPI)
+    return path
+
+
+def index() -> str:
+    """The page that shows all of them, by their first picture."""
+    cards = []
+    for script in SCRIPTS:
+        text = (MADE / f"{script.stem}.md").read_text()
+        title, picture = text.split("\n# ", 1)[1].split("\n", 1)[0], text.split("](", 1)[1].split(")", 1)[0]
+        cards.append(f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n:img-top: {picture}\n:::")
+    pages, body = "\n".join(script.stem for script in SCRIPTS), "\n".join(cards)
+    words = "Each picture is a script of `examples/gallery`; the tests run them."
+    toctree = f"```{{toctree}}\n:hidden:\n\n{pages}\n```"
+    return f"# Gallery\n\n{words}\n\n::::{{grid}} 1 2 3 3\n:gutter: 2\n\n{body}\n\n::::\n\n{toctree}\n"

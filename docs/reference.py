@@ -1,0 +1,100 @@
+"""The reference: a page a family, from the docstrings of what is public."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import iblf_jax as ij
+
+SECTIONS = ("Args", "Returns", "Raises", "Source")
+PAGES: dict[str, tuple[str, str]] = {
+    "runs": (
+        "Scenarios and runs",
+        "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status SimulationError SimulationWarning parameters with_parameters "
+        "recommended_dt recommended_period vector_field VectorField explain component leaf static astype",
+    ),
+    "studies": (
+        "Studies",
+        "monte_carlo Study sweep load_sweep StoreError sensitivity Sensitivity compare Comparison factor offset value uniform normal "
+        "log_uniform choice",
+    ),
+    "certificates": ("Certificates", "certify Certificate Counterexample"),
+    "tuning": ("Tuning", "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning"),
+    "out": (
+        "Out of Python, files and reports",
+        "export Exported cosimulate report load_scenario save_scenario load_rollouts save_rollouts",
+    ),
+}
+"""Page -> its title and the names that it explains."""
+FAMILIES = ("controllers", "barriers", "observers", "robots", "references", "bounds", "disturbances", "sensors", "actuators")
+
+
+def page_of(thing: Any, name: str, level: int = 2) -> str:
+    """One public object in Markdown."""
+    doc = inspect.getdoc(thing) or ""
+    lines = [f"{'#' * level} {name}", ""]
+    if callable(thing):
+        lines += ["```python", f"{name}{_signature(thing)}", "```", ""]
+    return "\n".join([*lines, _body(doc), ""])
+
+
+def _signature(thing: Any) -> str:
+    try:
+        text = str(inspect.signature(thing))
+    except (TypeError, ValueError):
+        return "(...)"
+    text = re.sub(r": '([^']*)'", r": \1", re.sub(r"iblf_jax(\.\w+)+\.(\w+)", r"\2", text)).replace(" -> None", "")
+    text = re.sub(r"-> '([^']*)'", r"-> \1", re.sub(r"<[^>]*>", "...", text)).replace("'", '"')
+    return text if len(text) < 90 else text.replace("(", "(\n    ", 1).replace(", ", ",\n    ").replace(") ->", "\n) ->")
+
+
+def _body(doc: str) -> str:
+    """A docstring in Markdown: sections as lists, what is set in (equations, code) as text."""
+    out, section, inside = list[str](), "", False
+    first, _, rest = doc.partition("\n")
+    if re.match(r"[\w']+ = ", first):
+        out, doc = ["```text", re.sub(r" {4,}", "    ", first), "```"], rest
+    for line in doc.splitlines():
+        head = re.fullmatch(rf"({'|'.join(SECTIONS)}):(.*)", line)
+        set_in = line.startswith("    ") and not section
+        if inside and not set_in and line.strip():
+            out.append("```\n")
+            inside = False
+        if head:
+            section = head[1]
+            out.append(f"\n**{section}**{head[2] and ':' + head[2]}\n")
+        elif set_in:
+            if not inside:
+                out.append("\n```text")
+                inside = True
+            out.append(line[4:])
+        elif section in ("Args", "Raises") and re.match(r"  \S", line):
+            what, _, rest = line.strip().partition(": ")
+            out.append(f"- **{what}**: {rest}" if rest else f"- {what}")
+        else:
+            out.append(line.strip() if section else line)
+    return "\n".join(out + (["```"] if inside else []))
+
+
+def write(folder: Path) -> None:
+    """Writes all pages into a folder."""
+    folder.mkdir()
+    names = []
+    for page, (title, listed) in PAGES.items():
+        texts = [page_of(getattr(ij, name), name) for name in listed.split()]
+        (folder / f"{page}.md").write_text(f"# {title}\n\n" + "\n".join(texts))
+        names.append(page)
+    for family in FAMILIES:
+        module = getattr(ij, family)
+        members = {cls.__name__: cls for cls in module.MEMBERS.values()}
+        texts = [page_of(cls, name) for name, cls in members.items()]
+        (folder / f"{family}.md").write_text(f"# {family.capitalize()}\n\n{_body(inspect.getdoc(module) or '')}\n\n" + "\n".join(texts))
+        names.append(family)
+    listed = "\n".join(names)
+    (folder / "index.md").write_text(
+        "# Reference\n\nEvery public name, from its docstring. [All members in one table](../members.md).\n\n"
+        f"```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
+    )

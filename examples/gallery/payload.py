@@ -1,0 +1,14 @@
+"""A payload is picked up: at two seconds the UR5 has 4 kg in its hand that its law does not know."""
+
+import iblf_jax as ij
+from iblf_jax import plotting
+
+scenario = ij.presets.ur5(payload=0.0)
+load = ij.robots.Payload(mass=4.0, centre=[0.0, 0.0, 0.1], start=2.0)
+arm = scenario.plant
+gripped = ij.with_parts(scenario, plant=type(arm)(**{**vars(arm), "carried": load}), model=arm)
+run = ij.simulate(gripped, duration=4.0, dt=2e-3, record_every=5)
+figure = plotting.joint(run, 1)
+
+# %% The observer learns the weight.
+estimates = plotting.uncertain_terms(run)

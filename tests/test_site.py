@@ -1,0 +1,58 @@
+"""What the site shows is run: the gallery's scripts, and every block of Python on its pages."""
+
+from __future__ import annotations
+
+import re
+import sys
+import warnings
+
+import pytest
+from conftest import ROOT
+
+sys.path.insert(0, str(ROOT / "docs"))
+import flags
+import gallery
+import reference
+
+import iblf_jax as ij
+
+PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "```python" in page.read_text() and page.name != "other_solvers.md"]
+"""Pages with Python; `test_vector_field` has the one about other solvers."""
+
+
+def test_there_are_examples():
+    assert len(gallery.SCRIPTS) >= 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", gallery.SCRIPTS, ids=lambda script: script.stem)
+def test_a_script_of_the_gallery_makes_its_page(script):
+    pictures = gallery.page(script)
+    assert pictures and all(path.stat().st_size > 1000 for path in pictures)
+    assert gallery.is_made(script)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_of_a_page_runs(page, tmp_path, monkeypatch):
+    if page.stem == "sweep_on_a_cluster":
+        pytest.importorskip("zarr")
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "__main__"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+            exec(compile(block, page.name, "exec"), names)
+
+
+def test_every_flag_has_a_section():
+    assert {flag.name for flag in ij.Status if flag} == set(flags.CASES)
+
+
+def test_every_public_name_is_in_the_reference():
+    listed = {name for _, names in reference.PAGES.values() for name in names.split()} | set(reference.FAMILIES)
+    classes = {name for name in dir(ij) if not name.startswith("_")}
+    modules = {name for name in classes if type(getattr(ij, name)).__name__ == "module"}
+    missing = classes - listed - modules - {"TYPE_CHECKING"}
+    assert not missing, f"docs/reference.py lacks {sorted(missing)}"
