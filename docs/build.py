@@ -56,6 +56,8 @@ def assemble() -> None:
     import gallery
     import reference
 
+    import iblf_jax as ij
+
     shutil.rmtree(SOURCE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", SOURCE, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     shutil.copy(ROOT / "docs" / "conf.py", SOURCE)
@@ -77,6 +79,9 @@ def assemble() -> None:
     shutil.copytree(gallery.MADE, SOURCE / "gallery")
     (SOURCE / "gallery" / "index.md").write_text(gallery.index())
 
+    (SOURCE / "extra").mkdir()
+    laws = {law: ij.presets.zhang_yan_2024(law=law, reading="corrected") for law in ("integral", "log", "tan", "pd")}
+    ij.explore(laws).save(SOURCE / "extra" / "live_loop.html")
     reference.write(SOURCE / "reference")
     flags.write(SOURCE / "how_to")
     barriers.write(SOURCE / "theory")

@@ -16,4 +16,5 @@ html_theme = "sphinx_book_theme"
 html_title = "iblf_jax"
 html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True}
 html_copy_source = False
+html_extra_path = ["extra"]
 suppress_warnings = ["myst.header", "mystnb.unknown_mime_type"]

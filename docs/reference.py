@@ -13,8 +13,8 @@ SECTIONS = ("Args", "Returns", "Raises", "Source")
 PAGES: dict[str, tuple[str, str]] = {
     "runs": (
         "Scenarios and runs",
-        "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status SimulationError SimulationWarning parameters with_parameters "
-        "recommended_dt recommended_period vector_field VectorField explain component leaf static astype",
+        "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status SimulationError SimulationWarning parameters "
+        "with_parameters recommended_dt recommended_period vector_field VectorField explain component leaf static astype",
     ),
     "studies": (
         "Studies",
@@ -25,7 +25,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "tuning": ("Tuning", "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning"),
     "out": (
         "Out of Python, files and reports",
-        "export Exported cosimulate report load_scenario save_scenario load_rollouts save_rollouts",
+        "export Exported explore cosimulate report load_scenario save_scenario load_rollouts save_rollouts",
     ),
 }
 """Page -> its title and the names that it explains."""

@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from iblf_jax.deployment.cosimulate import cosimulate as cosimulate
     from iblf_jax.deployment.export import Exported as Exported
     from iblf_jax.deployment.export import export as export
+    from iblf_jax.deployment.live import explore as explore
     from iblf_jax.engine.period import recommended_period as recommended_period
     from iblf_jax.files.tuning import load_tuning as load_tuning
     from iblf_jax.files.tuning import save_tuning as save_tuning
@@ -103,6 +104,7 @@ _ON_FIRST_USE = {
     "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
     "distributed": ("iblf_jax.studies.distributed", None),
+    "explore": ("iblf_jax.deployment.live", "explore"),
     "export": ("iblf_jax.deployment.export", "export"),
     "Exported": ("iblf_jax.deployment.export", "Exported"),
     "falsify": ("iblf_jax.tuning", "falsify"),

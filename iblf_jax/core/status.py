@@ -59,7 +59,7 @@ VELOCITY_LIMIT = 1e4
 """rad/s (or m/s).  No robot moves so; beyond it a run has diverged, and stopping there keeps every number finite in
 float32, so that neither a batch nor its gradient meets an infinity."""
 
-_WORDS = {
+WORDS = {
     Status.BOUND_VIOLATED: "a bound was violated",
     Status.NOT_FINITE: "the state ran away and was frozen",
     Status.STEP_TOO_LARGE: "the time step is too large for the closed loop",
@@ -74,11 +74,12 @@ _WORDS = {
     Status.FILTER_INFEASIBLE: "the safety filter's conditions could not all be met",
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
+"""What each flag says, in the order in which it is told."""
 
 
 def describe(status: int) -> str:
     """The flags of one run in words, "ok" if there is none."""
-    words = [text for flag, text in _WORDS.items() if int(status) & flag]
+    words = [text for flag, text in WORDS.items() if int(status) & flag]
     return "; ".join(words) if words else "ok"
 
 

@@ -1,0 +1,109 @@
+"""`explore`: a scenario's closed loop with sliders, as one page that computes in the browser; in notebooks the same page in a frame."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import tempfile
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.status import FAILED, WORDS
+from iblf_jax.deployment.export import export
+from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.reports import card
+from iblf_jax.simulation.paths import sign_at
+from iblf_jax.simulation.scenario import Scenario
+
+SPAN = 5.0
+"""A gain's slider goes from a fifth of its value to five times it."""
+ROOM = 0.3
+"""That of a start or a bound, so far to both sides [rad]."""
+POINTS = 500
+"""Instants that are drawn of a run, about."""
+HEIGHT = 640
+"""Pixels of the frame in a notebook."""
+
+
+class Page:
+    """A live page; a notebook shows it, `save` writes it."""
+
+    def __init__(self, text: str, fallback: str = "") -> None:
+        self.text, self.fallback = text, fallback
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the page, one HTML file that needs nothing else."""
+        path = checks.file_to_write("path", path)
+        path.write_text(self.text, encoding="utf-8")
+        return path
+
+    def _repr_html_(self) -> str:
+        if self.fallback:
+            return self.fallback
+        return f'<iframe srcdoc="{html.escape(self.text, quote=True)}" style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
+
+
+def explore(scenario: Scenario | Mapping[str, Scenario], *, duration: float = 10.0, dt: float = 1e-3, method: str = "rk4") -> Page:
+    """A page on which gains, start and bounds are moved by sliders, and the run follows while they move.
+
+    The closed loop runs in the browser, as WebAssembly (`export`), without Python.  Where `ziglang` is not installed a notebook shows the
+    scenario's table and figure instead.
+
+    Args:
+      scenario: what runs; or several by name, to choose from.
+      duration: of a run [s].
+      dt, method: as in `simulate`.
+
+    Returns:
+      A `Page`: the value of a notebook's cell, or `page.save("live.html")`.
+
+    Raises:
+      ValueError: bad arguments, or a loop that cannot be written out.
+
+    Source: design of this package.
+    """
+    several = scenario if isinstance(scenario, Mapping) else {"": scenario}
+    steps = checks.whole_steps(duration, dt)
+    if not several:
+        raise checks.fail("scenario", scenario, "a scenario, or some by name")
+    try:
+        loops = {name: _loop(each, dt, method) for name, each in several.items()}
+    except ToolchainError as error:
+        first = next(iter(several.values()))
+        return Page("", f"<p>{html.escape(str(error))}; without it nothing moves.</p>{card(first)}")
+    page = Template((files("iblf_jax.deployment") / "page" / "live.html").read_text())
+    values = {"title": "iblf_jax", "loops": json.dumps(loops).replace("</", "<\\/"), "steps": steps, "every": max(1, steps // POINTS)}
+    return Page(page.substitute(values))
+
+
+def _loop(scenario: Scenario, dt: float, method: str) -> dict[str, Any]:
+    """A module and its table, with the sliders that its parameters get."""
+    with tempfile.TemporaryDirectory() as folder:
+        export(scenario, folder, target="wasm", dt=dt, method=method)
+        module = base64.b64encode((Path(folder) / "iblf_loop.wasm").read_bytes()).decode()
+        table = json.loads((Path(folder) / "iblf_loop.json").read_text())
+    for row in table["parameters"]:
+        row |= _slider(scenario, row)
+    table["count"] = sum(int(np.prod(row["shape"])) for row in table["parameters"])
+    table["flags"] = [(int(flag), words) for flag, words in WORDS.items()]
+    table["failed"] = int(FAILED)
+    return {"wasm": module, "table": table}
+
+
+def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
+    """Ends of a parameter's sliders: of gains one for all joints, of starts and bounds one a joint; nothing for others."""
+    path, values = row["path"], np.ravel(row["value"])
+    if len(row["shape"]) > 1 or any(x is None for x in values):
+        return {}
+    if path.startswith(("controller.", "observer.")) and sign_at(scenario, path) == "positive":
+        return {"slider": [[float(values[0]) / SPAN, float(values[0]) * SPAN]], "positive": True, "each": False}
+    if path in ("initial.q", "bounds.lower.offset", "bounds.upper.offset", "bounds.lower.value", "bounds.upper.value"):
+        return {"slider": [[float(x) - ROOM, float(x) + ROOM] for x in values], "positive": False, "each": True}
+    return {}
