@@ -81,9 +81,8 @@ def quadratic_program(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array)
 def _solved(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array) -> _Point:
     """The solution of a scaled programme."""
     point = _Point(jnp.zeros(G.shape[1], h.dtype), jnp.maximum(h, 1.0), jnp.ones_like(h))
-    for _ in range(ITERATIONS):
-        point = _improved(H, G, h, soft, point)
-    return point
+    # A loop: where it is not lowered, XLA compiles one iteration.
+    return jax.lax.scan(lambda at, _: (_improved(H, G, h, soft, at), None), point, length=ITERATIONS)[0]
 
 
 @jax.jit  # so that the generated code holds it once
