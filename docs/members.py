@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
 from iblf_jax.controllers.systems import observer_of
 
 TARGET = Path(__file__).with_name("members.md")
@@ -22,6 +22,7 @@ FAMILIES = (
     ("Robots", robots, "`iblf_jax.robots`", ()),
     ("References", references, "`iblf_jax.references`", ()),
     ("Bounds", bounds, "`iblf_jax.bounds`", ()),
+    ("Regions", regions, "`iblf_jax.regions`", ()),
     ("Disturbances", disturbances, "`iblf_jax.disturbances`", ()),
     ("Sensors", sensors, "`iblf_jax.sensors`", ()),
     ("Velocities of an encoder", SimpleNamespace(MEMBERS=sensors.VELOCITIES), "`iblf_jax.sensors`", ()),

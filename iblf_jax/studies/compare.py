@@ -26,7 +26,7 @@ from iblf_jax.core.pytree import rewrapped, unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.observers import NoObserver
-from iblf_jax.simulation.metrics import AboveGravity, VelocityMargin, standard
+from iblf_jax.simulation.metrics import AboveGravity, standard, watched
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -137,8 +137,7 @@ def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; a failure is named in the table, not warned of."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        watched = () if scenario.velocity_bounds is None else (VelocityMargin(),)
-        return simulate(scenario, metrics=(*standard(), *watched, AboveGravity()), **options)
+        return simulate(scenario, metrics=(*standard(), *watched(scenario), AboveGravity()), **options)
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
