@@ -78,7 +78,7 @@ class Sphere:
 
     Args:
       centre: in the base's frame, (2,) or (3,) as the robot's points [m].
-      radius: () [m], > 0.
+      radius: its radius, () [m], > 0.
       keep: "inside" or "outside"; "outside" if not given.
       point: "tip", or the joint by its name or number whose origin is kept; "tip" if not given.
 

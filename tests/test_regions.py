@@ -45,7 +45,7 @@ def alone():
 
 @pytest.fixture(scope="module")
 def kept():
-    return ij.simulate(filtered(stepping()), **RUN)
+    return ij.simulate(filtered(stepping()), **RUN, backend="xla")
 
 
 # ---------------------------------------------------------------------------------------------------- by hand, from the equations alone
@@ -128,7 +128,7 @@ def test_a_run_is_that_of_an_independent_program():
 
     t = np.linspace(0.0, 1.0, 11)
     found = solve_ivp(rate, (0.0, 1.0), [1.0, 1.3, 0.0, 0.0], "DOP853", t_eval=t, rtol=1e-8, atol=1e-10)
-    run = ij.simulate(filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400)
+    run = ij.simulate(filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400, backend="xla")
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
 
 
@@ -164,14 +164,16 @@ def test_the_filter_keeps_what_the_law_breaks(kept):
 def test_too_little_torque_breaks_them_and_says_by_how_much():
     scenario = filtered(stepping(initial=ij.Initial([1.0, 1.3], [-3.0, -1.0])), limit=[3.0, 1.0])
     with pytest.warns(ij.SimulationWarning, match=r"m/s\^2 \(run\.region_slack\).*b1 and b2"):
-        run = ij.simulate(scenario, duration=0.3, dt=1e-3, method="euler")
+        run = ij.simulate(scenario, duration=0.3, dt=1e-3, method="euler", backend="xla")
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     np.testing.assert_allclose(run.metrics.largest_region_slack, run.region_slack.max(axis=0))
     assert float(np.max(run.metrics.largest_region_slack)) > 0.1
     assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([3.0, 1.0]) * (1 + 1e-9))
     at = scenario.setting.regions_along(run.q[1], run.dq[1])
     model, law = scenario.model, scenario.controller
-    ddq = np.linalg.solve(model.mass_matrix(run.q[1]), run.tau[1] - model.coriolis(run.q[1], run.dq[1], run.dq[1]) - model.gravity(run.q[1]))
+    ddq = np.linalg.solve(
+        model.mass_matrix(run.q[1]), run.tau[1] - model.coriolis(run.q[1], run.dq[1], run.dq[1]) - model.gravity(run.q[1])
+    )
     broken = -(at.slope @ ddq + at.bend + (law.b1 + law.b2) * at.rate + law.b1 * law.b2 * at.level)
     np.testing.assert_allclose(run.region_slack[1], np.maximum(broken, 0.0), atol=1e-5 * np.max(np.abs(broken)))
 
@@ -181,15 +183,20 @@ def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path)
     (tmp_path / "arm.xml").write_text(MODEL)
     model = mujoco.MjModel.from_xml_string(MODEL)
     data, robot = mujoco.MjData(model), ij.robots.load(tmp_path / "arm.xml", tip="tip")
-    parts = [regions.Sphere([0.3, 0.1, 0.2], 0.1), regions.HalfSpace([0.0, 1.0, 2.0], -1.0, "wrist"), regions.Sphere([0.0, 0.0, 0.0], 2.0, **SIDES)]
+    parts = [
+        regions.Sphere([0.3, 0.1, 0.2], 0.1),
+        regions.HalfSpace([0.0, 1.0, 2.0], -1.0, "wrist"),
+        regions.Sphere([0.0, 0.0, 0.0], 2.0, **SIDES),
+    ]
+    moving = jax.jit(lambda q, v: along(tuple(parts), robot, q, v))
     for q, v, a in rng.uniform(-1.5, 1.5, (5, 3, robot.n)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
         np.testing.assert_allclose(position_of(robot, "wrist", q), data.joint("wrist").xanchor, atol=1e-12)
         np.testing.assert_allclose(position_of(robot, "tip", q), data.site("tip").xpos, atol=1e-12)
         h = 1e-4
-        moved = [along(tuple(parts), robot, jnp.asarray(q + s * v + 0.5 * s**2 * a), jnp.asarray(v)).level for s in (-h, 0.0, h)]
-        at = along(tuple(parts), robot, jnp.asarray(q), jnp.asarray(v))
+        moved = [moving(q + s * v + 0.5 * s**2 * a, v).level for s in (-h, 0.0, h)]
+        at = moving(q, v)
         np.testing.assert_allclose(at.rate, (moved[2] - moved[0]) / (2 * h), atol=1e-6)
         np.testing.assert_allclose(at.slope @ a + at.bend, (moved[2] - 2 * moved[1] + moved[0]) / h**2, atol=1e-5)
     assert in_words(parts[1], robot) == "the origin of wrist"
@@ -201,6 +208,7 @@ MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="base"
 </body></body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_run_in_space_by_the_kernels():
     """A wall for the tip of an arm that is thrown at it, and what a batch says of it on two backends."""
     robot = random_arm(2, seed=1, armature=0.1)

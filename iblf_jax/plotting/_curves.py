@@ -32,12 +32,25 @@ DERIVED = {
     "measured_dq": lambda run: run.measured.dq,
     "region_wall": lambda run: np.zeros(np.shape(run.region_margin)),
 }
-"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f - f_hat, what a sensor told, walls of regions."""
+"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f - f_hat, what was measured, walls."""
 
 HELD = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
 """Signals of a sampled law that stay as they are from sample to sample."""
 
-GIVEN = {"t", "q_d", "dq_d", "lower", "upper", "error_lower", "error_upper", "wall_lower", "wall_upper", "dq_lower", "dq_upper", "region_wall"}
+GIVEN = {
+    "t",
+    "q_d",
+    "dq_d",
+    "lower",
+    "upper",
+    "error_lower",
+    "error_upper",
+    "wall_lower",
+    "wall_upper",
+    "dq_lower",
+    "dq_upper",
+    "region_wall",
+}
 """Signals that do not depend on the state, and are drawn to the end whatever became of it."""
 
 SAME = 0.03

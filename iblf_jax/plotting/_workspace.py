@@ -73,7 +73,7 @@ def draw_walls(axes: Any, robot: Any, regions: Sequence[Region], limits: np.ndar
 
 
 def _in_the_plane(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
-    x, y = (np.linspace(*ends, GRID) for ends in limits)
+    x, y = (np.linspace(low, high, GRID) for low, high in limits)
     at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     distance = np.asarray(jax.jit(jax.vmap(region.distance))(at)).reshape(GRID, GRID)
     if distance.min() < 0.0 < distance.max():
