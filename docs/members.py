@@ -63,11 +63,16 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
 def systems() -> list[str]:
     """The systems that the paper names, and what each is made of."""
     rows = []
-    for name in controllers.LAWS:
+    for name in (*controllers.LAWS, *controllers.KEEPERS):
         law = controllers.law_by_name(name)
         barrier = getattr(law, "barrier", None)
         usual = observers.Printed(kf=20.0)
-        parts = (type(law).__name__, type(barrier).__name__ if barrier else "-", "none" if observer_of(name, usual) is not usual else "any")
+        around = f" around {type(law.law).__name__}" if hasattr(law, "law") else ""
+        parts = (
+            type(law).__name__ + around,
+            type(barrier).__name__ if barrier else "-",
+            "none" if observer_of(name, usual) is not usual else "any",
+        )
         described = type(barrier) if isinstance(law, controllers.Backstepping) else type(law)
         rows.append((f"`{name}`", *parts, cell(source(described))))
     return table(("system", "law", "barrier", "observer", "source"), rows)

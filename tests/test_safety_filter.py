@@ -166,6 +166,20 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
     np.testing.assert_array_equal(again.metrics.ise, native.metrics["ise"][again_at])
 
 
+def test_a_study_tells_the_largest_slack():
+    narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
+    scenario = filtered(falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
+    starts = {"initial.q": ij.value(ij.uniform([0.7, 0.8], [0.87, 0.87])), "initial.dq": ij.value(ij.uniform(0.0, 0.48))}
+    study = ij.monte_carlo(scenario, starts, runs=16, duration=0.2, dt=1e-3, progress=False)
+    broken = np.asarray(study.metrics.largest_slack).max(axis=1) > 0
+    np.testing.assert_array_equal(broken, study.status & int(ij.Status.FILTER_INFEASIBLE) != 0)
+    assert 0 < broken.sum() < 16
+    worst = int(study.worst(1, "largest_slack")[0])
+    np.testing.assert_allclose(study.replay(worst).slack.max(axis=0), study.metrics.largest_slack[worst], rtol=1e-6)
+    with pytest.raises(ValueError, match="a law with a filter"):
+        ij.simulate(falling(), **RUN, metrics=(ij.metrics.Slack(),))
+
+
 def test_it_is_sampled_and_saved(tmp_path):
     scenario = ij.with_parts(filtered(falling(), nearest="acceleration"), sampling=ij.Sampling(period=2e-3, delay=1e-3))
     run = ij.simulate(scenario, **RUN)
