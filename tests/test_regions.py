@@ -293,6 +293,11 @@ def test_files_and_datasets_hold_them(tmp_path, alone):
 def test_figures(alone, kept):
     figure = plotting.region_margins({"alone": alone, "filtered": kept})
     assert len(figure.axes) == 6
+    assert len(alone.plot().axes) == 2 + 6 + 2  # tubes, joints together, margins and paths
+    drawn = plotting.workspace({"alone": alone, "filtered": kept}).axes[0]
+    tip = next(x for x in drawn.get_lines() if x.get_label() == "filtered").get_xydata()
+    np.testing.assert_allclose(tip[-1], points(np.asarray(kept.q[-1]))[1])
+    assert {x.get_label() for x in drawn.get_lines()} >= {"wall of the tip", "wall of the origin of joint 1", "reference"}
     line = next(x for x in figure.axes[0].get_lines() if x.get_label() == "alone")
     np.testing.assert_allclose(line.get_ydata()[-1], alone.region_margin[-1, 0])
 

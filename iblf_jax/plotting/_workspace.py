@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from iblf_jax.core import checks
@@ -127,14 +128,22 @@ def workspace(runs: Runs) -> Figure:
       ValueError: no run, a batch, or robots that do not fit together.
     """
     curves = curves_of(runs)
+    figure = _style.new_figure(4.9, 4.9)
+    draw_paths(figure, figure.add_gridspec(1, 1)[0], curves)
+    _style.entitle(figure, "Paths and walls", curves)
+    _style.legend_below(figure, 3)
+    return figure
+
+
+def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> Any:
+    """Draws the paths of the points of the runs, and the first one's walls; returns the panel."""
     first = curves[0]
     robot, regions = first.run.scenario.plant, first.run.scenario.regions
     moved = [skeletons(curve.run.scenario.plant, curve.at("q", _times(curve))) for curve in curves]
     wanted = skeletons(robot, first.at("q_d", _times(first)))
     if len({x.shape[-1] for x in (wanted, *moved)}) > 1:
         raise checks.fail("runs", "arms in the plane and in space", "arms of one kind", "Draw them one by one.")
-    figure = _style.new_figure(4.9, 4.9)
-    axes: Any = figure.add_subplot(projection="3d" if wanted.shape[-1] == 3 else None)
+    axes: Any = figure.add_subplot(where, projection="3d" if wanted.shape[-1] == 3 else None)
     limits = frame(axes, np.concatenate([x.reshape(-1, x.shape[-1]) for x in (wanted, *moved)]), regions)
     draw_walls(axes, robot, regions, limits)
     axes.plot(*wanted[:, -1].T, **(_style.reference() | {"label": "reference"}))
@@ -145,9 +154,7 @@ def workspace(runs: Runs) -> Figure:
             label = (curve.name or "tip") if row == robot.n else "_"
             axes.plot(*skeleton[:, row].T, **(look | {"label": label, "linewidth": 1.6 if row == robot.n else 0.9}))
         axes.plot(*skeleton[-1].T, color=_style.shade(0.45, look["color"]), linewidth=2.4, marker="o", markersize=4, label="_")
-    _style.entitle(figure, "Paths and walls", curves)
-    _style.legend_below(figure, 3)
-    return figure
+    return axes
 
 
 def _times(curve: Curve) -> np.ndarray:
