@@ -283,7 +283,7 @@ def test_files_and_datasets_hold_them(tmp_path, alone):
     again = load_scenario(tmp_path / "s.toml")
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
     jax.tree.map(np.testing.assert_array_equal, again, scenario)
-    assert "[[regions]]" in scenario_to_toml(scenario)
+    assert "[[regions]]" in scenario_to_toml(scenario) and "regions" not in scenario_to_toml(stepping(regions=()))
     assert "radius = 0.1  # m" in scenario_to_toml(scenario)
     assert {"regions[1].centre", "controller.b2"} <= {p.path for p in ij.parameters(scenario)}
     data = alone.to_xarray()

@@ -52,7 +52,7 @@ def test_it_keeps_what_the_law_breaks(alone, options):
     assert float(jnp.min(alone.metrics.margin)) < -0.01
     options = dict(options)
     method = options.pop("method", "rk4")
-    run = ij.simulate(filtered(falling(), **options), **RUN, method=method)
+    run = ij.simulate(filtered(falling(), **options), **RUN, method=method, backend="xla")
     assert not int(run.status) & ~int(ij.Status.INACCURATE)
     assert float(jnp.min(run.metrics.margin)) > 0
     assert float(jnp.max(run.slack)) == 0
@@ -147,7 +147,7 @@ def test_an_empty_box_is_flagged_with_its_slack():
 @pytest.mark.slow
 def test_too_little_torque_is_flagged_and_never_exceeded():
     with pytest.warns(ij.SimulationWarning, match="safety filter"):
-        run = ij.simulate(filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler")
+        run = ij.simulate(filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler", backend="xla")
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([7.0, 2.0]) * (1 + 1e-9))
     assert float(jnp.max(run.slack)) > 0.1

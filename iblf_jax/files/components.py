@@ -114,6 +114,8 @@ def encode_fields(part: Any, path: str) -> dict[str, Any]:
                 table[field.name] = NONE
         elif field.metadata.get("static"):
             table[field.name] = plain_static(value, name)
+        elif isinstance(value, tuple) and not value and field.default == ():
+            continue
         else:
             table[field.name] = encode(value, hints.get(field.name, Any), name)
     return table
