@@ -17,7 +17,6 @@ from iblf_jax.regions import along, in_words, margins, position_of
 from iblf_jax.simulation import metrics
 
 RUN = {"duration": 1.5, "dt": 1e-3}
-SIDES = {"keep": "inside"}
 WALL = regions.HalfSpace(normal=[-2.0, 0.2], offset=-0.46)
 BALL = regions.Sphere(centre=[0.40, 0.06], radius=0.1, point=1)
 REACH = regions.Sphere(centre=[0.1, 0.1], radius=0.46, keep="inside")
@@ -186,7 +185,7 @@ def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path)
     parts = [
         regions.Sphere([0.3, 0.1, 0.2], 0.1),
         regions.HalfSpace([0.0, 1.0, 2.0], -1.0, "wrist"),
-        regions.Sphere([0.0, 0.0, 0.0], 2.0, **SIDES),
+        regions.Sphere([0.0, 0.0, 0.0], 2.0, keep="inside"),
     ]
     moving = jax.jit(lambda q, v: along(tuple(parts), robot, q, v))
     for q, v, a in rng.uniform(-1.5, 1.5, (5, 3, robot.n)):
