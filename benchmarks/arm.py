@@ -49,7 +49,7 @@ def starts(scenario, runs: int) -> np.ndarray:
 def native(dtype: str, metrics, runs: int, steps: int, method: str) -> tuple[float, float, float]:
     """Seconds to compile, and wall and processor seconds of a batch."""
     scenario = canonical(ij.astype(ij.presets.iiwa14(), dtype))
-    folds, run = as_folds(metrics, dtype, scenario.n), Run(steps, method, mechanism=mechanism_of(scenario))
+    folds, run = as_folds(metrics, dtype, scenario), Run(steps, method, mechanism=mechanism_of(scenario))
     values, dt = {"initial.q": jnp.asarray(starts(scenario, runs), dtype)}, jnp.asarray(DT, dtype)
     seconds, call = compile_seconds(lambda v, dt: run_batch(scenario, v, folds, dt, run, backend="native"), values, dt)
     return seconds, *measured(lambda: call(values, dt), 3)

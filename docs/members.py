@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
 from iblf_jax.controllers.systems import observer_of
 
 TARGET = Path(__file__).with_name("members.md")
@@ -22,6 +22,7 @@ FAMILIES = (
     ("Robots", robots, "`iblf_jax.robots`", ()),
     ("References", references, "`iblf_jax.references`", ()),
     ("Bounds", bounds, "`iblf_jax.bounds`", ()),
+    ("Regions", regions, "`iblf_jax.regions`", ()),
     ("Disturbances", disturbances, "`iblf_jax.disturbances`", ()),
     ("Sensors", sensors, "`iblf_jax.sensors`", ()),
     ("Velocities of an encoder", SimpleNamespace(MEMBERS=sensors.VELOCITIES), "`iblf_jax.sensors`", ()),
@@ -62,11 +63,16 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
 def systems() -> list[str]:
     """The systems that the paper names, and what each is made of."""
     rows = []
-    for name in controllers.LAWS:
+    for name in (*controllers.LAWS, *controllers.KEEPERS):
         law = controllers.law_by_name(name)
         barrier = getattr(law, "barrier", None)
         usual = observers.Printed(kf=20.0)
-        parts = (type(law).__name__, type(barrier).__name__ if barrier else "-", "none" if observer_of(name, usual) is not usual else "any")
+        around = f" around {type(law.law).__name__}" if hasattr(law, "law") else ""
+        parts = (
+            type(law).__name__ + around,
+            type(barrier).__name__ if barrier else "-",
+            "none" if observer_of(name, usual) is not usual else "any",
+        )
         described = type(barrier) if isinstance(law, controllers.Backstepping) else type(law)
         rows.append((f"`{name}`", *parts, cell(source(described))))
     return table(("system", "law", "barrier", "observer", "source"), rows)

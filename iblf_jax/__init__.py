@@ -15,6 +15,7 @@ from iblf_jax import disturbances as disturbances
 from iblf_jax import observers as observers
 from iblf_jax import presets as presets
 from iblf_jax import references as references
+from iblf_jax import regions as regions
 from iblf_jax import robots as robots
 from iblf_jax import sensors as sensors
 from iblf_jax.bounds import Bounds as Bounds

@@ -36,6 +36,7 @@ class Holder:
     sampling: None = None
     sensor: object = ij.sensors.Ideal()
     actuator: object = ij.actuators.Ideal()
+    regions: tuple = ()
 
 
 jax.tree_util.register_pytree_node(Holder, lambda holder: ((), holder), lambda holder, _: holder)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
 from iblf_jax.simulation import metrics
 
 TWO_LINK = ij.presets.customary_two_link()
@@ -31,6 +31,13 @@ SIDES = {
     "constant": bounds.Constant([0.9, 1.2]),
     "sinusoid": bounds.Sinusoid(offset=[0.9, 0.8], amplitude=0.14, frequency=1.0, phase=[1.57, 0.0]),
     "funnel": bounds.Funnel(initial=0.5, final=[0.1, 0.2], rate=1.5),
+}
+
+REGIONS = {
+    "half_space": regions.HalfSpace(normal=[1.0, -2.0], offset=-0.6),
+    "half_space_of_the_elbow": regions.HalfSpace(normal=[0.0, 0.0, 2.0], offset=0.1, point=1),
+    "sphere": regions.Sphere(centre=[0.2, 0.4], radius=0.1),
+    "sphere_inside": regions.Sphere(centre=[0.2, 0.4, 0.1], radius=0.9, keep="inside"),
 }
 
 DISTURBANCES = {
@@ -104,12 +111,14 @@ LAWS = {
     "saturated_smooth": controllers.Saturated(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"),
 }
 
-FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), metrics.AboveGravity(), metrics.VelocityMargin())}
+OPTIONAL_FOLDS = (metrics.AboveGravity(), metrics.VelocityMargin(), metrics.RegionMargin(), metrics.Slack(), metrics.RegionSlack())
+FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), *OPTIONAL_FOLDS)}
 
 FAMILIES = {
     "robot": (ROBOTS, robots.MEMBERS, ij.testing.check_robot),
     "reference": (REFERENCES, references.MEMBERS, ij.testing.check_reference),
     "side": (SIDES, bounds.MEMBERS, ij.testing.check_side),
+    "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
     "observer": (OBSERVERS, observers.MEMBERS, ij.testing.check_observer),

@@ -106,6 +106,33 @@ def test_failed_runs_are_named():
     assert "weak, failed itself" in repr(reverse)
 
 
+@pytest.mark.slow
+def test_laws_for_other_constraints_have_names_and_margins():
+    """They stand beside the others at equal effort, though the first law leaves what it does not know of."""
+    speeds = ij.Bounds(ij.bounds.Constant([-1.0, -0.6]), ij.bounds.Constant([0.6, 0.5]))
+    wall = ij.regions.HalfSpace(normal=[-1.0, 0.0], offset=-0.245)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,))
+    comparison = ij.compare(scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3)
+    given = {row.law: row for row in comparison.table["gains"]}
+    assert given["integral"].velocity_margin < 0 < given["full_state"].velocity_margin
+    for row in given.values():
+        assert row.region_margin == float(np.min(comparison.rollouts[row.law].metrics.region_margin))
+    assert given["integral"].region_margin < 0
+    law = comparison.rollouts["reference_governor"].scenario.controller
+    assert isinstance(law, controllers.ReferenceGovernor) and isinstance(law.law, controllers.PDGravity)
+    assert comparison.factors["full_state"] > 1.0
+    assert "region margin [m]" in repr(comparison) and "region_margin" in comparison.to_pandas()
+    with pytest.raises(ValueError, match="velocity_bounds"):
+        ij.compare(ij.presets.zhang_yan_2024(), ["integral", "full_state"], **RUN)
+
+
+def test_a_filter_by_name_is_around_the_unconstrained_law():
+    law = controllers.law_by_name("safety_filter", k1=3.0, reading="corrected")
+    assert isinstance(law.law.barrier, ij.barriers.Quadratic) and float(law.law.k1) == 3.0
+    found = ij.compare(ij.with_parts(ij.presets.zhang_yan_2024(), controller=law), ["pd"], duration=0.02, dt=1e-3, equal_effort=False)
+    assert isinstance(found.rollouts["pd"].scenario.controller, controllers.PDGravity)  # a filter is a law's own, unlike a torque limit
+
+
 def test_a_law_without_a_factor_is_said_so():
     # A limit far below what the integral form does: no gain makes this one work as hard.
     capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])

@@ -74,6 +74,29 @@ def test_what_has_no_solution_is_the_least_breaking_and_says_so(rng):
     assert 0.2 * count < broken < count
 
 
+@pytest.mark.parametrize(("n", "rows"), [(2, 6), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((3, 9), (7, 16)))])
+def test_many_without_a_solution_meet_the_conditions_of_the_least(n, rows, rng):
+    """Soft rows near and far within a hard box: no point breaks the same rows less (by bounded least squares)."""
+    from scipy.optimize import lsq_linear
+
+    A = rng.normal(size=(200, rows, n))
+    A /= np.linalg.norm(A, axis=2, keepdims=True)
+    room = rng.uniform(-1.5, 0.5, (200, rows)) * 10 ** rng.uniform(-2, 2, (200, 1))
+    box = np.broadcast_to(np.concatenate([np.eye(n), -np.eye(n)]), (200, 2 * n, n))
+    G, h = np.concatenate([A, box], axis=1), np.concatenate([room, np.ones((200, 2 * n))], axis=1)
+    soft = np.broadcast_to(np.r_[np.ones(rows), np.zeros(2 * n)], h.shape)
+    x = np.asarray(SOLVED(np.broadcast_to(np.eye(n), (200, n, n)), G, h, soft).x)
+    assert np.max(np.abs(x)) <= 1 + 1e-9
+    broken = np.einsum("bij,bj->bi", A, x) - room
+    lost = 0
+    for k in np.flatnonzero(np.any(broken > 1e-6, axis=1)):
+        active = broken[k] > 1e-9
+        best = lsq_linear(A[k][active], room[k][active], (-1 - 1e-12, 1 + 1e-12), tol=1e-14).cost
+        assert 0.5 * np.sum(broken[k][active] ** 2) <= best * (1 + 1e-6) + 1e-12
+        lost += 1
+    assert lost > 100
+
+
 def test_derivatives_are_those_of_the_solution(rng):
     H, G, h = (jnp.asarray(x[0]) for x in random_programs(rng, 1, 3, 8))
     soft = jnp.ones(8)

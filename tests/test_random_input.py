@@ -555,7 +555,7 @@ jax.tree_util.register_dataclass(Own, ["width"], ["units"])
 def test_anything_in_a_fold_and_in_a_table(odd):
     value = NASTY[odd]
     for field in ("width", "units"):
-        accepts_or_value_error(lambda field=field: metrics.as_folds([Own(**{field: value})], np.float64, 2))
+        accepts_or_value_error(lambda field=field: metrics.as_folds([Own(**{field: value})], np.float64, ij.presets.zhang_yan_2024()))
     for table in (value, {"k1": value}, {"k1": 1.0, "K2": 1.0, "o": 1.0, "barrier": value}):
         accepts_or_value_error(lambda table=table: decode_fields(ij.controllers.Backstepping, table, "controller"))
     assert depth_left(500)

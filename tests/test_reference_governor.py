@@ -104,6 +104,13 @@ def test_files_paths_and_gradients(tmp_path):
     assert float(found) == pytest.approx((float(loss(40.0 + h)) - float(loss(40.0 - h))) / (2 * h), rel=1e-5)
 
 
+def test_its_speed_is_tuned():
+    scenario = scenario_of(controllers.ReferenceGovernor(law=LAWS["pd"], eta=2.0))
+    result = ij.tune(scenario, ["controller.eta"], ij.objectives.tracking(), duration=0.4, dt=2e-3, iterations=3, progress=False)
+    assert float(np.min(result.values["controller.eta"])) > 3.0  # a faster one tracks better
+    assert result.nominal[1].metrics.ise.sum() < 0.95 * result.nominal[0].metrics.ise.sum()
+
+
 def test_its_state_starts_inside_the_margin():
     governor = controllers.ReferenceGovernor(law=LAWS["pd"])
     state = governor.init(jnp.array([0.205, 0.5]), jnp.zeros(2), scenario_of(governor).setting)

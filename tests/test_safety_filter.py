@@ -52,7 +52,7 @@ def test_it_keeps_what_the_law_breaks(alone, options):
     assert float(jnp.min(alone.metrics.margin)) < -0.01
     options = dict(options)
     method = options.pop("method", "rk4")
-    run = ij.simulate(filtered(falling(), **options), **RUN, method=method)
+    run = ij.simulate(filtered(falling(), **options), **RUN, method=method, backend="xla")
     assert not int(run.status) & ~int(ij.Status.INACCURATE)
     assert float(jnp.min(run.metrics.margin)) > 0
     assert float(jnp.max(run.slack)) == 0
@@ -147,7 +147,7 @@ def test_an_empty_box_is_flagged_with_its_slack():
 @pytest.mark.slow
 def test_too_little_torque_is_flagged_and_never_exceeded():
     with pytest.warns(ij.SimulationWarning, match="safety filter"):
-        run = ij.simulate(filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler")
+        run = ij.simulate(filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler", backend="xla")
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([7.0, 2.0]) * (1 + 1e-9))
     assert float(jnp.max(run.slack)) > 0.1
@@ -164,6 +164,20 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
     again_at = 3
     again = native.replay(again_at)
     np.testing.assert_array_equal(again.metrics.ise, native.metrics["ise"][again_at])
+
+
+def test_a_study_tells_the_largest_slack():
+    narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
+    scenario = filtered(falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
+    starts = {"initial.q": ij.value(ij.uniform([0.7, 0.8], [0.87, 0.87])), "initial.dq": ij.value(ij.uniform(0.0, 0.48))}
+    study = ij.monte_carlo(scenario, starts, runs=16, duration=0.2, dt=1e-3, progress=False)
+    broken = np.asarray(study.metrics.largest_slack).max(axis=1) > 0
+    np.testing.assert_array_equal(broken, study.status & int(ij.Status.FILTER_INFEASIBLE) != 0)
+    assert 0 < broken.sum() < 16
+    worst = int(study.worst(1, "largest_slack")[0])
+    np.testing.assert_allclose(study.replay(worst).slack.max(axis=0), study.metrics.largest_slack[worst], rtol=1e-6)
+    with pytest.raises(ValueError, match="a law with a filter"):
+        ij.simulate(falling(), **RUN, metrics=(ij.metrics.Slack(),))
 
 
 def test_it_is_sampled_and_saved(tmp_path):

@@ -32,6 +32,7 @@ def assert_equal(a: ij.Scenario, b: ij.Scenario) -> None:
 
 
 TWO_JOINTS = [robot for robot in members.ROBOTS.values() if robot.n == 2]
+IN_THE_PLANE = [members.REGIONS[name] for name in ("half_space", "sphere")]
 TWO_JOINTS.append(ij.robots.PlanarChain(mass=[1.0, 2.0], length=0.3, centre=0.1, inertia=0.02))
 
 
@@ -57,6 +58,7 @@ def scenarios(draw) -> ij.Scenario:
         observer=one(members.OBSERVERS),
         disturbance=one(members.DISTURBANCES),
         initial=ij.Initial(q=0.5),
+        regions=tuple(draw(st.lists(st.sampled_from(IN_THE_PLANE), max_size=2))),
     )
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     dtype = draw(st.sampled_from(["float64", "float32"]))

@@ -162,17 +162,23 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
     """Metrics of runs side by side, one column a joint, with units."""
     from iblf_jax.core import tables
     from iblf_jax.robots import joint_names
+    from iblf_jax.simulation.signals import OF_REGIONS
 
     first = next(iter(runs.values()))
     joints = joint_names(first.scenario.plant, first.n)
     rows = [["metric", "unit", *(cell for _ in runs for cell in joints)]]
     for name, unit in first.metrics.units.items():
-        row = [name, unit]
-        for run in runs.values():
-            values = np.ravel(run.metrics[name])
-            cells = ["-" if name.endswith("violation_joint") and x < 0 else number(x) for x in values]
-            row += [*cells, *[""] * (run.n - len(cells))][: run.n]
-        rows.append(row)
+        values = [np.ravel(run.metrics[name]) for run in runs.values()]
+        # One row a region: there may be more of them than joints.
+        lines = (
+            [(f"{name}[{i}]", [x[i : i + 1] for x in values]) for i in range(values[0].size)] if name in OF_REGIONS else [(name, values)]
+        )
+        for shown, numbers in lines:
+            row = [shown, unit]
+            for x in numbers:
+                cells = ["-" if name.endswith(("violation_joint", "violation_region")) and y < 0 else number(y) for y in x]
+                row += [*cells, *[""] * (first.n - len(cells))]
+            rows.append(row)
     if any(runs):  # a name, over the first of its joints
         rows.insert(0, ["", "", *(cell for name in runs for cell in [name, *[""] * (first.n - 1)])])
     return "\n".join(tables.as_text(rows, left=(0, 1)))

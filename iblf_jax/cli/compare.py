@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     add_scenario_arguments(parser, default="zhang_yan_2024")
     add_run_arguments(parser)
-    parser.add_argument("--laws", nargs="+", metavar="LAW", help="the laws, the first of which sets the effort (default: all)")
+    parser.add_argument("--laws", nargs="+", metavar="LAW", help="the laws, the first of which sets the effort (default: the paper's)")
     parser.add_argument("--gains-only", action="store_true", help="do not look for equal effort")
     parser.add_argument("--out", metavar="DIR", help="write comparison.txt, comparison.csv, comparison.json, figures and rollouts.nc here")
     parser.set_defaults(run=run)

@@ -13,6 +13,7 @@ from iblf_jax.controllers.reference_governor import ReferenceGovernor as Referen
 from iblf_jax.controllers.safety_filter import SafetyFilter as SafetyFilter
 from iblf_jax.controllers.saturated import Saturated as Saturated
 from iblf_jax.controllers.saturated import within_effort as within_effort
+from iblf_jax.controllers.systems import KEEPERS as KEEPERS
 from iblf_jax.controllers.systems import LAWS as LAWS
 from iblf_jax.controllers.systems import law_by_name as law_by_name
 
@@ -30,6 +31,7 @@ MEMBERS = {
 """Every law by the name that a scenario file gives it."""
 
 __all__ = [
+    "KEEPERS",
     "LAWS",
     "MEMBERS",
     "AdaptiveRBF",

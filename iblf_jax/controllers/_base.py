@@ -14,6 +14,7 @@ import jax
 
 from iblf_jax.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.references import Reference
+from iblf_jax.regions import Along, Region, along
 from iblf_jax.robots import Robot
 
 State = Any
@@ -21,12 +22,13 @@ State = Any
 
 
 class Setting(NamedTuple):
-    """What a law knows of the world; of bounds on the velocities if there are any."""
+    """What a law knows of the world; of bounds on the velocities, and of regions, if there are any."""
 
     model: Robot
     reference: Reference
     bounds: Bounds
     velocity_bounds: Bounds | None = None
+    regions: tuple[Region, ...] = ()
 
     def tube(self, t: jax.Array, *, acceleration: bool = True) -> Tube:
         """Reference, bounds and their rates at time t [s]; arguments as `bounds.tube_at`."""
@@ -35,6 +37,10 @@ class Setting(NamedTuple):
     def speed_limits(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The bounds on the velocities at time t [s], (n,) each [rad/s]; only where there are any."""
         return speed_limits_at(self.reference, self.velocity_bounds, t)  # type: ignore[arg-type]
+
+    def regions_along(self, q: jax.Array, dq: jax.Array) -> Along:
+        """How the model's points move through the regions at q [rad] and dq [rad/s]; only where there are any."""
+        return along(self.regions, self.model, q, dq)
 
 
 @partial(jax.jit, static_argnums=3, inline=True)  # so that it is traced once for all that ask at a time
@@ -57,6 +63,8 @@ class Command(NamedTuple):
     """bool: the torque was cut to a limit."""
     slack: Any = ()
     """By how much a filter had to break its own conditions, (n,) [rad/s^2]; `()` for laws that have none."""
+    region_slack: Any = ()
+    """The same of its conditions on m regions, (m,) [m/s^2]; `()` where there are none."""
 
 
 class Controller(Protocol):
@@ -65,8 +73,8 @@ class Controller(Protocol):
     A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it works ("k1", "K2" if it says nothing),
     which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `needs_velocity_bounds = True` if it cannot do
     without `Setting.velocity_bounds`; `includes_e2 = True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2;
-    `wraps`, the name of the field that holds another law whose paths are then its own ("controller.K2" reaches through).  And a method
-    `advice()`, a list of warnings.
+    `filters = True` if its commands have a `slack`; `wraps`, the name of the field that holds another law whose paths are then its own
+    ("controller.K2" reaches through).  And a method `advice()`, a list of warnings.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:

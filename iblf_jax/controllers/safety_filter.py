@@ -6,12 +6,17 @@ The bounds are h_u = k_uc - q >= 0 and h_l = q - k_lc >= 0, of relative degree 2
     q" <= k_uc" + (a1 + a2)(k_uc' - q') + a1 a2 (k_uc - q),
     q" >= k_lc" + (a1 + a2)(k_lc' - q') + a1 a2 (k_lc - q),
 
-and bounds on the velocities, of relative degree 1, are one more: v_l' + a3 (v_l - q') <= q" <= v_u' + a3 (v_u - q').  The model and the
-observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 - f_hat.  Inside what the conditions keep
+and bounds on the velocities, of relative degree 1, are one more: v_l' + a3 (v_l - q') <= q" <= v_u' + a3 (v_u - q').  Regions for the tip
+or a joint's origin (`Scenario.regions`) are of relative degree 2 in their level h(q), with b1, b2 > 0 (`regions.along` has dh/dq and c):
+
+    h" + (b1 + b2) h' + b1 b2 h >= 0,    h' = dh/dq q',    h" = dh/dq q" + c.
+
+The model and the observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 - f_hat.  Inside what the conditions keep
 (h >= 0 and h' + a2 h >= 0 at the start) they keep it for as long as they have a common torque, and f_hat is f.
 
-Where they have none (within the torque limits, or as a bound runs into another), the torque breaks them by the least slack: it is in the
-command, is recorded, and raises `Status.FILTER_INFEASIBLE`.
+Where they have none (within the torque limits, or as a bound runs into another), the torque breaks them by the least slack, the sum of
+squares of the distances to what they allow, in torque or in acceleration as `nearest` says: it is in the command, is recorded, and raises
+`Status.FILTER_INFEASIBLE`.
 """
 
 from __future__ import annotations
@@ -25,17 +30,17 @@ from iblf_jax.controllers._base import Command, Controller, Setting, State
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.core.qp import quadratic_program
+from iblf_jax.core.qp import Solution, quadratic_program
 
 NEAREST = ("torque", "acceleration")
 
 
 @component
 class SafetyFilter:
-    """The torque nearest to the law's with  q" in the box of the conditions (head of this module)  and  |tau| <= limit.
+    """The torque nearest to the law's with  q" as the conditions allow (head of this module)  and  |tau| <= limit.
 
-    Nearest in torque, |tau - tau_law|, or in acceleration, |M0^-1 (tau - tau_law)|; the latter without a limit is a clip, else it is a
-    quadratic programme (`core.qp`).  Where the law's own torque meets all conditions it is passed on as it is.  Paths reach through:
+    Nearest in torque, |tau - tau_law|, or in acceleration, |M0^-1 (tau - tau_law)|; the latter without limit and regions is a clip, else it
+    is a quadratic programme (`core.qp`).  Where the law's own torque meets all conditions it is passed on as it is.  Paths reach through:
     "controller.K2" is the wrapped law's K2.
 
     Args:
@@ -43,6 +48,8 @@ class SafetyFilter:
       a1: first rate of the position's conditions, () or (n,) [1/s], > 0; 10 if not given.
       a2: second rate of these, () or (n,) [1/s], > 0; 10 if not given.
       a3: rate of the velocity's conditions, where the scenario has `velocity_bounds`, () or (n,) [1/s], > 0; 20 if not given.
+      b1: first rate of the regions' conditions, where the scenario has `regions`, () [1/s], > 0; 10 if not given.
+      b2: second rate of these, () [1/s], > 0; 10 if not given.
       limit: largest torque of each joint, () or (n,) [N m], > 0; none if not given.
       nearest: "torque" or "acceleration"; "torque" if not given.
 
@@ -54,9 +61,12 @@ class SafetyFilter:
     a1: Leaf = leaf("1/s", sign="positive", default=10.0)
     a2: Leaf = leaf("1/s", sign="positive", default=10.0)
     a3: Leaf = leaf("1/s", sign="positive", default=20.0)
+    b1: Leaf = leaf("1/s", sign="positive", shape="scalar", default=10.0)
+    b2: Leaf = leaf("1/s", sign="positive", shape="scalar", default=10.0)
     limit: Leaf = leaf("N m", sign="positive", default=None)
     nearest: str = static(default="torque")
     wraps: ClassVar[str] = "law"
+    filters: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown measure."""
@@ -90,29 +100,38 @@ class SafetyFilter:
         M = model.mass_matrix(q)
         planned = solve_spd(M, asked + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
         lowest, highest = self.box(t, q, dq, setting)
-        if self.nearest == "acceleration" and self.limit is None:
+        if self.nearest == "acceleration" and self.limit is None and not setting.regions:
             # An empty box is broken on both sides alike.
             slack = jnp.maximum(0.5 * (lowest - highest), 0.0)
             wanted = jnp.clip(planned, lowest - slack, highest + slack)
             return command._replace(tau=asked + matvec(M, wanted - planned), slack=slack), rate
-        change, slack = self._change(M, asked, lowest - planned, highest - planned)
-        saturated = command.saturated if self.limit is None else command.saturated | (jnp.abs(asked) > self.limit)
-        return command._replace(tau=asked + change, slack=slack, saturated=saturated), rate
-
-    def _change(self, M: jax.Array, asked: jax.Array, least: jax.Array, most: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """What is added to the torque, and the slack of each joint, if the acceleration may change by `least` to `most`."""
-        n = len(asked)
-        unit = jnp.eye(n, dtype=asked.dtype)
-        inverse = jnp.stack([solve_spd(M, row) for row in unit])
-        H = unit if self.nearest == "torque" else matmul(inverse, inverse)
-        G, h, soft = [inverse, -inverse], [most, -least], [jnp.ones(2 * n, asked.dtype)]
+        unit = jnp.eye(setting.model.n, dtype=asked.dtype)
+        # What is looked for is the change of the torque or of the acceleration; the columns say what it does to both.
+        torque, acceleration = (unit, jnp.stack([solve_spd(M, row) for row in unit])) if self.nearest == "torque" else (M, unit)
+        rows = [(acceleration, highest - planned, 1.0), (-acceleration, planned - lowest, 1.0)]
+        if setting.regions:
+            at = setting.regions_along(q, dq)
+            room = matvec(at.slope, planned) + at.bend + (self.b1 + self.b2) * at.rate + self.b1 * self.b2 * at.level
+            rows.append((-matmul(at.slope, acceleration), room, 1.0))
+        saturated = command.saturated
         if self.limit is not None:
-            G, h, soft = [*G, unit, -unit], [*h, self.limit - asked, self.limit + asked], [*soft, jnp.zeros(2 * n, asked.dtype)]
-        rows, room = jnp.concatenate(G), jnp.concatenate(h)
-        found = quadratic_program(H, rows, room, jnp.concatenate(soft))
-        free = jnp.all(room >= 0)
-        slack = jnp.maximum(found.slack[:n], found.slack[n : 2 * n])
-        return jnp.where(free, 0.0, found.x), jnp.where(free, 0.0, slack)
+            rows += [(torque, self.limit - asked, 0.0), (-torque, self.limit + asked, 0.0)]
+            saturated = saturated | (jnp.abs(asked) > self.limit)
+        found = _nearest(rows)
+        region_slack = found.slack[2 * len(q) : 2 * len(q) + len(setting.regions)] if setting.regions else ()
+        slack = jnp.maximum(found.slack[: len(q)], found.slack[len(q) : 2 * len(q)])
+        tau = asked + matvec(torque, found.x)
+        return command._replace(tau=tau, slack=slack, region_slack=region_slack, saturated=saturated), rate
+
+
+def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:
+    """The least change x with  row x <= room  for all rows, each with its room and whether it may be broken; none where all have room."""
+    room = jnp.concatenate([room for _, room, _ in rows])
+    soft = jnp.concatenate([jnp.full_like(room, may_break) for _, room, may_break in rows])
+    G = jnp.concatenate([row for row, _, _ in rows])
+    found = quadratic_program(jnp.eye(G.shape[1], dtype=G.dtype), G, room, soft)
+    free = jnp.all(room >= 0)
+    return Solution(*(jnp.where(free, 0.0, x) for x in found))
 
 
 def _moving_bounds(t: jax.Array, setting: Setting) -> list[tuple[jax.Array, jax.Array, jax.Array]]:

@@ -1,6 +1,7 @@
 """The systems that the paper names, each by its name: which law with which barrier, and the gains of the yardsticks.
 
-All barrier laws take the same k1, K2 and o, so that they are compared at equal gains; computed torque and PD have their own.
+All barrier laws take the same k1, K2 and o, so that they are compared at equal gains; computed torque and PD have their own.  So have the
+laws that keep other constraints, or keep them otherwise: full state, a governor, a filter.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque
 from iblf_jax.controllers.dynamic_surface import DynamicSurface
+from iblf_jax.controllers.full_state import FullState
 from iblf_jax.controllers.pd_gravity import PDGravity
+from iblf_jax.controllers.reference_governor import ReferenceGovernor
+from iblf_jax.controllers.safety_filter import SafetyFilter
 from iblf_jax.core import checks
 from iblf_jax.observers import NoObserver, Observer
 
@@ -38,17 +42,26 @@ YARDSTICKS: dict[str, Callable[[], Controller]] = {
 FILTER = 0.01
 """s.  ASSUMPTION: time constant of the dynamic surface by name; small beside 1/k1, and no stiffer than K2 makes the loop."""
 
-LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *YARDSTICKS)
-"""Every system by the name that `law_by_name`, the presets and `compare` take."""
+DAMPING = 8.0
+"""rad^2/s^3.  ASSUMPTION: c of the full-state law by name, as in `presets.zhang_yan_2024_full_state`."""
 
-_WITHOUT_OBSERVER = ("adaptive_rbf", "pd")
+SPEED = 10.0
+"""rad/(N m s).  ASSUMPTION: eta of the governor by name, slow enough for steps of 1 ms beside the paper's bounds."""
+
+LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *YARDSTICKS)
+"""Every system of the paper by the name that `law_by_name`, the presets and `compare` take."""
+KEEPERS = ("full_state", "reference_governor", "safety_filter")
+"""Laws for other constraints by the names that these take too: full state (for scenarios with `velocity_bounds`; K2 in 1/s), a reference
+governor around the yardstick "pd", a safety filter around the unconstrained "backstepping"."""
+
+_WITHOUT_OBSERVER = ("adaptive_rbf", "pd", "reference_governor")
 
 
 def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, reading: str = "printed", p: int = 1) -> Controller:
     """The law of a system.
 
     Args:
-      name: one of `LAWS`; "backstepping" is the unconstrained one.
+      name: one of `LAWS` or `KEEPERS`; "backstepping" is the unconstrained one.
       k1: gain of the virtual velocity, () or (n,) [1/s].
       K2: gain of the velocity error, () or (n,) [N m s/rad].
       o: margin under the root of kappa (3.7), () or (n,) [1/s^2], for the barriers that use it.
@@ -58,13 +71,19 @@ def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, readi
     Raises:
       ValueError: an unknown name or reading.
     """
-    checks.one_of("law", name, LAWS)
+    checks.one_of("law", name, (*LAWS, *KEEPERS))
     if name in YARDSTICKS:
         return YARDSTICKS[name]()
     if name == "adaptive_rbf":
         return AdaptiveRBF(k1=k1, K2=K2, o=o, barrier=barriers.Log(p=p))
     if name == "dynamic_surface":
         return DynamicSurface(k1=k1, K2=K2, o=o, filter=FILTER)
+    if name == "full_state":
+        return FullState(k1=k1, K2=K2, c=DAMPING, o=o)
+    if name == "reference_governor":
+        return ReferenceGovernor(law=YARDSTICKS["pd"](), eta=SPEED)
+    if name == "safety_filter":
+        return SafetyFilter(law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading), nearest="acceleration")
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
     return Backstepping(k1=k1, K2=K2, o=o if getattr(barrier, "uses_o", True) else None, barrier=barrier, reading=reading)
 

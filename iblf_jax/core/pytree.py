@@ -97,11 +97,17 @@ def component(cls: type[T]) -> type[T]:
     return cls
 
 
+def layers(part: Any) -> list[Any]:
+    """A component, and what it wraps, outermost first (class attribute `wraps`: the name of the field that holds it)."""
+    found = [part]
+    while getattr(type(found[-1]), "wraps", None):
+        found.append(getattr(found[-1], type(found[-1]).wraps))
+    return found
+
+
 def unwrapped(part: Any) -> Any:
-    """The innermost component of one that wraps another (class attribute `wraps`: the name of the field that holds it)."""
-    while getattr(type(part), "wraps", None):
-        part = getattr(part, type(part).wraps)
-    return part
+    """The innermost component of one that wraps another."""
+    return layers(part)[-1]
 
 
 def rewrapped(part: Any, inner: Any) -> Any:

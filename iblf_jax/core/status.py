@@ -45,8 +45,11 @@ class Status(enum.IntFlag):
     FILTER_INFEASIBLE = 4096
     """A safety filter's conditions had no common torque at some time: the torque broke them by the least slack, which the run records."""
 
+    REGION_VIOLATED = 8192
+    """The tip, or the origin of a joint, touched or crossed the wall of a region that it must stay in."""
 
-VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED
+
+VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED
 """The flags of a constraint that was not kept."""
 
 FAILED = VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
@@ -71,6 +74,7 @@ WORDS = {
     Status.GUARD_STAYED: "the guard stayed active beyond the first instant",
     Status.SAMPLING_TOO_SLOW: "the law is sampled too slowly",
     Status.VELOCITY_VIOLATED: "a velocity bound was violated",
+    Status.REGION_VIOLATED: "a region was left",
     Status.FILTER_INFEASIBLE: "the safety filter's conditions could not all be met",
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }

@@ -99,7 +99,7 @@ def cosimulate(
     steps = checks.whole_steps(duration, dt, dt_is_free=False)
     record_every = checks.recorded_every(record_every, steps)
     write = None if film is None else _film_writer(film)
-    folds = as_folds(metrics, scenario.initial.q.dtype, scenario.n, velocity_bounds=scenario.velocity_bounds is not None)
+    folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     motion = _run(scenario, robot, dt, steps, seed)
     result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)

@@ -78,7 +78,7 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     """
     scenario = canonical(scenario)
     dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype, scenario.n, velocity_bounds=scenario.velocity_bounds is not None)
+    folds = as_folds(metrics, dtype, scenario)
     tableau(method)
     if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')

@@ -19,6 +19,7 @@ from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
 from iblf_jax.engine.transformable import run_now, run_transformable
+from iblf_jax.regions import in_words
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
@@ -26,6 +27,7 @@ from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.stability import RADIUS
 
 MOST_SAMPLES = 20_000_000
@@ -94,7 +96,7 @@ def simulate(
     scenario, seed = canonical(scenario), checks.seed(seed)
     check_step(scenario, dt)
     dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype, scenario.n, velocity_bounds=scenario.velocity_bounds is not None)
+    folds = as_folds(metrics, dtype, scenario)
     step_size, noise = jnp.asarray(dt, dtype), noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
     result = simulate_unchecked(scenario, folds, step_size, noise, steps=steps, method=method, record_every=record_every, backend=backend)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
@@ -161,6 +163,12 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             f"{_called(result, joint)} left its velocity bounds first, at t = {float(metrics['first_velocity_violation_time']):.4g} s; "
             f"its smallest margin is {float(metrics['velocity_margin'][joint]):.3g} rad/s."
         )
+    if status & Status.REGION_VIOLATED and "first_region_violation_time" in metrics:
+        i, plant = int(metrics["first_region_violation_region"]), result.scenario.plant
+        texts.append(
+            f"regions[{i}]: {in_words(result.scenario.regions[i], plant)} crossed its wall, at "
+            f"t = {float(metrics['first_region_violation_time']):.4g} s; its smallest margin is {float(metrics['region_margin'][i]):.3g} m."
+        )
     if status & Status.STEP_TOO_LARGE:
         mode = float(result.fastest_mode)
         limit = tableau(result.method).stability / mode
@@ -185,9 +193,12 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             "of the velocity's filter."
         )
     if status & Status.FILTER_INFEASIBLE:
+        worst = f"{float(np.max(result.slack)):.3g} rad/s^2 (run.slack)"
+        if has(result, "region_slack"):
+            worst += f" and {float(np.max(result.region_slack)):.3g} m/s^2 (run.region_slack)"
         texts.append(
-            f"At the recorded samples its accelerations were beyond what its conditions allow by up to {float(np.max(result.slack)):.3g} "
-            "rad/s^2 (run.slack). Raise controller.limit, or lower a1, a2 and a3, so that it brakes sooner."
+            f"At the recorded samples its accelerations were beyond what its conditions allow by up to {worst}. Raise controller.limit, or "
+            "lower a1, a2, a3, b1 and b2, so that it brakes sooner."
         )
     if status & Status.ALPHA_INFEASIBLE:
         worst = f"by up to {-float(np.min(metrics['alpha_margin'])):.3g} rad/s" if "alpha_margin" in metrics else "at some time"

@@ -28,7 +28,7 @@ from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.simulation import accuracy, integrators, sampling, stability
 from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS, Sample, has_speed_limits, speed_margin
+from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
 
 
 class Run(NamedTuple):
@@ -95,9 +95,12 @@ def sample_status(sample: Sample) -> jax.Array:
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
         | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
     )
-    if not isinstance(sample.slack, tuple):
-        found |= flag(jnp.any(sample.slack > 0), Status.FILTER_INFEASIBLE)
-    if not has_speed_limits(sample):
+    for slack in ("slack", "region_slack"):
+        if has(sample, slack):
+            found |= flag(jnp.any(getattr(sample, slack) > 0), Status.FILTER_INFEASIBLE)
+    if has(sample, "region_margin"):
+        found |= flag(jnp.any(~(sample.region_margin > 0)), Status.REGION_VIOLATED)
+    if not has(sample, "dq_lower"):
         return found
     found |= flag(jnp.any(~(speed_margin(sample, sample.dq) > 0)), Status.VELOCITY_VIOLATED)
     return found | flag(jnp.any(~(speed_margin(sample, sample.alpha) > NARROWEST)), Status.ALPHA_INFEASIBLE)

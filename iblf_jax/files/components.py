@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, robots, sensors
+from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.files.values import (
@@ -37,6 +37,7 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     robots.Robot: ("robots", robots.MEMBERS),
     references.Reference: ("references", references.MEMBERS),
     bounds.Side: ("bounds", bounds.MEMBERS),
+    regions.Region: ("regions", regions.MEMBERS),
     disturbances.Disturbance: ("disturbances", disturbances.MEMBERS),
     controllers.Controller: ("controllers", controllers.MEMBERS),
     barriers.Barrier: ("barriers", barriers.MEMBERS),
@@ -113,6 +114,8 @@ def encode_fields(part: Any, path: str) -> dict[str, Any]:
                 table[field.name] = NONE
         elif field.metadata.get("static"):
             table[field.name] = plain_static(value, name)
+        elif isinstance(value, tuple) and not value and field.default == ():
+            continue
         else:
             table[field.name] = encode(value, hints.get(field.name, Any), name)
     return table

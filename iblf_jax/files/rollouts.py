@@ -26,7 +26,7 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.files.values import Words
 from iblf_jax.simulation.paths import parameters
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.signals import SIGNALS
+from iblf_jax.simulation.signals import SIGNALS, own_dims
 
 if TYPE_CHECKING:
     import xarray
@@ -50,8 +50,8 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
       run: one run, arrays (T, ...), or a batch, (B, T, ...).
 
     Returns:
-      Dimensions time (T), joint (n), and run (B) first for a batch; variables as the Rollout's fields and metrics, each with
-      `units` and `description`.  A metric whose name is taken is called `metric_<name>`.
+      Dimensions time (T), joint (n), region where there are some, and run (B) first for a batch; variables as the Rollout's fields and
+      metrics, each with `units` and `description`.  A metric whose name is taken is called `metric_<name>`.
 
     Raises:
       ValueError: not a Rollout, or one that is being traced.
@@ -66,7 +66,7 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
     variables = _trajectories(run, batch)
     variables |= _states(run, batch)
     for name, value in run.metrics.items():
-        dims = (*batch, *_own_dims(name, np.shape(value)[len(batch) :], run.n))
+        dims = (*batch, *own_dims(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
         variables[label] = (dims, np.asarray(value), _attrs(run.metrics.units.get(name, "1"), f"metric {name.replace('_', ' ')}"))
     variables |= _verdict(run, batch)
@@ -134,13 +134,6 @@ def _batch_dims(run: Rollout) -> tuple[str, ...]:
     return ("run",) if depth == 1 else tuple(f"run_{i}" for i in range(depth))
 
 
-def _own_dims(name: str, shape: tuple[int, ...], n: int) -> tuple[str, ...]:
-    """Dimension names of one sample of a variable: joint for (n,), else its own."""
-    if shape == (n,):
-        return ("joint",)
-    return tuple(f"{name}_axis_{i}" for i in range(len(shape)))
-
-
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
     for name, signal in SIGNALS.items():
@@ -149,7 +142,7 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
         if isinstance(getattr(run, name), tuple):
             continue  # this scenario has no such signal
         value = np.asarray(getattr(run, name))
-        dims = (*batch, "time", *_own_dims(name, value.shape[len(batch) + 1 :], run.n))
+        dims = (*batch, "time", *own_dims(name, value.shape[len(batch) + 1 :], run.n))
         variables[name] = (dims, value, _attrs(signal.unit, signal.meaning))
     return variables
 
@@ -159,7 +152,7 @@ def _states(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     for whole, description in STATES.items():
         for keys, value in jax.tree_util.tree_leaves_with_path(getattr(run, whole)):
             name = re.sub(r"\W+", "_", whole + jax.tree_util.keystr(keys)).strip("_")
-            dims = (*batch, "time", *_own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
+            dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
             variables[name] = (dims, np.asarray(value), _attrs("1", description))
     return variables
 
@@ -200,7 +193,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         if batched:
             one = value[(0,) * len(batch)]
             if not np.all(value == one):
-                varying[p.path] = ((*batch, *_own_dims(p.path, one.shape, run.n)), value, _attrs(p.unit or "1", f"parameter {p.path}"))
+                varying[p.path] = ((*batch, *own_dims(p.path, one.shape, run.n)), value, _attrs(p.unit or "1", f"parameter {p.path}"))
                 continue
             value = one
         fixed[p.path] = value.tolist()

@@ -61,8 +61,15 @@ components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.ME
 components.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
 components.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
 
-OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin", "velocity_margin", "metric")
-REQUIREMENTS = ("error_below", "peak_torque_below", "margin_above", "velocity_margin_above", "violation_probability_below")
+OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin", "velocity_margin", "region_margin", "metric")
+REQUIREMENTS = (
+    "error_below",
+    "peak_torque_below",
+    "margin_above",
+    "velocity_margin_above",
+    "region_margin_above",
+    "violation_probability_below",
+)
 TABLES = ("tune", "objective", "requirement", "perturbations")
 HISTORY = dict.fromkeys(("loss", "objective", "terms", "excess", "margin", "gradient_norm", "z", "x"), "f") | {
     "valid": "b",

@@ -14,6 +14,7 @@ from iblf_jax.plotting._figures import joint as joint
 from iblf_jax.plotting._figures import paper_figures as paper_figures
 from iblf_jax.plotting._figures import phase_portrait as phase_portrait
 from iblf_jax.plotting._figures import positions as positions
+from iblf_jax.plotting._figures import region_margins as region_margins
 from iblf_jax.plotting._figures import save as save
 from iblf_jax.plotting._figures import torques as torques
 from iblf_jax.plotting._figures import tube as tube
@@ -31,5 +32,6 @@ from iblf_jax.plotting._sweeps import parallel as parallel
 from iblf_jax.plotting._tuning import pareto as pareto
 from iblf_jax.plotting._tuning import paths as paths
 from iblf_jax.plotting._tuning import tuning as tuning
+from iblf_jax.plotting._workspace import workspace as workspace
 from iblf_jax.plotting.animation import animate as animate
 from iblf_jax.plotting.comparison import comparison as comparison

@@ -19,6 +19,7 @@ from matplotlib.artist import Artist
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, called
+from iblf_jax.plotting._workspace import draw_walls, frame, skeletons
 
 FAN_POINTS = 13
 FAN_RADIUS = 0.42
@@ -71,13 +72,13 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[World, list[Moti
     first, motions = curves[0], []
     for curve in curves:
         q = curve.at("q", t)
-        motions.append(Motion(q, np.asarray(jax.jit(jax.vmap(curve.run.scenario.plant.skeleton))(q))))
+        motions.append(Motion(q, skeletons(curve.run.scenario.plant, q)))
         shape = motions[-1].skeleton.shape[1:]
-        if shape not in ((curve.run.n + 1, 2), (curve.run.n + 1, 3)) or shape != motions[0].skeleton.shape[1:]:
-            raise checks.fail("plant.skeleton(q)", shape, "n + 1 points in the plane or in space, alike for all runs")
+        if shape != motions[0].skeleton.shape[1:]:
+            raise checks.fail("plant.skeleton(q)", shape, "points in the plane or in space, alike for all runs")
     robot = first.run.scenario.plant
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
-    ghost = np.asarray(jax.jit(jax.vmap(robot.skeleton))(q_d))
+    ghost = skeletons(robot, q_d)
     fans = jax.jit(jax.vmap(lambda *args: _fans(robot, *args)))(motions[0].q, lower, upper)
     return World(t, q_d, lower, upper, ghost, np.asarray(fans)), motions
 
@@ -103,7 +104,10 @@ class Scene:
         self.parts: list[tuple[Any, Artist]] = []
         self.fans: list[Any] = []
         self.dots: list[Any] = []
-        self._limit_arm()
+        points = [self.world.ghost, *(motion.skeleton for motion in self.motions)]
+        robot, regions = curves[0].run.scenario.plant, curves[0].run.scenario.regions
+        limits = frame(self.arm, np.concatenate([x.reshape(-1, x.shape[-1]) for x in points]), regions)
+        draw_walls(self.arm, robot, regions, limits)
         self._add_fans()
         self._add_arms(curves)
         self._add_bars(curves)
@@ -115,18 +119,6 @@ class Scene:
         artist.set_animated(True)
         self.parts.append((artist.axes, artist))
         return artist
-
-    def _limit_arm(self) -> None:
-        skeletons = [self.world.ghost, *(motion.skeleton for motion in self.motions)]
-        points = np.concatenate([skeleton.reshape(-1, skeleton.shape[-1]) for skeleton in skeletons])
-        points = points[np.isfinite(points).all(axis=1)]
-        low, high = points.min(axis=0), points.max(axis=0)
-        size = max(float(np.max(high - low)), 1e-3)
-        room = np.full_like(low, 0.08 * size) if len(low) == 2 else 0.55 * size - 0.5 * (high - low)  # a cube, in space
-        for name, bottom, top in zip("xyz", low - room, high + room, strict=False):
-            self.arm.set(**{f"{name}lim": (bottom, top), f"{name}label": _style.label(f"${name}$", "m")})
-        self.arm.set_aspect("equal")
-        self.arm.locator_params(nbins=6 if len(low) == 2 else 4)
 
     def _line(self, axes: Any, **options: Any) -> Any:
         dimensions = self.world.ghost.shape[-1] if axes is self.arm else 2

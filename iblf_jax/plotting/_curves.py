@@ -30,13 +30,27 @@ DERIVED = {
     "estimate_error": lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate),
     "measured_q": lambda run: run.measured.q,
     "measured_dq": lambda run: run.measured.dq,
+    "region_wall": lambda run: np.zeros(np.shape(run.region_margin)),
 }
-"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f - f_hat, and what a sensor told."""
+"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f - f_hat, what was measured, walls."""
 
 HELD = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
 """Signals of a sampled law that stay as they are from sample to sample."""
 
-GIVEN = {"t", "q_d", "dq_d", "lower", "upper", "error_lower", "error_upper", "wall_lower", "wall_upper", "dq_lower", "dq_upper"}
+GIVEN = {
+    "t",
+    "q_d",
+    "dq_d",
+    "lower",
+    "upper",
+    "error_lower",
+    "error_upper",
+    "wall_lower",
+    "wall_upper",
+    "dq_lower",
+    "dq_upper",
+    "region_wall",
+}
 """Signals that do not depend on the state, and are drawn to the end whatever became of it."""
 
 SAME = 0.03
@@ -87,6 +101,11 @@ class Curve:
         return not isinstance(self.run.dq_lower, tuple)
 
     @property
+    def has_regions(self) -> bool:
+        """Whether points of its robot must stay in regions."""
+        return not isinstance(self.run.region_margin, tuple)
+
+    @property
     def ok(self) -> bool:
         """Whether the run has no flag."""
         return self.run.ok
@@ -106,10 +125,12 @@ class Curve:
         return called(getattr(self.run.scenario, "plant", None), self.run.n)[joint]
 
     def break_index(self) -> int | None:
-        """The first sample at which the run was outside its bounds, or its last one if it ran away; None if neither."""
+        """The first sample at which the run was outside its bounds or regions, or its last one if it ran away; None if neither."""
         lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
-        inside = (lower < self["q"]) & (self["q"] < upper)
-        outside = np.flatnonzero(~inside.all(axis=1))
+        inside = ((lower < self["q"]) & (self["q"] < upper)).all(axis=1)
+        if self.has_regions:
+            inside &= (self["region_margin"] > 0).all(axis=1)
+        outside = np.flatnonzero(~inside)
         if outside.size:
             return int(outside[0])
         return self.samples - 1 if int(self.run.status) & Status.NOT_FINITE else None

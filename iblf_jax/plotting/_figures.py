@@ -18,8 +18,9 @@ from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct
+from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct, plain
 from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, show, transient_end
+from iblf_jax.regions import in_words
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
@@ -203,6 +204,29 @@ def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
       ValueError: no run, a batch, or a zoom that is no time.
     """
     return _every_joint("Velocity", runs, "dq", zoom)
+
+
+def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Distance [m] of every region's point to its wall, at 0, for runs of scenarios with `regions`.
+
+    Args:
+      runs: one run, or a dict of runs by name, with as many regions each.
+      zoom: how much of the start is magnified [s]; the transient if not given.
+
+    Returns:
+      The figure, one row a region.
+
+    Raises:
+      ValueError: no run, a batch, runs that differ in the number of regions or have none, or a zoom that is no time.
+    """
+    curves = curves_of(runs)
+    counts = [len(curve.run.scenario.regions) for curve in curves]
+    if len(set(counts)) > 1 or not counts[0]:
+        raise checks.fail("runs", f"runs with {', '.join(map(str, counts))} regions", "runs with as many regions each, at least one")
+    plant, quantity = curves[0].run.scenario.plant, QUANTITIES["region_margin"]
+    names = [plain(in_words(region, plant)) for region in curves[0].run.scenario.regions]
+    rows = [PanelRow(quantity, i, f"{name}\n{_style.label(quantity.symbol, quantity.unit)}") for i, name in enumerate(names)]
+    return _rows_with_zoom("Distance to the walls", curves, rows, zoom, 1.75 if len(rows) <= 3 else 1.25)
 
 
 def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:

@@ -11,9 +11,11 @@ from matplotlib.gridspec import SubplotSpec
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, curves_of, thinned
+from iblf_jax.plotting._curves import Curve, curves_of, plain, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
 from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, draw, draw_frame, say_what_is_cut, set_limits, show
+from iblf_jax.plotting._workspace import draw_paths
+from iblf_jax.regions import in_words
 from iblf_jax.simulation.results import Rollout
 
 WIDTH = 10.0
@@ -26,7 +28,8 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     """One run at a glance, its status in the title: what `run.plot()` shows.
 
     Position of every joint in its tube, and velocity where it has bounds or is measured; then, with the joints together, e1, xi and the
-    phase portrait of the first two joints; torque, uncertain term with estimate, and Lyapunov function.
+    phase portrait of the first two joints; torque, uncertain term with estimate, and Lyapunov function; where there are regions, the
+    distances to their walls and the path of the tip.
 
     Args:
       run: one run of n joints.
@@ -44,12 +47,15 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
     tubes = ("q", "dq") if curve.has_speed_limits or curve.is_measured else ("q",)
-    figure = _style.new_figure(WIDTH, 1.3 + 2.0 * rows * len(tubes) + 4.4)
-    parts = figure.add_gridspec(1 + len(tubes), 1, height_ratios=(*(2.0 * rows for _ in tubes), 4.4))
+    heights = (*(2.0 * rows for _ in tubes), 4.4, *([3.2] if curve.has_regions else []))
+    figure = _style.new_figure(WIDTH, 1.3 + sum(heights))
+    parts = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     whole = (0.0, float(np.asarray(run.t)[-1]) or 1e-3)
     for i, field in enumerate(tubes):
         _tubes(figure, parts[i], curve, QUANTITIES[field], whole)
     _together(figure, parts[len(tubes)], curve, whole)
+    if curve.has_regions:
+        _regions(figure, parts[len(tubes) + 1], curve, whole)
     _style.entitle(figure, title, [curve], always=True)
     _style.legend_below(figure, 8)
     return figure
@@ -99,6 +105,22 @@ def _joints(axes: Axes, curve: Curve, quantity: Plotted, whole: Window) -> None:
     say_what_is_cut(axes, [curve] * len(drawn), drawn, quantity.unit)
     axes.set_ylabel(r"$f$ (broad), $\hat f$ [N m]" if quantity.truth else quantity.label)
     axes.set_xlabel(_style.label("time $t$", "s"))
+
+
+def _regions(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
+    """The distances to the walls of the regions, and the path of the tip between them."""
+    grid = where.subgridspec(1, 2, width_ratios=(1.5, 1))
+    axes, quantity, scenario = figure.add_subplot(grid[0]), QUANTITIES["region_margin"], curve.run.scenario
+    for i in range(len(scenario.regions)):
+        draw(axes, curve, quantity.field, i, whole, **(_style.series(i) | {"label": "_"}))
+    names = [plain(f"{i}: {in_words(region, scenario.plant)}") for i, region in enumerate(scenario.regions)]
+    axes.legend(axes.get_lines(), names, title="regions")
+    axes.axhline(0.0, color=_style.alarm(), linewidth=1.0)
+    axes.set_xlim(*whole)
+    axes.set_xlabel(_style.label("time $t$", "s"))
+    axes.set_ylabel(quantity.label)
+    for line in draw_paths(figure, grid[1], [curve]).get_lines():
+        line.set_label("_")
 
 
 def _lyapunov(axes: Axes, curve: Curve, whole: Window) -> None:

@@ -78,6 +78,7 @@ QUANTITIES = {
             r"reference $\dot q_d$",
             measured="measured_dq",
         ),
+        Plotted("region_margin", "distance", "$h$", "m", guide="region_wall", guide_words="wall"),
         Plotted("tau", "torque", r"$\tau$", "N m"),
         Plotted("disturbance_estimate", "uncertain term", "$f$", "N m", truth="disturbance", transient="estimate_error"),
     )

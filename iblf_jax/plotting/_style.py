@@ -242,8 +242,12 @@ def wrapped(words: str, room: int) -> str:
 
 
 def entitle(figure: Figure, words: str, curves: Sequence[Curve], *, always: bool = False) -> None:
-    """The title of a figure, with the status of every run that has a flag (of every run with `always`)."""
-    verdicts = [(f"{curve.name}: " if curve.name else "status: ") + curve.status for curve in curves if always or not curve.ok]
+    """The title of a figure, with the status of every run that has a flag (of every run with `always`), once for runs that share it."""
+    named: dict[str, list[str]] = {}
+    for curve in curves:
+        if always or not curve.ok:
+            named.setdefault(curve.status, []).append(curve.name or "status")
+    verdicts = [f"{', '.join(names)}: {status}" for status, names in named.items()]
     failed = any(curve.failed for curve in curves)
     head(figure, [words, *verdicts], color=alarm() if failed else ink())
 

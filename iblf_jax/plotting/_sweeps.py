@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
-from iblf_jax.core.status import FAILED, Status
+from iblf_jax.core.status import FAILED, VIOLATED
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import plain
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SHARES = {
     "failed": (int(FAILED), "share of failed runs [1]"),
-    "violated": (int(Status.BOUND_VIOLATED), "share of runs that left a bound [1]"),
+    "violated": (int(VIOLATED), "share of runs that left a bound [1]"),
 }
 """What may be drawn beside the metrics: the share of the runs that raised one of these flags."""
 COLOURS = "viridis"

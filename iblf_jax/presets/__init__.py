@@ -40,7 +40,7 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
     Args:
       law: "integral" (the paper's), "log" (its comparison), or any other of `LAWS`: the systems that the paper names, at the same gains
         k1, K2 and o, and the yardsticks "computed_torque" and "pd" at their own.  "backstepping" is the unconstrained one;
-        "adaptive_rbf" and "pd" run without an observer.
+        "adaptive_rbf" and "pd" run without an observer.  Of `controllers.KEEPERS` those that need no bounds on velocities.
       reading: "printed", or "corrected" (law with C0 alpha, observer in momentum form), for which Theorem 2 is exact.
       p: exponent of the logarithmic barrier.
 

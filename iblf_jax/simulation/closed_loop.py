@@ -25,6 +25,7 @@ from iblf_jax.actuators import Ideal
 from iblf_jax.controllers import Command
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
+from iblf_jax.regions import margins
 from iblf_jax.robots import at_time, friction_torque
 from iblf_jax.sensors import Measurement
 from iblf_jax.simulation.sampling import Instant, normals
@@ -41,11 +42,12 @@ class Said(NamedTuple):
     guard_active: jax.Array
     saturated: jax.Array
     slack: Any = ()
+    region_slack: Any = ()
 
 
 def said_by(command: Command, f_hat: jax.Array) -> Said:
     """What a command says besides its torque."""
-    return Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated, command.slack)
+    return Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated, command.slack, command.region_slack)
 
 
 class Held(NamedTuple):
@@ -84,10 +86,10 @@ def initial_state(scenario: Scenario) -> LoopState:
         return state
     zero, no = jnp.zeros_like(q), jnp.zeros((n,), bool)
     command = jax.eval_shape(scenario.controller.command, zero[0], q, dq, zero, scenario.setting, state.controller)[0]
-    slack = () if isinstance(command.slack, tuple) else zero
+    slack, region_slack = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (command.slack, command.region_slack))
     commands = jnp.repeat(still[None], scenario.sampling.queue + 1, axis=0)
     sensor = scenario.sensor.init(q, dq, scenario.sampling.period)
-    return state._replace(held=Held(commands, sensor, Measurement(q, dq), Said(zero, zero, zero, no, no, slack)))
+    return state._replace(held=Held(commands, sensor, Measurement(q, dq), Said(zero, zero, zero, no, no, slack, region_slack)))
 
 
 def moving(state: LoopState) -> LoopState:
@@ -293,6 +295,8 @@ def observed(
         guard_active=said.guard_active,
         saturated=said.saturated | limited,
         slack=said.slack,
+        region_slack=said.region_slack,
+        region_margin=margins(scenario.regions, scenario.plant, q) if scenario.regions else (),
         **dict(zip(("dq_lower", "dq_upper"), limits, strict=False)),
     )
 

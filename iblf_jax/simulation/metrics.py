@@ -16,16 +16,16 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.pytree import Leaf, component, layers, leaf
 from iblf_jax.simulation.accuracy import UNITS
-from iblf_jax.simulation.scenario import fit_joints
+from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample, speed_margin
 
 
 class Fold(Protocol):
     """What the package asks of a metric.
 
-    It may also have, as a class attribute, `needs_velocity_bounds = True` if it reads `sample.dq_lower` and `sample.dq_upper`.
+    It may also have, as a class attribute, `needs`: an optional signal that it reads, which not every scenario has (`OF_SCENARIO`).
     """
 
     units: ClassVar[dict[str, str]]
@@ -124,16 +124,16 @@ class Settling:
 
 
 def _first_outside(acc: Any, margin: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Time and joint of the first violation, after an instant with these margins."""
-    first = jnp.any(~(margin > 0)) & (acc.joint < 0)
-    return jnp.where(first, t, acc.time), jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.joint)
+    """Time and joint, or region, of the first violation, after an instant with these margins."""
+    first = jnp.any(~(margin > 0)) & (acc.first < 0)
+    return jnp.where(first, t, acc.time), jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.first)
 
 
 class _MarginState(NamedTuple):
     margin: jax.Array
     xi: jax.Array
     time: jax.Array
-    joint: jax.Array
+    first: jax.Array
 
 
 @component
@@ -171,7 +171,7 @@ class Margin:
             "margin": acc.margin,
             "xi_margin": acc.xi,
             "first_violation_time": acc.time,
-            "first_violation_joint": acc.joint,
+            "first_violation_joint": acc.first,
         }
 
 
@@ -179,7 +179,7 @@ class _SpeedState(NamedTuple):
     margin: jax.Array
     alpha: jax.Array
     time: jax.Array
-    joint: jax.Array
+    first: jax.Array
 
 
 @component
@@ -198,7 +198,7 @@ class VelocityMargin:
         "first_velocity_violation_time": "s",
         "first_velocity_violation_joint": "1",
     }
-    needs_velocity_bounds: ClassVar[bool] = True
+    needs: ClassVar[str] = "dq_lower"
 
     def init(self, sample: Sample) -> _SpeedState:
         """Infinitely far from the bounds."""
@@ -220,8 +220,91 @@ class VelocityMargin:
             "velocity_margin": acc.margin,
             "alpha_margin": acc.alpha,
             "first_velocity_violation_time": acc.time,
-            "first_velocity_violation_joint": acc.joint,
+            "first_velocity_violation_joint": acc.first,
         }
+
+
+class _RegionState(NamedTuple):
+    margin: jax.Array
+    time: jax.Array
+    first: jax.Array
+
+
+@component
+class RegionMargin:
+    """How near the points of the robot came to the walls of their regions, and the first violation.
+
+    region_margin = min over time of the distance to the wall, region by region, continuous through zero.  first_region_violation_time is
+    infinite and first_region_violation_region -1 on a run that stays in all of them.  For scenarios with `regions` alone, whose runs
+    carry it unless told otherwise.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "region_margin": "m",
+        "first_region_violation_time": "s",
+        "first_region_violation_region": "1",
+    }
+    needs: ClassVar[str] = "region_margin"
+
+    def init(self, sample: Sample) -> _RegionState:
+        """Infinitely far from the walls."""
+        return _RegionState(jnp.full_like(sample.region_margin, jnp.inf), jnp.full_like(sample.t, jnp.inf), jnp.int32(-1))
+
+    def update(self, acc: _RegionState, sample: Sample) -> _RegionState:
+        """Adds one sample."""
+        margin = sample.region_margin
+        return _RegionState(jnp.minimum(acc.margin, margin), *_first_outside(acc, margin, sample.t))
+
+    def finish(self, acc: _RegionState) -> dict[str, jax.Array]:
+        """region_margin, (m,) for m regions; first_region_violation_time and first_region_violation_region, ()."""
+        return {
+            "region_margin": acc.margin,
+            "first_region_violation_time": acc.time,
+            "first_region_violation_region": acc.first,
+        }
+
+
+@component
+class Slack:
+    """By how much a filter had to break its conditions on the joints at most: largest_slack.
+
+    For laws with a filter (`controllers.SafetyFilter`) alone, whose runs carry it unless told otherwise.
+    """
+
+    units: ClassVar[dict[str, str]] = {"largest_slack": "rad/s^2"}
+    needs: ClassVar[str] = "slack"
+
+    def init(self, sample: Sample) -> jax.Array:
+        """Zero."""
+        return jnp.zeros_like(sample.slack)
+
+    def update(self, acc: jax.Array, sample: Sample) -> jax.Array:
+        """Adds one sample."""
+        return jnp.maximum(acc, sample.slack)
+
+    def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
+        """largest_slack, (n,)."""
+        return {"largest_slack": acc}
+
+
+@component
+class RegionSlack:
+    """The same of its conditions on the regions, largest_region_slack; for laws with a filter in scenarios with regions."""
+
+    units: ClassVar[dict[str, str]] = {"largest_region_slack": "m/s^2"}
+    needs: ClassVar[str] = "region_slack"
+
+    def init(self, sample: Sample) -> jax.Array:
+        """Zero."""
+        return jnp.zeros_like(sample.region_slack)
+
+    def update(self, acc: jax.Array, sample: Sample) -> jax.Array:
+        """Adds one sample."""
+        return jnp.maximum(acc, sample.region_slack)
+
+    def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
+        """largest_region_slack, (m,) for m regions."""
+        return {"largest_region_slack": acc}
 
 
 class _TorqueSums(NamedTuple):
@@ -332,33 +415,56 @@ class Estimation:
         return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
 
 
-def as_folds(
-    metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, n: int | None = None, *, velocity_bounds: bool = False
-) -> tuple[Fold, ...]:
+OF_SCENARIO = {
+    "dq_lower": ("velocity_bounds", "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."),
+    "region_margin": ("regions", "Such as regions=(ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)."),
+    "slack": ("a law with a filter", "Such as ij.controllers.SafetyFilter(law)."),
+    "region_slack": ("regions and a law with a filter", "Such as ij.controllers.SafetyFilter(law), and regions=(...)."),
+}
+"""Optional signal -> what of a scenario gives it, and how."""
+
+
+def has_signal(scenario: Scenario, signal: str) -> bool:
+    """Whether runs of a scenario have an optional signal, one of `OF_SCENARIO`."""
+    if signal == "dq_lower":
+        return scenario.velocity_bounds is not None
+    filters = signal == "region_margin" or any(getattr(law, "filters", False) for law in layers(scenario.controller))
+    return filters and (signal == "slack" or len(scenario.regions) > 0)
+
+
+def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
+    """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of the scenario do not have."""
+    needs = getattr(fold, "needs", None)
+    if needs is None:
+        return
+    checks.one_of(f"{field}.needs", needs, OF_SCENARIO)
+    if not has_signal(scenario, needs):
+        words, remedy = OF_SCENARIO[needs]
+        raise checks.fail(field, f"a {type(fold).__name__} that reads {needs}", f"a scenario with {words}", remedy)
+
+
+def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenario: Scenario | None = None) -> tuple[Fold, ...]:
     """The folds that a user asked for (None: the standard ones), checked, their numbers in one floating-point type.
 
     Args:
       metrics: the folds, or None.
       dtype: of their numbers.
-      n: joints of the scenario that they are for, if it is known.
-      velocity_bounds: whether it has bounds on the velocities.
+      scenario: that they are for, if it is known.
 
     Raises:
-      ValueError: something that is not a fold, one that needs velocity bounds where there are none, units that are no words, fields that
-        are no numbers, or two folds that return the same name.
+      ValueError: something that is not a fold, one that needs what the scenario does not have (bounds on the velocities, regions), units
+        that are no words, fields that are no numbers, or two folds that return the same name.
     """
     if metrics is None:
-        metrics = (*standard(), VelocityMargin()) if velocity_bounds else standard()
+        metrics = standard() if scenario is None else (*standard(), *watched(scenario))
     if not isinstance(metrics, tuple | list):
         raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
     owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
     for i, fold in enumerate(metrics):
         checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
-        if n is not None:
-            fit_joints(fold, n, f"metrics[{i}]")
-        if getattr(fold, "needs_velocity_bounds", False) and not velocity_bounds:
-            remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
-            raise checks.fail(f"metrics[{i}]", type(fold).__name__, "a metric of a scenario without velocity bounds", remedy)
+        if scenario is not None:
+            fit_joints(fold, scenario.n, f"metrics[{i}]")
+            check_needs(f"metrics[{i}]", fold, scenario)
         for name, unit in checks.mapping(f"metrics[{i}].units", fold.units, '{"rmse": "rad"}').items():
             checks.word(f"metrics[{i}].units[{name!r}]", unit, "a unit in words")
             if name in owner:
@@ -381,11 +487,16 @@ def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
 
 
 def standard() -> tuple[Fold, ...]:
-    """The folds that every run carries unless told otherwise; one with bounds on the velocities a `VelocityMargin` too.
+    """The folds that every run carries unless told otherwise; some scenarios' carry more (`watched`).
 
     Made on the call: an array made at import would start JAX's backend and fix its precision before a user can choose.
     """
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
+
+
+def watched(scenario: Scenario) -> tuple[Fold, ...]:
+    """The folds that runs of a scenario carry besides the standard ones: of bounds on velocities, of regions, of a filter."""
+    return tuple(fold for fold in (VelocityMargin(), RegionMargin(), Slack(), RegionSlack()) if has_signal(scenario, fold.needs))
 
 
 MEMBERS = {
@@ -393,6 +504,9 @@ MEMBERS = {
     "settling": Settling,
     "margin": Margin,
     "velocity_margin": VelocityMargin,
+    "region_margin": RegionMargin,
+    "slack": Slack,
+    "region_slack": RegionSlack,
     "torque": Torque,
     "above_gravity": AboveGravity,
     "estimation": Estimation,

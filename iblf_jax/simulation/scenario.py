@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax import regions
 from iblf_jax.actuators import Actuator
 from iblf_jax.actuators import Ideal as IdealActuator
 from iblf_jax.bounds import Bounds, speed_limits_at, tube_at
@@ -83,6 +84,8 @@ class Scenario:
       actuator: what becomes of the torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
       velocity_bounds: what the joints' velocities must keep, a `bounds.Bounds` [rad/s] whose funnels follow q_d'; none if not given.
         They are watched whatever the law; `controllers.FullState` keeps them.
+      regions: where points of the robot must stay, a tuple of any of `iblf_jax.regions`; () if not given.  They are watched whatever the
+        law; `controllers.SafetyFilter` keeps them.
 
     Raises:
       ValueError: if a leaf has the wrong number of joints, model and plant differ in theirs, or a sensor comes without a sampling.
@@ -100,6 +103,7 @@ class Scenario:
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
     velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=OF_VELOCITY)
+    regions: tuple[regions.Region, ...] = ()
 
     def check(self) -> None:
         """Completes the model, checks what the parts are, and gives every joint-wise leaf its n entries."""
@@ -125,8 +129,25 @@ class Scenario:
             raise checks.fail("Scenario.sensor", type(self.sensor).__name__, "an Ideal sensor where no law is sampled", remedy)
         if self.model.n != self.plant.n:
             raise checks.fail("Scenario.model", f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has")
+        self._check_regions()
         for field in dataclasses.fields(self):
             object.__setattr__(self, field.name, fit_joints(getattr(self, field.name), self.plant.n, field.name))
+
+    def _check_regions(self) -> None:
+        """Makes a tuple of the regions; raises ValueError for what is none, or does not fit plant and model."""
+        if not isinstance(self.regions, tuple | list):
+            remedy = "Such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)."
+            raise checks.fail("Scenario.regions", self.regions, "a tuple of regions", remedy)
+        object.__setattr__(self, "regions", tuple(self.regions))
+        for i, region in enumerate(self.regions):
+            name = f"Scenario.regions[{i}]"
+            checks.conforms(name, region, regions.Region, "iblf_jax.regions has them.")
+            for robot in (self.plant, self.model):
+                try:
+                    jax.eval_shape(lambda r=robot, x=region: x.distance(regions.position_of(r, x.point, jnp.zeros(r.n))))
+                except Exception as error:
+                    what = f"a region for a point of a {type(robot).__name__} of {robot.n} joints"
+                    raise checks.fail(name, region, what, f"{type(error).__name__}: {checks.line(str(error))}") from error
 
     @property
     def n(self) -> int:
@@ -135,8 +156,8 @@ class Scenario:
 
     @property
     def setting(self) -> Setting:
-        """What the law knows: model, reference and bounds."""
-        return Setting(self.model, self.reference, self.bounds, self.velocity_bounds)
+        """What the law knows: model, reference, bounds and regions."""
+        return Setting(self.model, self.reference, self.bounds, self.velocity_bounds, self.regions)
 
     def _repr_html_(self) -> str:
         from iblf_jax import reports
@@ -154,8 +175,8 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     Args:
       scenario: what to change; it stays as it is.
       parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance, initial, sampling, sensor, actuator,
-        velocity_bounds; each as `Scenario` takes it, so that one number stands for one number a joint.  Numbers take the scenario's
-        floating-point type.
+        velocity_bounds, regions; each as `Scenario` takes it, so that one number stands for one number a joint.  Numbers take the
+        scenario's floating-point type.
 
     Returns:
       A new Scenario; it runs like any other, and compiles where the structure is new.
@@ -299,7 +320,8 @@ def _start(scenario: Scenario):
     _shaped(
         "disturbance.torque(t, q, dq, plant, model)", lambda: scenario.disturbance.torque(zero, q, dq, scenario.plant, scenario.model), n
     )
-    return tube.q_d, tube.lower, tube.upper, _speed_limits(scenario, zero)
+    limits = _speed_limits(scenario, zero)
+    return tube.q_d, tube.lower, tube.upper, limits, regions.margins(scenario.regions, scenario.plant, q) if scenario.regions else q[:0]
 
 
 def _speed_limits(scenario: Scenario, zero: jax.Array):
@@ -325,7 +347,7 @@ def _check_speeds(dq: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
 
 def _check_start(scenario: Scenario) -> None:
     q = np.asarray(scenario.initial.q)
-    q_d, lower, upper, speeds = jax.tree.map(np.asarray, _start(scenario))
+    q_d, lower, upper, speeds, rooms = jax.tree.map(np.asarray, _start(scenario))
     M = [np.asarray(mass_matrix_at(robot, scenario.initial.q)) for robot in (scenario.plant, scenario.model)]
     for name, values in (("reference", q_d), ("bounds.lower", lower), ("bounds.upper", upper)):
         if not np.all(np.isfinite(values)):
@@ -349,6 +371,10 @@ def _check_start(scenario: Scenario) -> None:
             )
     if speeds is not None:
         _check_speeds(np.asarray(scenario.initial.dq), *speeds)
+    for region, room in zip(scenario.regions, rooms, strict=True):
+        if not room > 0:
+            got = f"{regions.in_words(region, scenario.plant)} {-room:.4g} m beyond its wall"
+            raise checks.fail("initial.q", got, "a start inside all regions", "Move the start or the region.")
     if not np.all(np.abs(scenario.initial.dq) < VELOCITY_LIMIT):
         raise checks.fail(
             "initial.dq", scenario.initial.dq, f"speeds below {VELOCITY_LIMIT:g} rad/s", "A run that fast counts as diverged."

@@ -46,6 +46,14 @@ class Signals:
         default=(), kw_only=True
     )
     """`()` under laws without a filter."""
+    region_margin: Annotated[Any, Recorded("m", "distance of the regions' points to their walls")] = dataclasses.field(
+        default=(), kw_only=True
+    )
+    """One number a region; `()` where there are none."""
+    region_slack: Annotated[Any, Recorded("m/s^2", "how far the law's filter broke its own conditions on the regions")] = dataclasses.field(
+        default=(), kw_only=True
+    )
+    """`()` without regions or without a filter."""
 
 
 @jax.tree_util.register_dataclass
@@ -61,14 +69,25 @@ class Sample(Signals):
     saturated: Array
 
 
-def has_speed_limits(sample: Sample) -> bool:
-    """Whether velocities have bounds."""
-    return not isinstance(sample.dq_lower, tuple)
+def has(sample: Signals, signal: str) -> bool:
+    """Whether there is an optional signal: bounds of the velocities, a slack, margins of regions."""
+    return not isinstance(getattr(sample, signal), tuple)
 
 
 def speed_margin(sample: Sample, velocity: Array) -> Array:
     """Distance of a velocity to the nearer of its bounds, (n,) [rad/s]."""
     return jnp.minimum(velocity - sample.dq_lower, sample.dq_upper - velocity)
+
+
+OF_REGIONS = ("region_margin", "region_slack", "largest_region_slack")
+"""Signals and metrics with one number a region."""
+
+
+def own_dims(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
+    """Dimensions of a signal or metric at one instant or of one run: joint for (n,), region, else its own."""
+    if name in OF_REGIONS:
+        return ("region",)
+    return ("joint",) if shape == (joints,) else tuple(f"{name}_axis_{i}" for i in range(len(shape)))
 
 
 SIGNALS: dict[str, Recorded] = {name: hint.__metadata__[0] for name, hint in get_type_hints(Signals, include_extras=True).items()}

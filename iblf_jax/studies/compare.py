@@ -19,18 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.controllers import LAWS, Controller, law_by_name
+from iblf_jax.controllers import KEEPERS, LAWS, Controller, Saturated, law_by_name
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import rewrapped, unwrapped
-from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.status import Status, describe
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.observers import NoObserver
-from iblf_jax.simulation.metrics import AboveGravity, VelocityMargin, standard
+from iblf_jax.simulation.metrics import AboveGravity, standard, watched
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.comparison import Comparison
+from iblf_jax.studies.comparison import NO_EFFORT, Comparison
 
 RATIO = math.sqrt(2.0)
 """Grid of factors: powers of this."""
@@ -40,6 +40,7 @@ ROOT_TOLERANCE = 1e-7
 EDGE_BISECTIONS = 4
 """How closely the edge of the factors that work is approached."""
 
+NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
 
 
@@ -60,7 +61,8 @@ def compare(
     Args:
       scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; the k1, K2, o and reading of its own law
         are those of the laws that are given by name, and a torque limit around its law is put around them too.
-      laws: names (`iblf_jax.controllers.LAWS`) or laws, or a dict of either by the name to show.  The first one sets the effort.
+      laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the name to show.  The first one sets the
+        effort.
       duration, dt, method, record_every: as `simulate`.
       equal_effort: whether to look for the factors; about ten further runs a law.
 
@@ -93,7 +95,7 @@ def compare(
 def _named_laws(laws: Laws) -> dict[str, str | Controller]:
     """The laws by the name to show."""
     if isinstance(laws, str) or not isinstance(laws, Mapping | Sequence) or len(laws) == 0:
-        raise checks.fail("laws", laws, "a list of names and laws, or a dict of them", f"Names are {', '.join(LAWS)}.")
+        raise checks.fail("laws", laws, "a list of names and laws, or a dict of them", f"Names are {', '.join(NAMES)}.")
     if isinstance(laws, Mapping):
         pairs = [(str(name), law) for name, law in laws.items()]
     else:
@@ -101,9 +103,9 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
     named: dict[str, str | Controller] = {}
     for name, law in pairs:
         if isinstance(law, str):
-            checks.one_of("laws", law, LAWS)
+            checks.one_of("laws", law, NAMES)
         else:
-            checks.conforms(f"laws[{name!r}]", law, Controller, f"Or a name: {', '.join(LAWS)}.")
+            checks.conforms(f"laws[{name!r}]", law, Controller, f"Or a name: {', '.join(NAMES)}.")
         count = 2
         shown = name
         while shown in named:
@@ -125,7 +127,7 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
         own = unwrapped(scenario.controller)
         kept = {name: getattr(own, name) for name in ("k1", "K2", "o", "reading") if getattr(own, name, None) is not None}
         p = getattr(getattr(own, "barrier", None), "p", 1)
-        controller = rewrapped(scenario.controller, law_by_name(law, p=p, **kept))
+        controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
         observer = observer_of(law, scenario.observer)
     else:
         controller = law
@@ -133,12 +135,18 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
     return dataclasses.replace(scenario, controller=controller, observer=observer)
 
 
+def _limited_as(controller: Controller, law: Controller) -> Controller:
+    """A law within the torque limits of another one."""
+    if not isinstance(controller, Saturated):
+        return law
+    return dataclasses.replace(controller, law=_limited_as(controller.law, law))
+
+
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; a failure is named in the table, not warned of."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        watched = () if scenario.velocity_bounds is None else (VelocityMargin(),)
-        return simulate(scenario, metrics=(*standard(), *watched, AboveGravity()), **options)
+        return simulate(scenario, metrics=(*standard(), *watched(scenario), AboveGravity()), **options)
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
@@ -152,7 +160,7 @@ def _at_effort_of(
 ) -> tuple[float, str, Rollout | None]:
     """The factor at which a law has the first one's effort, or NaN and the reason; and the run there."""
     title, reference = first
-    if int(reference.status) & FAILED:
+    if int(reference.status) & NO_EFFORT:
         return math.nan, f"the first law, {title}, failed itself, so it sets no effort", None
     names = gain_names(scenario.controller)
     if not names:
@@ -164,7 +172,7 @@ def _at_effort_of(
         if factor not in runs:
             scaled = {f"controller.{name}": np.asarray(getattr(inner, name)) * factor for name in names}
             runs[factor] = _run(with_parameters(scenario, scaled), options)
-        return math.nan if int(runs[factor].status) & FAILED else float(runs[factor].metrics.effort_above_gravity)
+        return math.nan if int(runs[factor].status) & NO_EFFORT else float(runs[factor].metrics.effort_above_gravity)
 
     factor = factor_nearest_one(effort, float(reference.metrics.effort_above_gravity))
     return (factor, "", runs[factor]) if math.isfinite(factor) else (factor, _why_not(runs, reference), None)
@@ -235,16 +243,16 @@ def _root(excess: Callable[[float], float | None], a: float, b: float) -> list[f
 def _why_not(runs: Mapping[float, Rollout], reference: Rollout) -> str:
     """Why no factor was found, in words."""
     target = float(reference.metrics.effort_above_gravity)
-    sound = {factor: run for factor, run in runs.items() if not int(run.status) & FAILED}
+    sound = {factor: run for factor, run in runs.items() if not int(run.status) & NO_EFFORT}
     if not sound:
-        return "every run failed: " + describe(int(runs[1.0].status) & FAILED)
+        return "every run failed: " + describe(int(runs[1.0].status) & NO_EFFORT)
     efforts = [float(run.metrics.effort_above_gravity) for run in sound.values()]
     side = "stays below" if max(efforts) < target else "stays above" if min(efforts) > target else "misses"
     where = f"{side} {target:.4g} N m ({min(efforts):.4g} to {max(efforts):.4g})"
     text = f"its effort {where} for factors {min(sound):.3g} to {max(sound):.3g}"
     failed = sorted((factor for factor in runs if factor not in sound), key=lambda factor: abs(math.log(factor)))
     if failed:
-        status = Status(int(runs[failed[0]].status) & FAILED)
+        status = Status(int(runs[failed[0]].status) & NO_EFFORT)
         text += f"; at {failed[0]:.3g} the run fails: {describe(status)}"
         text += " (a smaller dt may reach further)" if status & Status.STEP_TOO_LARGE else ""
     return text

@@ -12,7 +12,7 @@ import numpy as np
 from iblf_jax.barriers import Integral
 from iblf_jax.core import tables
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.status import FAILED, describe
+from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.simulation.results import Rollout
 
 HELD = {"gains": "Gains as given", "effort": "Equal effort"}
@@ -40,6 +40,8 @@ class Row(NamedTuple):
     """1 - max |xi| [1]."""
     velocity_margin: float
     """Smallest distance of a velocity to its bound [rad/s]; NaN where velocities have none."""
+    region_margin: float
+    """Smallest distance of a point to the wall of its region [m]; NaN where there are none."""
     peak_torque: float
     """[N m]."""
     torque_rms: float
@@ -51,6 +53,12 @@ class Row(NamedTuple):
     status: str
 
 
+NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
+"""Flags of runs whose effort is not to be compared; constraints that a law does not know of are no obstacle."""
+
+OPTIONAL = ("velocity_margin", "region_margin")
+"""Of constraints that not every scenario has."""
+
 HEADINGS = (
     "law",
     "factor",
@@ -59,6 +67,7 @@ HEADINGS = (
     "margin [rad]",
     "1-max|xi|",
     "velocity margin [rad/s]",
+    "region margin [m]",
     "peak tau [N m]",
     "rms tau [N m]",
     "above gravity",
@@ -82,6 +91,7 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
         worst("margin", np.min),
         worst("xi_margin", np.min),
         worst("velocity_margin", np.min) if "velocity_margin" in m else math.nan,
+        worst("region_margin", np.min) if "region_margin" in m else math.nan,
         worst("peak_torque"),
         float(np.sqrt(np.sum(np.asarray(m["torque_rms"]) ** 2))),
         float(m["effort_above_gravity"]),
@@ -130,7 +140,7 @@ class Comparison:
         notes["gains"] += [FACTOR_TWO] if any(isinstance(barrier, Integral) for barrier in barriers) else []
         notes["gains"] += [f"{name} FAILED: {why}." for name, why in self.failed.items()]
         if self.factors:
-            if first in self.failed:
+            if int(self.rollouts[first].status) & NO_EFFORT:
                 held = "Nothing could be held equal."
             else:
                 effort = float(self.rollouts[first].metrics.effort_above_gravity)
@@ -167,7 +177,7 @@ class Comparison:
 
         lines = [{"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows]
         frame = pd.DataFrame(lines).set_index(["held", "law"])
-        return frame if frame.velocity_margin.notna().any() else frame.drop(columns="velocity_margin")
+        return frame.drop(columns=[name for name in OPTIONAL if frame[name].isna().all()])
 
     def plot(self, joint: int = 0, **options):
         """Overlaid figure of all laws, at their gains and at equal effort.  Options as `plotting.comparison`."""
@@ -177,12 +187,9 @@ class Comparison:
 
 
 def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
-    """Headings and lines, without the margin of velocities that have no bounds."""
-    lines = [HEADINGS, *map(_cells, rows)]
-    if any(math.isfinite(row.velocity_margin) for row in rows):
-        return lines
-    at = Row._fields.index("velocity_margin")
-    return [(*line[:at], *line[at + 1 :]) for line in lines]
+    """Headings and lines, without the margins of constraints that there are none of."""
+    shown = [i for i, name in enumerate(Row._fields) if name not in OPTIONAL or any(math.isfinite(getattr(row, name)) for row in rows)]
+    return [tuple(line[i] for i in shown) for line in [HEADINGS, *map(_cells, rows)]]
 
 
 def _cells(row: Row) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core.status import Status
+from iblf_jax.simulation.signals import own_dims
 
 if TYPE_CHECKING:
     import xarray
@@ -16,11 +17,12 @@ if TYPE_CHECKING:
 RUN = "run"
 DRAWN = "drawn_"
 """Begins the name of a drawn parameter in flat data."""
-
-
-def own_dims(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
-    """Dimensions of one case of a variable: joint for (n,), else its own."""
-    return ("joint",) if shape == (joints,) else tuple(f"{name}_axis_{i}" for i in range(len(shape)))
+FIRST_TIMES = {
+    "first_violation_time": Status.BOUND_VIOLATED,
+    "first_velocity_violation_time": Status.VELOCITY_VIOLATED,
+    "first_region_violation_time": Status.REGION_VIOLATED,
+}
+"""Metric that says when a constraint was violated first -> the flag that says that it was."""
 
 
 def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Mapping[str, str], done: np.ndarray) -> xarray.Dataset:
@@ -68,9 +70,12 @@ def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Ma
         },
     )
     if "first_violation_time" in flat:
-        violated = (flat["status"] >= 0) & (flat["status"] & int(Status.BOUND_VIOLATED) != 0)
-        outside = violated & (np.asarray(flat["first_violation_time"]) <= 0)
-        words = "whether the run violated a bound at t = 0 already: it was started there, and no law could keep it"
+        violated = {flag: (flat["status"] >= 0) & (flat["status"] & int(flag) != 0) for flag in FIRST_TIMES.values()}
+        at_start = [violated[flag] & (np.asarray(flat[name]) <= 0) for name, flag in FIRST_TIMES.items() if name in flat]
+        outside = np.any(at_start, axis=0)
+        words = (
+            "whether the run violated a bound, or was outside a region, at t = 0 already: it was started there, and no law could keep it"
+        )
         variables["started_outside"] = (dims, outside.reshape(status.shape), {"units": "1", "description": words})
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
 

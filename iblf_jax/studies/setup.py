@@ -86,7 +86,7 @@ def prepare(
     check_step(scenario, dt)
     targets, by_path = targets_of(scenario, perturbations)
     dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype, scenario.n, velocity_bounds=scenario.velocity_bounds is not None)
+    folds = as_folds(metrics, dtype, scenario)
     by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, dt))
     designed: dict[str, Any] = {}
     if sampler != "independent":

@@ -19,6 +19,7 @@ from iblf_jax.core import checks
 SMALLER_IS_WORSE = (
     *("margin", "xi_margin", "first_violation_time"),
     *("velocity_margin", "alpha_margin", "first_velocity_violation_time"),
+    *("region_margin", "first_region_violation_time"),
 )
 """Metrics of which the smallest value, over joints and over runs, is the worst."""
 

@@ -23,7 +23,9 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.status import VIOLATED as LEFT
 from iblf_jax.engine.simulate import SimulationWarning, simulate_unchecked
+from iblf_jax.regions import in_words
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
@@ -39,8 +41,8 @@ from iblf_jax.studies.statistics import Probability
 if TYPE_CHECKING:
     import xarray
 
-VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE
-"""What `violation_probability` counts: a run that left its bounds, or that ran away, after which it has no say."""
+VIOLATED = LEFT | Status.NOT_FINITE
+"""What `violation_probability` counts: a run that did not keep its bounds or regions, or that ran away, after which it has no say."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,8 +132,9 @@ class Study:
 
     @cached_property
     def started_outside(self) -> np.ndarray:
-        """Whether each run violated a bound at t = 0 already, (N,) bool: its start was drawn there, so that no law could keep it."""
-        return self.made & (self.status & int(Status.BOUND_VIOLATED) != 0) & ~(np.min(summaries.first_margins(self), axis=1) > 0)
+        """Whether each run violated a bound or a region at t = 0 already, (N,) bool: drawn there, so that no law could keep it."""
+        inside = [np.min(margins, axis=1) > 0 for margins in summaries.first_margins(self).values()]
+        return self.made & (self.status & int(LEFT) != 0) & ~np.all(inside, axis=0)
 
     @property
     def status_counts(self) -> dict[str, int]:
@@ -147,11 +150,11 @@ class Study:
 
     @property
     def violation_probability(self) -> Probability:
-        """How probable it is that a run leaves its bounds or runs away, with the 95 % Clopper-Pearson interval.
+        """How probable it is that a run leaves its bounds or regions, or runs away, with the 95 % Clopper-Pearson interval.
 
         Runs that started outside their bounds count, for they have violated them; `started_outside` says which they are.  That a law
         violates them has the probability `probability((study.status & VIOLATED != 0) & ~study.started_outside)`, with
-        `VIOLATED = Status.BOUND_VIOLATED | Status.NOT_FINITE`.
+        `VIOLATED = ij.status.VIOLATED | Status.NOT_FINITE`.
         """
         return self.probability(VIOLATED)
 
@@ -323,11 +326,12 @@ class Study:
     def _warn_of_start(self, i: int) -> None:
         if not self.started_outside[i]:
             return
-        margins = summaries.first_margins(self)[i]
-        joint = int(np.argmin(margins))
-        name = joint_names(self.scenario.plant, self.scenario.n)[joint]
+        first = {unit: margins[i] for unit, margins in summaries.first_margins(self).items()}
+        unit = next(unit for unit, margins in first.items() if not np.min(margins) > 0)
+        worst, plant = int(np.argmin(first[unit])), self.scenario.plant
+        name = in_words(self.scenario.regions[worst], plant) if unit == "m" else joint_names(plant, self.scenario.n)[worst]
         warnings.warn(
-            f"Run {i} started outside its bounds: {name} was drawn {-margins[joint]:.3g} rad beyond one at t = 0. "
+            f"Run {i} started outside its bounds: {name} was drawn {-first[unit][worst]:.3g} {unit} beyond one at t = 0. "
             "That violation is the draw's, not the law's: narrow the perturbations of the start, or leave such runs out "
             "(study.started_outside).",
             SimulationWarning,

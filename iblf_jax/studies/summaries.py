@@ -13,13 +13,13 @@ import numpy as np
 from iblf_jax.bounds import tube_at
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status
+from iblf_jax.regions import margins
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS
+from iblf_jax.simulation.signals import SIGNALS, own_dims
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import block_size, run_blocks
 from iblf_jax.studies.config import describe_component
-from iblf_jax.studies.dataset import own_dims
 
 if TYPE_CHECKING:
     import xarray
@@ -38,17 +38,27 @@ def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
     return values
 
 
-def first_margins(study: Study) -> np.ndarray:
-    """How far every joint of each run is inside its bounds at t = 0, (N, n) [rad]; not above zero where it starts on or outside them."""
-    return np.asarray(_first_margins(study.scenario, study.samples))
+def first_margins(study: Study) -> dict[str, np.ndarray]:
+    """How far each run is inside its constraints at t = 0; not above zero where it starts on or outside them.
+
+    By unit: "rad" and, where velocities have bounds, "rad/s", (N, n); "m" where there are m regions, (N, m).
+    """
+    return {unit: np.asarray(x) for unit, x in _first_margins(study.scenario, study.samples).items()}
 
 
 @jax.jit
-def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> jax.Array:
-    def one(drawn: Mapping[str, Any]) -> jax.Array:
+def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, jax.Array]:
+    def one(drawn: Mapping[str, Any]) -> dict[str, jax.Array]:
         made = with_parameters(scenario, drawn)
-        tube = tube_at(made.reference, made.bounds, jnp.zeros((), made.initial.q.dtype))
-        return jnp.minimum(made.initial.q - tube.lower, tube.upper - made.initial.q)
+        q, dq, zero = made.initial.q, made.initial.dq, jnp.zeros((), made.initial.q.dtype)
+        tube = tube_at(made.reference, made.bounds, zero)
+        found = {"rad": jnp.minimum(q - tube.lower, tube.upper - q)}
+        if made.velocity_bounds is not None:
+            low, high = made.setting.speed_limits(zero)
+            found["rad/s"] = jnp.minimum(dq - low, high - dq)
+        if made.regions:
+            found["m"] = margins(made.regions, made.plant, q)
+        return found
 
     return jax.vmap(one)(samples)
 

@@ -22,10 +22,11 @@ from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.signals import own_dims
 from iblf_jax.studies import config as configuration
 from iblf_jax.studies import distributed
 from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
-from iblf_jax.studies.dataset import DRAWN, own_dims, to_dataset
+from iblf_jax.studies.dataset import DRAWN, to_dataset
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.interrupt import Interrupted, StopRequest

@@ -27,6 +27,7 @@ from iblf_jax.testing.observers import check_observer as check_observer
 from iblf_jax.testing.robots import check_robot as check_robot
 from iblf_jax.testing.world import check_disturbance as check_disturbance
 from iblf_jax.testing.world import check_reference as check_reference
+from iblf_jax.testing.world import check_region as check_region
 from iblf_jax.testing.world import check_side as check_side
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "check_objective",
     "check_observer",
     "check_reference",
+    "check_region",
     "check_robot",
     "check_sensor",
     "check_side",

@@ -1,4 +1,4 @@
-"""The checkers for references, sides of the bounds, and disturbances."""
+"""The checkers for references, sides of the bounds, regions, and disturbances."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from iblf_jax.core import checks
 from iblf_jax.disturbances import Disturbance
 from iblf_jax.presets import customary_two_link
 from iblf_jax.references import Reference
+from iblf_jax.regions import Region
 from iblf_jax.robots import Robot
 from iblf_jax.simulation.scenario import fit_joints
 from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, joints_of, probe, shape_of
@@ -108,6 +109,61 @@ def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> No
 
         probe(findings, outputs, fitted, (t, q_d))
         _smooth_in_time(findings, "at(t, q_d)", lambda t: along(fitted, t, q_d), duration)
+
+
+POINTS = 64
+"""Where a region is looked at."""
+
+
+def check_region(region: Any, *, dimensions: int | None = None, size: float = 2.0) -> None:
+    """Checks a region: shapes, derivatives, float32, a distance that is one, and a level with its sign and, at the wall, its slope.
+
+    Args:
+      region: an instance.
+      dimensions: 2 in the plane, 3 in space; whichever it takes if not given.
+      size: of the surroundings of the base's origin to look at [m].
+
+    Raises:
+      ContractError: lists what does not hold, with the remedy.
+      ValueError: an argument beside the region that is none.
+    """
+    size = checks.positive_number("size", size, "m")
+    known = (2, 3) if dimensions is None else (checks.positive_integer("dimensions", dimensions, least=2, most=3),)
+    with examine(region, "Region", Region) as findings:
+        ok = isinstance(region.point, str | int)
+        findings.require(ok, f"point is {region.point!r}", 'It must be "tip", or a joint\'s name or number, in a static field')
+        made = in_dtype(region, "float64")
+        d = next((d for d in known if _takes(made, d)), known[-1])
+        rng = np.random.default_rng(3)
+        points = jnp.asarray(rng.uniform(-size, size, (POINTS, d)))
+        for label, function in (("distance(x)", made.distance), ("level(x)", made.level)):
+            has_shape(findings, label, shape_of(findings, label, function, points[0]), ())
+        findings.stop_if_any()
+
+        def outputs(region, x):
+            return {"distance(x)": region.distance(x), "level(x)": region.level(x), "the slope of level(x)": jax.grad(region.level)(x)}
+
+        probe(findings, outputs, made, (points[0],))
+        distance, slope = jax.jit(jax.vmap(jax.value_and_grad(made.distance)))(points)
+        steep = float(jnp.max(jnp.sqrt(jnp.sum(slope**2, axis=1))))
+        findings.require(steep < 1 + 1e-6, f"distance(x) changes by {steep:.4g} m a metre", "It must be a distance: 1 at most")
+        # At the wall: along the slope from each point by its distance.
+        wall = points - slope * (distance / jnp.maximum(jnp.sum(slope**2, axis=1), 1e-12))[:, None]
+        left, turned = jax.jit(jax.vmap(jax.value_and_grad(made.level)))(wall)
+        found, along = jax.jit(jax.vmap(jax.value_and_grad(made.distance)))(wall)
+        there = np.asarray(jnp.abs(found) < 1e-6)
+        same = np.allclose(left[there], found[there], atol=1e-5) and np.allclose(turned[there], along[there], atol=1e-4)
+        findings.require(same, "level(x) has another wall, or another slope at it, than distance(x)", "Both are 0 there, of slope 1")
+        level = jax.jit(jax.vmap(made.level))(points)
+        findings.require(bool(jnp.all((level > 0) == (distance > 0))), "level(x) and distance(x) differ in sign", "Positive is inside")
+
+
+def _takes(region: Any, dimensions: int) -> bool:
+    """Whether a region is one of the plane (2) or of space (3)."""
+    try:
+        return jax.eval_shape(region.distance, jnp.zeros(dimensions)).shape == ()
+    except Exception:  # whatever a shape that does not fit raises
+        return False
 
 
 def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None, duration: float = 20.0) -> None:

@@ -5,6 +5,8 @@ each perturbation is the unknown, and every one of S attacks, started at random,
 
     minimise  margin(u) = min over time and joints of min(q - lower, upper - q)     subject to     0 <= u <= 1
 
+(or the margin of the velocities, or of the regions),
+
 by the method of `newton`: the exact margin and its slope, which are those of the joint, side and instant that come nearest, a
 curvature learnt from their changes, and a trust region.  An attack that has arrived starts anew somewhere else.  All run in one batch,
 derivatives by forward mode.  What comes back is the run with the smallest margin that was seen, so it is never better news than its
@@ -27,12 +29,14 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
-from iblf_jax.core.status import Status, describe
+from iblf_jax.core.pytree import astype
+from iblf_jax.core.status import VIOLATED, Status, describe
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.sampling import check_step
@@ -42,9 +46,11 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import NUMBERS_A_RUN, Slope, Value
-from iblf_jax.tuning.quantities import Peak, Quantities
+from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
 from iblf_jax.tuning.tangents import by_coordinates
 
+MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
+"""What may be attacked -> the deficit that is minus its margin."""
 FIRST_RADIUS = 0.5
 """Of the first step, in u."""
 TOLERANCE = 1e-4
@@ -64,21 +70,23 @@ class Attack:
     values: dict[str, np.ndarray]
     """Path -> worst value, in the leaf's unit."""
     margin: float
-    """Its smallest margin [rad]; negative if a bound was violated."""
+    """Its smallest margin, in `unit`; negative if a bound was violated."""
     first_margin: float
-    """The smallest margin of the random starting points [rad]."""
+    """The smallest margin of the random starting points."""
     status: int
     """Flags of `Status` of that run."""
     history: np.ndarray
-    """Margin of every attack's trial at every step, (iterations + 1, starts) [rad]; NaN for runs that are no answer (`NO_ANSWER`)."""
+    """Margin of every attack's trial at every step, (iterations + 1, starts); NaN for runs that are no answer (`NO_ANSWER`)."""
     runs: int
     """Rollouts with derivatives that were made."""
     timing: dict[str, Any]
+    unit: str = dataclasses.field(default="rad", kw_only=True)
+    """Of the margins."""
 
     @property
     def violated(self) -> bool:
-        """Whether the scenario was falsified: a run within the sets left its bounds or ran away."""
-        return bool(self.status & int(Status.BOUND_VIOLATED | Status.NOT_FINITE))
+        """Whether the scenario was falsified: a run within the sets did not keep its bounds or regions, or ran away."""
+        return bool(self.status & int(VIOLATED | Status.NOT_FINITE))
 
     def replay(self, record_every: int = 1) -> Rollout:
         """The worst run, in full."""
@@ -86,7 +94,7 @@ class Attack:
 
     def __repr__(self) -> str:
         word = "FALSIFIED" if self.violated else "not falsified"
-        lines = [f"Attack({word}: smallest margin {self.margin:.4g} rad, {self.first_margin:.4g} at random; {self.runs} runs)"]
+        lines = [f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g} at random; {self.runs} runs)"]
         lines += [f"  status: {describe(self.status)}"]
         lines += [f"  {path}: {np.array2string(np.asarray(x), precision=5)}" for path, x in self.values.items()]
         return "\n".join(lines)
@@ -104,11 +112,12 @@ def falsify(
     starts: int = 16,
     iterations: int = 12,
     seed: int = 0,
+    margin: str = "positions",
     progress: bool | None = None,
 ) -> Attack:
     """Looks for the run with the smallest margin within stated sets.
 
-        minimise over u in [0, 1]^d:   min over t and joints of min(q - lower, upper - q)
+        minimise over u in [0, 1]^d:   min over t and joints of min(q - lower, upper - q)     (or of velocities or regions, `margin`)
 
     Args:
       scenario: what to attack, with its tuned gains say.
@@ -120,14 +129,15 @@ def falsify(
       starts: attacks, each from its own random point, in one batch; one that has arrived starts anew from another point.
       iterations: steps of each of them.
       seed: fixes the starting points.
+      margin: which one is looked at: of the "positions", the "velocities" or the "regions".
       progress: a progress bar; shown where somebody watches if not given.
 
     Returns:
       An `Attack`: the worst run found, and whether it left its bounds.  Not to have found one proves nothing.
 
     Raises:
-      ValueError: a perturbation without ends (a normal distribution), perturbations in which nothing admissible was found, or bad
-        arguments.
+      ValueError: a perturbation without ends (a normal distribution), no such margin, perturbations in which nothing admissible was found,
+        or bad arguments.
 
     Source: head of this module.
     """
@@ -139,21 +149,25 @@ def falsify(
     checks.fits("iterations", iterations, 8 * starts)
     cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
-    run = Run(steps, method, mechanism=mechanism_of(scenario))
-    push = partial(_push, cube, jnp.asarray(dt, dtype), run=run, backend=backend)
+    checks.one_of("margin", margin, MARGINS)
+    one: Any = 1.0
+    peak = Peak(one, MARGINS[margin])
+    check_needs("margin", peak, scenario)
+    run, unit = Run(steps, method, mechanism=mechanism_of(scenario)), DEFICITS[peak.signal]
+    push = partial(_push, cube, astype(peak, dtype), jnp.asarray(dt, dtype), run=run, backend=backend)
     seed = checks.seed(seed)
     searcher = Newton(Box(np.full(cube.size, 0.5), np.zeros(cube.size), np.ones(cube.size)), TOLERANCE, FIRST_RADIUS)
     state, best, history = searcher.init(cube.admissible_points(starts, [seed, 3])), None, []
 
     def attack(u: np.ndarray) -> Slope:
         nonlocal best
-        margin, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
-        fine = np.isfinite(margin) & (status & int(NO_ANSWER) == 0)
-        history.append(np.where(fine, margin, np.nan))
-        s = int(np.argmin(np.where(fine, margin, np.inf)))
-        if fine[s] and (best is None or margin[s] < best[0]):
-            best = (float(margin[s]), u[s].copy(), int(status[s]))
-        return Slope(Value(np.where(fine, margin, np.inf)), slope, np.zeros((starts, cube.size, cube.size)))
+        margins, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
+        fine = np.isfinite(margins) & (status & int(NO_ANSWER) == 0)
+        history.append(np.where(fine, margins, np.nan))
+        s = int(np.argmin(np.where(fine, margins, np.inf)))
+        if fine[s] and (best is None or margins[s] < best[0]):
+            best = (float(margins[s]), u[s].copy(), int(status[s]))
+        return Slope(Value(np.where(fine, margins, np.inf)), slope, np.zeros((starts, cube.size, cube.size)))
 
     with bar(progress, iterations + 1, unit="steps") as shown:
         for step in range(iterations + 1):
@@ -164,7 +178,7 @@ def falsify(
             for s in arrived.tolist():
                 searcher.begin(state, s, anew[s])
             shown.update(1)
-            shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} rad")
+            shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} {unit}")
     if best is None:
         remedy = (
             "In every run that was tried the reference leaves the bounds (Assumption 2) or the step is too large: narrow the "
@@ -175,7 +189,7 @@ def falsify(
     timing = {"duration": duration, "dt": dt, "method": method}
     worst = with_parameters(scenario, values)
     first = next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row)))
-    return Attack(worst, values, best[0], first, best[2], np.stack(history), starts * (iterations + 1), timing)
+    return Attack(worst, values, best[0], first, best[2], np.stack(history), starts * (iterations + 1), timing, unit=unit)
 
 
 def _back(refused: Callable[[np.ndarray], str], last_valid: np.ndarray, ahead: np.ndarray) -> np.ndarray:
@@ -188,12 +202,11 @@ def _back(refused: Callable[[np.ndarray], str], last_valid: np.ndarray, ahead: n
 
 
 @partial(jax.jit, static_argnames=("run", "backend"))
-def _push(cube: Cube, dt, u, *, run, backend):
-    """Smallest margin (S,) [rad], its slope by u (S, d) and the status of each attack."""
-    one: Any = jnp.ones_like(dt)
+def _push(cube: Cube, peak: Peak, dt, u, *, run, backend):
+    """Smallest margin (S,), minus the peak of a deficit, its slope by u (S, d) and the status of each attack."""
     varied = jax.vmap(cube.values)(u)
     slopes = jax.vmap(jax.jacfwd(cube.values))(u)
-    found = by_coordinates(cube.cases.scenario, varied, slopes, (Quantities((Peak(one, "deficit"),)),), dt, run, backend=backend)
+    found = by_coordinates(cube.cases.scenario, varied, slopes, (Quantities((peak,)),), dt, run, backend=backend)
     deficits, moved = found.outcome.metrics["tuning_pieces"], found.tangents["tuning_pieces"]
     worst = jnp.argmax(deficits, axis=1)
     margin = -jnp.take_along_axis(deficits, worst[:, None], axis=1)[:, 0]

@@ -27,7 +27,7 @@ from iblf_jax.studies.recommended import recommended_dt
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
-from iblf_jax.tuning.objectives import Objective, check_velocity_bounds, checked, complete, is_complete, is_smoothed
+from iblf_jax.tuning.objectives import Objective, check_signals, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, sampled_too_slowly, values_at
 from iblf_jax.tuning.problem import (
@@ -250,7 +250,7 @@ def build(
     blocks, box = layout(scenario, parameters, float(timing["dt"]), timing["method"])
     checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
     goal = checked(objective)
-    check_velocity_bounds(goal, scenario)
+    check_signals(goal, scenario)
     fit_joints(goal, scenario.n, "objective")
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)

@@ -26,7 +26,8 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, leaf, static
-from iblf_jax.simulation.metrics import Fold, Settling, Tracking
+from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, Quantity, TimeIntegral
 
 
@@ -219,17 +220,10 @@ def has_price_on_torque(objective: Objective) -> bool:
     return any(getattr(q, "signal", "torque") in ("torque", "torque_rate") for q in quantities if not _of_the_error(q))
 
 
-def check_velocity_bounds(objective: Objective, scenario: Any) -> None:
-    """Raises ValueError for an objective that asks for margins of velocities where these have no bounds."""
-    of_velocity = [q for q in _composed(objective).quantities if _of_velocity(q)]
-    if of_velocity and scenario.velocity_bounds is None:
-        remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
-        raise checks.fail("objective", "a margin of velocities", "a scenario with velocity_bounds", remedy)
-
-
-def _of_velocity(quantity: Quantity) -> bool:
-    fold = getattr(quantity, "fold", None)
-    return getattr(quantity, "signal", "") == "velocity_deficit" or getattr(fold, "needs_velocity_bounds", False)
+def check_signals(objective: Objective, scenario: Scenario) -> None:
+    """Raises ValueError for an objective of what the scenario's runs do not have: margins of velocities or regions, a slack."""
+    for quantity in _composed(objective).quantities:
+        check_needs("objective", quantity, scenario)
 
 
 def _of_the_error(quantity: Quantity) -> bool:
@@ -317,6 +311,12 @@ def velocity_margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any 
     return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="velocity_margin"),))
 
 
+def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
+    """Soft penalty on coming nearer to a region's wall than a target; as `margin`, in m, for scenarios with `regions`."""
+    quantity = Peak(target, "region_deficit", smoothing=smoothing)
+    return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="region_margin"),))
+
+
 def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Objective:
     """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own, summed over the joints.
 
@@ -368,6 +368,11 @@ def margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
 def velocity_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
     """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with `velocity_bounds`; as `margin_above`."""
     return Requirement(Peak(limit, "velocity_deficit"), -limit, limit, allowed, name=f"velocity margin > {limit:g} rad/s")
+
+
+def region_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
+    """Minimum over time and regions of the distance to the wall > limit [m], for scenarios with `regions`; as `margin_above`."""
+    return Requirement(Peak(limit, "region_deficit"), -limit, limit, allowed, name=f"region margin > {limit:g} m")
 
 
 def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:

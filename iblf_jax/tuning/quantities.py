@@ -53,18 +53,20 @@ class Quantity(Protocol):
         ...
 
 
-TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1", "deficit": "rad", "velocity_deficit": "rad/s"}
+DEFICITS = {"deficit": "rad", "velocity_deficit": "rad/s", "region_deficit": "m"}
+"""Signals of which the largest is minus a margin -> unit: no sizes, and no weights of the joints."""
+TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1"} | DEFICITS
 """Signal -> unit."""
-DEFICITS = ("deficit", "velocity_deficit")
-"""Signals of which the largest is minus a margin: no sizes, and no weights of the joints."""
+NEEDS = {"velocity_deficit": "dq_lower", "region_deficit": "region_margin"}
+"""Signal -> the optional one of the run that it is made of."""
 
 
 def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax.Array:
-    """A signal at one sample, (n,) or (2 n,).
+    """A signal at one sample, (n,), (2 n,) or one number a region.
 
     error e1; torque tau; torque_rate (tau - last tau) / dt; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose
     integral of squares is the time outside the tolerance; deficit (lower - q, q - upper), the largest of which is minus the margin;
-    velocity_deficit the same of the velocities.
+    velocity_deficit the same of the velocities; region_deficit minus the distances to the walls of the regions.
     """
     if name == "error":
         return sample.e1
@@ -75,6 +77,8 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax
     if name == "outside":
         size = jnp.where(sample.e1 >= 0, sample.e1, -sample.e1)
         return jax.nn.sigmoid((size - tolerance) / (SOFT_EDGE * tolerance)) ** 0.5
+    if name == "region_deficit":
+        return -sample.region_margin
     if name == "velocity_deficit":
         return jnp.concatenate([sample.dq_lower - sample.dq, sample.dq - sample.dq_upper])
     return jnp.concatenate([sample.lower - sample.q, sample.q - sample.upper])
@@ -137,7 +141,7 @@ class Peak:
 
     Args:
       scale: the size of y that matters, () in its unit, > 0.
-      signal: "error", "torque", "torque_rate", "deficit" or "velocity_deficit"; "torque" if not given.
+      signal: "error", "torque", "torque_rate", "deficit", "velocity_deficit" or "region_deficit"; "torque" if not given.
       joints: weight of each joint, () or (n,) [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       smoothing: T as a part of the scale, () [1], > 0; 0.01 if not given.
@@ -152,6 +156,11 @@ class Peak:
     windows: jax.Array | None = leaf("s", shape="any", default=None)
     units: ClassVar[dict[str, str]] = {name: unit for name, unit in TUNED_SIGNALS.items() if name != "outside"}
 
+    @property
+    def needs(self) -> str | None:
+        """The optional signal of a run that it reads."""
+        return NEEDS.get(self.signal)
+
     def check(self) -> None:
         """Raises ValueError for an unknown signal."""
         checks.one_of("Peak.signal", self.signal, tuple(self.units))
@@ -164,9 +173,10 @@ class Peak:
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
 
     def init(self, sample: Sample):
-        """Below everything, (W, 2 n); the first torque has no predecessor but itself."""
+        """Below everything, (W, 2 n), or (W, m) for m regions; the first torque has no predecessor but itself."""
         count = 1 if self.windows is None else 1 + self.windows.size
-        return jnp.full((count, 2 * sample.q.size), -FAR, sample.t.dtype), sample.tau
+        size = sample.region_margin.size if self.signal == "region_deficit" else 2 * sample.q.size
+        return jnp.full((count, size), -FAR, sample.t.dtype), sample.tau
 
     def update(self, acc, sample: Sample):
         """Adds one sample to the window that it is in."""
@@ -214,6 +224,11 @@ class MetricResult:
         """Raises ValueError for something that is not a fold, or a name that it does not return."""
         checks.conforms("MetricResult.fold", self.fold, Fold, "iblf_jax.metrics has them; iblf_jax.testing.check_fold looks at your own.")
         checks.one_of("MetricResult.name", self.name, tuple(self.fold.units))
+
+    @property
+    def needs(self) -> str | None:
+        """The optional signal of a run that its fold reads."""
+        return getattr(self.fold, "needs", None)
 
     def init(self, sample: Sample):
         """The fold's accumulator."""

@@ -182,8 +182,7 @@ class TuneResult:
         """The nominal run before and after, in full."""
         setup = self.setup
         dtype, steps = self.start.initial.q.dtype, checks.whole_steps(setup.duration, setup.dt)
-        bounded = self.start.velocity_bounds is not None
-        folds, step = as_folds(None, dtype, velocity_bounds=bounded), jnp.asarray(setup.dt, dtype)
+        folds, step = as_folds(None, dtype, self.start), jnp.asarray(setup.dt, dtype)
         run = partial(simulate_unchecked, folds=folds, dt=step, steps=steps, method=setup.method, record_every=1)
         return run(canonical(self.start)), run(canonical(self.scenario))
 
@@ -263,7 +262,7 @@ class TuneResult:
         changes = {k: np.broadcast_to(x.reshape(-1, *(1,) * len(shapes[k])), (len(x), *shapes[k])) for k, x in grid.items()}
         setup, scenario = self.setup, canonical(self.scenario)
         dtype = scenario.initial.q.dtype
-        folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario.n)
+        folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario)
         run = Run(checks.whole_steps(setup.duration, setup.dt), setup.method, mechanism=mechanism_of(scenario))
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), run=run, backend=setup.backend)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)

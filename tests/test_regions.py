@@ -1,0 +1,331 @@
+"""Regions for the tip and for joints' origins: watched under every law, kept by the safety filter, drawn, tuned, attacked."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arm_cases import random_arm
+from independent import Loop
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax import bounds, controllers, plotting, regions
+from iblf_jax.files.scenario import load_scenario, save_scenario, scenario_to_toml
+from iblf_jax.regions import along, in_words, margins, position_of
+from iblf_jax.simulation import metrics
+
+RUN = {"duration": 1.5, "dt": 1e-3}
+WALL = regions.HalfSpace(normal=[-2.0, 0.2], offset=-0.46)
+BALL = regions.Sphere(centre=[0.40, 0.06], radius=0.1, point=1)
+REACH = regions.Sphere(centre=[0.1, 0.1], radius=0.46, keep="inside")
+
+
+def stepping(law=None, goal=(0.3, 0.9), **parts):
+    """PD that steps towards a reference whose tip is beyond the wall, and whose elbow is in the ball; no disturbance."""
+    law = controllers.PDGravity(Kp=[30.0, 20.0], Kd=[2.0, 1.0]) if law is None else law
+    walls = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(2.2))
+    rest = ij.references.Sinusoid(offset=goal, amplitude=0.0)
+    made = {"controller": law, "reference": rest, "bounds": walls, "initial": ij.Initial([1.0, 1.3]), "regions": (WALL, BALL, REACH)}
+    scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
+    return ij.with_parts(scenario, **(made | {"disturbance": ij.disturbances.Nothing()} | parts))
+
+
+def filtered(scenario, **options):
+    return ij.with_parts(scenario, controller=controllers.SafetyFilter(law=scenario.controller, **options))
+
+
+@pytest.fixture(scope="module")
+def alone():
+    with pytest.warns(ij.SimulationWarning, match=r"a region was left\. regions\[\d\]: the \w+.* crossed its wall, at t = .* m\.$"):
+        return ij.simulate(stepping(), **RUN)
+
+
+@pytest.fixture(scope="module")
+def kept():
+    return ij.simulate(filtered(stepping()), **RUN, backend="xla")
+
+
+# ---------------------------------------------------------------------------------------------------- by hand, from the equations alone
+
+
+def points(q):
+    """Elbow and tip of the paper's arm."""
+    elbow = 0.35 * np.array([np.cos(q[0]), np.sin(q[0])])
+    return elbow, elbow + 0.31 * np.array([np.cos(q[0] + q[1]), np.sin(q[0] + q[1])])
+
+
+def distances(q):
+    elbow, tip = points(q)
+    normal = np.array([-2.0, 0.2]) / np.hypot(2.0, 0.2)
+    ball, reach = np.linalg.norm(elbow - [0.40, 0.06]) - 0.1, 0.46 - np.linalg.norm(tip - [0.1, 0.1])
+    return np.array([normal @ tip + 0.46, ball, reach])
+
+
+def levels(q):
+    """The filter's: as the distances, but smooth at the centre inside."""
+    _, tip = points(q)
+    return np.array([*distances(q)[:2], (0.46**2 - np.sum((tip - [0.1, 0.1]) ** 2)) / (2 * 0.46)])
+
+
+def rates(q, v, h=1e-5):
+    """Slope of the levels (3, 2) and their second rate without accelerations (3,), by central differences of the fourth order."""
+    w = np.array([1 / 12, -2 / 3, 2 / 3, -1 / 12]) / h
+    slope = np.stack([sum(c * levels(q + s * h * e) for c, s in zip(w, (-2, -1, 1, 2), strict=True)) for e in np.eye(2)], axis=1)
+    k = 1e-3
+    w2 = np.array([-1 / 12, 4 / 3, -5 / 2, 4 / 3, -1 / 12]) / k**2
+    return slope, sum(c * levels(q + s * k * v) for c, s in zip(w2, (-2, -1, 0, 1, 2), strict=True))
+
+
+def least_change(G, h):
+    """The least x with G x <= h, of two numbers, by trying every set of active rows; None if there is none."""
+    best = None
+    for size in range(3):
+        for active in itertools.combinations(range(len(h)), size):
+            A = G[list(active)]
+            if size == 2 and abs(np.linalg.det(A)) < 1e-9 * np.prod(np.linalg.norm(A, axis=1)):
+                continue
+            x = np.linalg.pinv(A) @ h[list(active)] if size else np.zeros(2)
+            if np.all(G @ x <= h + 1e-10 * (1 + np.abs(h))) and (best is None or x @ x < best @ best):
+                best = x
+    return best
+
+
+def filtered_torque(q, v, a1=10.0, a2=10.0, b1=10.0, b2=10.0):
+    """PD with gravity, and the torque nearest to it that meets every condition."""
+    M, C, G, _ = Loop().arm(q)
+    asked = G - np.array([30.0, 20.0]) * (q - [0.3, 0.9]) - np.array([2.0, 1.0]) * v
+    inverse = np.linalg.inv(M)
+    planned = inverse @ (asked - C(v) @ v - G)
+    low, high = -(a1 + a2) * v + a1 * a2 * (-0.5 - q), -(a1 + a2) * v + a1 * a2 * (2.2 - q)
+    slope, bend = rates(q, v)
+    room = slope @ planned + bend + (b1 + b2) * slope @ v + b1 * b2 * levels(q)
+    rows = np.concatenate([inverse, -inverse, -slope @ inverse])
+    return asked, asked + least_change(rows, np.concatenate([high - planned, planned - low, room]))
+
+
+def test_the_torque_is_that_of_every_set_of_active_rows(rng):
+    scenario, changed = filtered(stepping()), 0
+    q, v = rng.uniform([0.8, 0.9], [1.2, 1.6], (60, 2)), rng.uniform(-1.5, 1.5, (60, 2))
+    law, zero = scenario.controller, jnp.zeros(2)
+    found = jax.jit(jax.vmap(lambda q, v: law.command(zero[0], q, v, zero, scenario.setting, ())[0]))(q, v)
+    np.testing.assert_array_equal(found.slack, 0.0)
+    np.testing.assert_array_equal(found.region_slack, 0.0)
+    for k in range(len(q)):
+        asked, tau = filtered_torque(q[k], v[k])
+        np.testing.assert_allclose(found.tau[k], tau, rtol=0, atol=1e-6 * (1 + np.max(np.abs(tau))))
+        changed += np.max(np.abs(tau - asked)) > 1e-3
+    assert 15 < changed < 60
+
+
+@pytest.mark.slow
+def test_a_run_is_that_of_an_independent_program():
+    def rate(_, x):
+        M, C, G, _ = Loop().arm(x[:2])
+        return np.concatenate([x[2:], np.linalg.solve(M, filtered_torque(x[:2], x[2:])[1] - C(x[2:]) @ x[2:] - G)])
+
+    t = np.linspace(0.0, 1.0, 11)
+    found = solve_ivp(rate, (0.0, 1.0), [1.0, 1.3, 0.0, 0.0], "DOP853", t_eval=t, rtol=1e-8, atol=1e-10)
+    run = ij.simulate(filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400, backend="xla")
+    np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
+
+
+# ----------------------------------------------------------------------------------------------------------------- what is watched
+
+
+def test_margins_are_those_by_hand_and_what_the_status_says(alone):
+    np.testing.assert_allclose(alone.region_margin, [distances(q) for q in np.asarray(alone.q)], atol=1e-12)
+    outside = np.asarray(alone.region_margin <= 0)
+    first = int(np.flatnonzero(outside.any(axis=1))[0])
+    assert ij.Status(int(alone.status)) & ij.status.FAILED == ij.Status.REGION_VIOLATED
+    assert float(alone.metrics.first_region_violation_time) == pytest.approx(float(alone.t[first]))
+    assert outside[first, int(alone.metrics.first_region_violation_region)]
+    np.testing.assert_allclose(alone.metrics.region_margin, alone.region_margin.min(axis=0), rtol=1e-12)
+    assert np.sum(np.asarray(alone.metrics.region_margin) < -0.01) >= 2
+
+
+def test_the_loop_does_not_know(alone):
+    free = ij.simulate(stepping(regions=()), **RUN)
+    for name in ("q", "tau", "V"):
+        np.testing.assert_allclose(getattr(free, name), getattr(alone, name), rtol=1e-12, atol=1e-13)
+    assert free.region_margin == () and "region_margin" not in free.metrics
+
+
+def test_the_filter_keeps_what_the_law_breaks(kept):
+    assert not int(kept.status) & int(ij.status.FAILED | ij.Status.FILTER_INFEASIBLE)
+    margin = np.asarray(kept.metrics.region_margin)
+    assert np.all(margin > 0) and np.sum(margin < 0.01) >= 1
+    np.testing.assert_array_equal(kept.metrics.largest_slack, 0.0)
+    np.testing.assert_array_equal(kept.metrics.largest_region_slack, 0.0)
+
+
+def test_too_little_torque_breaks_them_and_says_by_how_much():
+    scenario = filtered(stepping(initial=ij.Initial([1.0, 1.3], [-3.0, -1.0])), limit=[3.0, 1.0])
+    with pytest.warns(ij.SimulationWarning, match=r"m/s\^2 \(run\.region_slack\).*b1 and b2"):
+        run = ij.simulate(scenario, duration=0.3, dt=1e-3, method="euler", backend="xla")
+    assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
+    np.testing.assert_allclose(run.metrics.largest_region_slack, run.region_slack.max(axis=0))
+    assert float(np.max(run.metrics.largest_region_slack)) > 0.1
+    assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([3.0, 1.0]) * (1 + 1e-9))
+    at = scenario.setting.regions_along(run.q[1], run.dq[1])
+    model, law = scenario.model, scenario.controller
+    ddq = np.linalg.solve(
+        model.mass_matrix(run.q[1]), run.tau[1] - model.coriolis(run.q[1], run.dq[1], run.dq[1]) - model.gravity(run.q[1])
+    )
+    broken = -(at.slope @ ddq + at.bend + (law.b1 + law.b2) * at.rate + law.b1 * law.b2 * at.level)
+    np.testing.assert_allclose(run.region_slack[1], np.maximum(broken, 0.0), atol=1e-5 * np.max(np.abs(broken)))
+
+
+def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(MODEL)
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    data, robot = mujoco.MjData(model), ij.robots.load(tmp_path / "arm.xml", tip="tip")
+    parts = [
+        regions.Sphere([0.3, 0.1, 0.2], 0.1),
+        regions.HalfSpace([0.0, 1.0, 2.0], -1.0, "wrist"),
+        regions.Sphere([0.0, 0.0, 0.0], 2.0, keep="inside"),
+    ]
+    moving = jax.jit(lambda q, v: along(tuple(parts), robot, q, v))
+    for q, v, a in rng.uniform(-1.5, 1.5, (5, 3, robot.n)):
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(position_of(robot, "wrist", q), data.joint("wrist").xanchor, atol=1e-12)
+        np.testing.assert_allclose(position_of(robot, "tip", q), data.site("tip").xpos, atol=1e-12)
+        h = 1e-4
+        moved = [moving(q + s * v + 0.5 * s**2 * a, v).level for s in (-h, 0.0, h)]
+        at = moving(q, v)
+        np.testing.assert_allclose(at.rate, (moved[2] - moved[0]) / (2 * h), atol=1e-6)
+        np.testing.assert_allclose(at.slope @ a + at.bend, (moved[2] - 2 * moved[1] + moved[0]) / h**2, atol=1e-5)
+    assert in_words(parts[1], robot) == "the origin of wrist"
+
+
+MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="base" axis="0 0 1"/><geom size="0.1"/>
+<body pos="0.1 0 0.3"><joint name="elbow" axis="0 1 0"/><geom size="0.1" pos="0.1 0 0"/>
+<body pos="0.4 0 0.05"><joint name="wrist" axis="0 1 0.2"/><geom size="0.05" pos="0.1 0 0"/><site name="tip" pos="0.2 0 0.1"/>
+</body></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.slow
+def test_a_run_in_space_by_the_kernels():
+    """A wall for the tip of an arm that is thrown at it, and what a batch says of it on two backends."""
+    robot = random_arm(2, seed=1, armature=0.1)
+    start = position_of(robot, "tip", jnp.full(2, 0.5))
+    wall = regions.HalfSpace(normal=[0.0, 0.0, 1.0], offset=float(start[2]) - 0.02)
+    scenario = ij.Scenario(
+        plant=robot,
+        reference=ij.references.Sinusoid(offset=[0.5] * 2, amplitude=0.0),
+        bounds=bounds.Bounds(lower=bounds.Constant(-3.0), upper=bounds.Constant(3.0)),
+        controller=controllers.SafetyFilter(law=controllers.PDGravity(Kp=1.0, Kd=0.1), nearest="acceleration"),
+        initial=ij.Initial([0.5] * 2, [0.4, -0.8]),
+        regions=(wall,),
+    )
+    options = {"runs": 3, "duration": 0.1, "dt": 1e-3, "method": "euler", "progress": False}
+    perturbations = {"regions[0].offset": ij.offset(ij.uniform(-0.01, 0.0))}
+    found, again = (ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "vmap"))
+    for name in ("region_margin", "largest_slack", "peak_torque"):
+        np.testing.assert_allclose(found.metrics[name], again.metrics[name], rtol=1e-7, atol=1e-9)
+    assert found.metrics.region_margin.shape == (3, 1)
+    assert found.to_xarray().region_margin.dims == ("run", "region")
+
+
+# ----------------------------------------------------------------------------------------------------------------- what is done with them
+
+
+def test_derivatives_by_the_region_and_the_rates():
+    def worst(offset, b1):
+        scenario = ij.with_parameters(filtered(stepping(regions=(WALL, BALL))), {"regions[0].offset": offset, "controller.b1": b1})
+        run = ij.simulate(scenario, duration=0.4, dt=2e-3, record_every=200, method="euler", metrics=(metrics.RegionMargin(),))
+        return jnp.min(run.metrics.region_margin)
+
+    point, h = (-0.46, 10.0), 1e-5
+    found = jax.jvp(worst, point, (1.0, 20.0))[1]
+    difference = (worst(point[0] + h, point[1] + 20 * h) - worst(point[0] - h, point[1] - 20 * h)) / (2 * h)
+    assert abs(float(found)) > 1e-3
+    assert float(found) == pytest.approx(float(difference), rel=1e-4)
+
+
+def test_a_requirement_on_regions_and_an_attack_on_them():
+    scenario, short = stepping(goal=(0.5, 0.9), regions=(BALL, WALL)), {"duration": 0.4, "dt": 2e-3, "progress": False}
+    objective = ij.objectives.tracking() + 0.1 * ij.objectives.effort() + ij.objectives.region_margin_above(0.01)
+    result = ij.tune(scenario, ["controller.Kd"], objective, **short, iterations=8)
+    line = result.report.verdicts[0]
+    assert (line.name, line.unit, line.verdict) == ("region margin > 0.01 m", "m", "pass")
+    run = result.nominal[1]
+    assert float(np.min(run.metrics.region_margin)) == pytest.approx(line.value)
+    sets = {"initial.q": ij.offset(ij.uniform(-0.02, 0.02))}
+    attack = ij.falsify(result.scenario, sets, **short, starts=4, iterations=3, margin="regions")
+    assert attack.unit == "m" and attack.margin <= attack.first_margin < line.value + 0.03
+    assert attack.violated == (attack.margin < 0)
+    assert float(np.min(attack.replay().metrics.region_margin)) == pytest.approx(attack.margin)
+    with pytest.raises(ValueError, match="regions"):
+        ij.falsify(stepping(regions=()), sets, **short, margin="regions")
+    with pytest.raises(ValueError, match="regions"):
+        ij.tune(stepping(regions=()), ["controller.Kd"], objective, **short)
+
+
+def test_starts_beyond_a_wall_are_told_from_violations():
+    scenario = stepping(goal=(1.0, 1.3), regions=(regions.HalfSpace([1.0, 0.0], -0.1),))
+    study = ij.monte_carlo(scenario, {"initial.q": ij.offset(ij.uniform(-0.3, 0.3))}, runs=32, duration=0.1, dt=1e-3, progress=False)
+    outside = np.asarray(jax.vmap(lambda q: margins(scenario.regions, scenario.plant, q))(study.samples["initial.q"]))[:, 0] <= 0
+    assert 0 < np.sum(outside) < 32
+    np.testing.assert_array_equal(study.started_outside, outside)
+    assert study.violation_probability.count >= np.sum(outside)
+    with pytest.warns(ij.SimulationWarning, match="the tip was drawn .* m beyond one"):
+        study.replay(int(np.flatnonzero(outside)[0]))
+
+
+def test_files_and_datasets_hold_them(tmp_path, alone):
+    scenario = filtered(stepping())
+    save_scenario(scenario, tmp_path / "s.toml")
+    again = load_scenario(tmp_path / "s.toml")
+    assert jax.tree.structure(again) == jax.tree.structure(scenario)
+    jax.tree.map(np.testing.assert_array_equal, again, scenario)
+    assert "[[regions]]" in scenario_to_toml(scenario) and "regions" not in scenario_to_toml(stepping(regions=()))
+    assert "radius = 0.1  # m" in scenario_to_toml(scenario)
+    assert {"regions[1].centre", "controller.b2"} <= {p.path for p in ij.parameters(scenario)}
+    data = alone.to_xarray()
+    assert data.region_margin.dims == ("time", "region") and data.region_margin.units == "m"
+
+
+def test_figures(alone, kept):
+    figure = plotting.region_margins({"alone": alone, "filtered": kept})
+    assert len(figure.axes) == 6
+    assert len(alone.plot().axes) == 2 + 6 + 2  # tubes, joints together, margins and paths
+    drawn = plotting.workspace({"alone": alone, "filtered": kept}).axes[0]
+    tip = next(x for x in drawn.get_lines() if x.get_label() == "filtered").get_xydata()
+    np.testing.assert_allclose(tip[-1], points(np.asarray(kept.q[-1]))[1])
+    assert {x.get_label() for x in drawn.get_lines()} >= {"wall of the tip", "wall of the origin of joint 1", "reference"}
+    line = next(x for x in figure.axes[0].get_lines() if x.get_label() == "alone")
+    np.testing.assert_allclose(line.get_ydata()[-1], alone.region_margin[-1, 0])
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (3.0, "a tuple of regions"),
+        ((WALL, 3.0), r"regions\[1\]"),
+        ((regions.HalfSpace([0.0, 0.0, 1.0]),), r"regions\[0\].*TwoLink of 2 joints"),
+        ((regions.Sphere([0.1, 0.2], 0.1, point="wrist"),), "wrist"),
+        ((regions.Sphere([0.1, 0.2], 0.1, point=2),), "joint 0, joint 1"),
+        ((regions.HalfSpace([1.0, 0.0], 0.9),), r"initial\.q.*the tip .* m beyond its wall"),
+    ],
+)
+def test_bad_ones_are_refused(part, words):
+    with pytest.raises(ValueError, match=words):
+        ij.simulate(stepping(regions=part), **RUN)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: regions.HalfSpace([0.0, 0.0]), "a direction"),
+        (lambda: regions.HalfSpace(1.0), "two numbers"),
+        (lambda: regions.Sphere([0.0, 1.0], -1.0), "> 0"),
+        (lambda: regions.Sphere([0.0, 1.0], 1.0, keep="in"), "inside"),
+    ],
+)
+def test_bad_regions_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
