@@ -122,6 +122,12 @@ CASES: dict[str, Case] = {
         "A safety filter's conditions and its torque limits have nothing in common. The torque broke the conditions by the least.",
         "`run.slack` says by how much. More torque, slower conditions (`a1`, `a2`), or another start.",
     ),
+    "REGION_VIOLATED": Case(
+        lambda: _run(_paper(regions=(ij.regions.HalfSpace(normal=[0.0, 1.0], offset=0.45),)), duration=4.0),
+        "The tip, or the origin of a joint, touched or crossed the wall of a region. Here the law does not know the wall.",
+        "Put a `controllers.SafetyFilter` around the law, or move the reference. `run.metrics.region_margin` says by how much.",
+        plotting.workspace,
+    ),
     "INADMISSIBLE_DRAW": Case(
         lambda: None,
         "Of studies: a draw was no robot at all, such as one with a negative mass. The run was not made; its metrics are NaN.",

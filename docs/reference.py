@@ -29,7 +29,7 @@ PAGES: dict[str, tuple[str, str]] = {
     ),
 }
 """Page -> its title and the names that it explains."""
-FAMILIES = ("controllers", "barriers", "observers", "robots", "references", "bounds", "disturbances", "sensors", "actuators")
+FAMILIES = ("controllers", "barriers", "observers", "robots", "references", "bounds", "regions", "disturbances", "sensors", "actuators")
 
 
 def page_of(thing: Any, name: str, level: int = 2) -> str:

@@ -62,7 +62,10 @@ def _parts_of(scenario: Scenario) -> str:
     rows = []
     for name in vars(scenario):
         part = getattr(scenario, name)
-        if part is None or (name == "model" and part is scenario.plant):
+        if part is None or part == () or (name == "model" and part is scenario.plant):
+            continue
+        if isinstance(part, tuple):
+            rows.append((name, ", ".join(type(each).__name__ for each in part), ""))
             continue
         inner = getattr(part, getattr(type(part), "wraps", None) or "barrier", None)
         kind = type(part).__name__ + (f" ({type(inner).__name__})" if inner is not None else "")

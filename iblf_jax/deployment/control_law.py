@@ -107,8 +107,9 @@ def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Said
         dq, filtered = velocity.estimate(told.q, told.dq, normal, scenario.sampling.period, memory.velocity)  # type: ignore[union-attr]
     answer = answered(scenario, told.t, Measurement(told.q, dq), memory.controller, memory.observer)
     command, tube = answer.command, scenario.setting.tube(told.t)
-    no = jnp.zeros((), bool)
-    infeasible = no if isinstance(command.slack, tuple) else jnp.any(command.slack > 0)
+    infeasible = jnp.zeros((), bool)
+    for slack in jax.tree.leaves((command.slack, command.region_slack)):
+        infeasible |= jnp.any(slack > 0)
     said = Said(
         command.tau,
         command.alpha,
