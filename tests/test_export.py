@@ -147,10 +147,31 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
             no = jnp.zeros(q.shape, bool)
             return ij.controllers.Command(x, dq, 0 * q, no, no), ()
 
+    @ij.component
+    class Whole:
+        """A law of whole numbers."""
+
+        gain: ij.Leaf = ij.leaf("1")
+
+        def init(self, q, dq, setting):
+            return ()
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            no = jnp.zeros(q.shape, bool)
+            return ij.controllers.Command(self.gain * jnp.abs((9.0 * q).astype(jnp.int32)), dq, 0 * q, no, no), ()
+
     with pytest.raises(ValueError, match="no fixed length"):
         ij.export(ij.with_parts(base, controller=Endless(1.0)), tmp_path)
+    with pytest.raises(ValueError, match=r"scenario: got .*no abs of kind"):
+        ij.export(ij.with_parts(base, controller=Whole(1.0)), tmp_path)
     with pytest.raises(ValueError, match="period"):
         ij.export(ij.presets.zhang_yan_2024(), tmp_path)
+    several = jax.tree.map(lambda x: jnp.stack([x, x, x]), base)
+    for target in ("c", "wasm"):
+        with pytest.raises(ValueError, match="one scenario"):
+            ij.export(several, tmp_path, target=target)
+    with pytest.raises(ValueError, match="reference"):
+        ij.export(base, tmp_path, target="wasm", reference="told")
     for wrong in ({"target": "rust"}, {"dtype": "half"}, {"name": "int"}, {"name": "a b"}, {"reference": "none"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             ij.export(base, tmp_path, **wrong)
@@ -258,6 +279,15 @@ def test_a_closed_loop_as_an_fmu_is_simulate(lab, tmp_path):
     np.testing.assert_allclose(changed["q"], other.q, atol=1e-10)
     with pytest.raises(Exception, match=r"fmi3DoStep|error"):
         fmpy.simulate_fmu(file, stop_time=0.01, step_size=1e-3, output_interval=1.5e-3)
+
+
+def test_a_sampled_loop_without_noise_as_an_fmu_is_simulate(tmp_path):
+    lab = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
+    ij.export(lab, tmp_path, target="fmu-loop")
+    run = ij.simulate(lab, duration=0.2, dt=1e-3, record_every=10)
+    found = fmpy.simulate_fmu(str(tmp_path / "iblf_loop.fmu"), stop_time=0.2, step_size=1e-3, output_interval=1e-2, output=["q", "tau"])
+    for name in ("q", "tau"):
+        np.testing.assert_allclose(found[name], getattr(run, name), atol=1e-10, err_msg=name)
 
 
 def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):

@@ -19,7 +19,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine.plan import LIMITS
 from iblf_jax.lowering.packed import Shapes, lowered
 from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import Program, UnsupportedError
+from iblf_jax.lowering.program import Program
 from iblf_jax.sensors import Ideal, Measurement
 from iblf_jax.simulation.closed_loop import answered, stepping_observer
 from iblf_jax.simulation.scenario import Scenario
@@ -147,7 +147,8 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
       told_reference: the reference is told at every sample; else it is inside.
 
     Raises:
-      ValueError: the law cannot be written out; the message says why.
+      ValueError: a sensor whose velocity filter is not known.
+      UnsupportedError: the law does not lower; the message says why.
     """
     if not isinstance(scenario.sensor, Ideal) and not hasattr(scenario.sensor, "velocity"):
         kind = type(scenario.sensor).__name__
@@ -175,7 +176,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
       carry: one, what goes from call to call.
 
     Raises:
-      ValueError: it does not lower; the message says why.
+      UnsupportedError: it does not lower; the message says why.
     """
     trees = [jax.tree.structure(x) for x in (scenario, given, carry)]
 
@@ -185,10 +186,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
         return jax.tree.leaves(after), jax.tree.leaves(results)
 
     shapes = [Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry)]
-    try:
-        return written_out(lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program)
-    except UnsupportedError as error:
-        raise checks.fail("scenario", f"what has no C ({error})", "a scenario whose operations are lowered") from None
+    return written_out(lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program)
 
 
 def number_names(tree: Any) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
       method: the integrator.
 
     Raises:
-      ValueError: it cannot be written out; the message says why.
+      UnsupportedError: it does not lower; the message says why.
     """
     dtype = scenario.initial.q.dtype
     settings = Settings(jnp.zeros((), dtype), jnp.zeros((4,), dtype) if has_noise(scenario) else ())
@@ -64,7 +64,8 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
 
     def step(scenario, settings, carry, index):
         state, status = jax.tree.map(lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), carry, like)
-        inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), settings.noise)
+        noise = settings.noise if has_noise(scenario) else () if scenario.sampling is None else jnp.zeros((4,), dtype)
+        inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), noise)
         size = accuracy.places(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(inputs, blank._replace(state=state, status=status), index, method, Form(scalar=True))
