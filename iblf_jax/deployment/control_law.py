@@ -154,11 +154,31 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
         kind = type(scenario.sensor).__name__
         raise checks.fail("scenario.sensor", kind, "one with a field `velocity`, or sensors.Ideal()", "It says how q' follows from q.")
     told = told_at(jnp.zeros((), scenario.initial.q.dtype), scenario.initial.q, told_reference)
-    memory = jax.eval_shape(start, scenario, told)[0]
-    begin = program_of(lambda scenario, told, memory, index: (memory, start(scenario, told)), scenario, told, ())
-    step = program_of(lambda scenario, told, memory, index: sample(scenario, told, memory), scenario, told, memory)
+    dtype = told.q.dtype
+    like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, told)[0])
+    memory = as_floats(like, dtype)
+
+    def first(scenario, told, carry, index):
+        memory, tau = start(scenario, told)
+        return (), (as_floats(memory, dtype), tau)
+
+    def one(scenario, told, carry, index):
+        memory, said = sample(scenario, told, of_floats(carry, like))
+        return as_floats(memory, dtype), said
+
+    begin, step = program_of(first, scenario, told, ()), program_of(one, scenario, told, memory)
     reads = any(node.op == "lane" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n for node in step.nodes)
     return ControlLaw(begin, step, number_names(memory), reads)
+
+
+def as_floats(memory: Any, dtype: Any) -> Any:
+    """A memory whose numbers are all of one type: whole numbers and flags as 0.0, 1.0, ..."""
+    return jax.tree.map(lambda x: x.astype(dtype), memory)
+
+
+def of_floats(memory: Any, like: Any) -> Any:
+    """What `as_floats` was given, of the types of `like`."""
+    return jax.tree.map(lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), memory, like)
 
 
 def told_at(t: jax.Array, q: jax.Array, told_reference: bool) -> Told:
