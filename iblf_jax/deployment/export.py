@@ -17,7 +17,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe
-from iblf_jax.deployment.c_names import RESERVED
+from iblf_jax.deployment.c_names import FILES, RESERVED
 from iblf_jax.deployment.control_law import Told, control_law, sample, start
 from iblf_jax.deployment.cosimulate import check_single, with_period
 from iblf_jax.deployment.fmu import law_fmu, loop_fmu
@@ -108,8 +108,8 @@ def export(
     checks.one_of("reference", reference, ("inside", "told"))
     is_loop = target in ("fmu-loop", "wasm")
     name = ("iblf_loop" if is_loop else "iblf_law") if name is None else name
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in RESERVED:
-        raise checks.fail("name", name, "a C identifier", 'Such as name="arm_law".')
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in RESERVED or name.lower() in FILES:
+        raise checks.fail("name", name, "a C identifier that is no word of C, its headers or CMake", 'Such as name="arm_law".')
     if target.startswith("fmu") and dtype != "double":
         raise checks.fail("dtype", dtype, '"double" for an FMU', "FMI's own numbers are.")
     if is_loop and reference == "told":
