@@ -17,6 +17,7 @@ import members
 import numpy as np
 import pytest
 import wasmtime
+from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
 import iblf_jax as ij
@@ -112,7 +113,7 @@ def test_floats_and_every_step_of_an_observer(base, tmp_path, step):
     against_jax(tmp_path, lab, dtype="float32")
 
 
-HOSTILE = ("*/ int main(void) { return 7; } /*", 'a\\\n#error no "); system(1); //', "??/\n\u00e9\u2028 $name ${joints} %s")
+HOSTILE = ("*/ int main(void) { return 7; } /* ???/", 'a\\\n#error no "); system(1); //', "??/\n\u00e9\u2028 $name ${joints} %s")
 
 
 def test_names_from_files_stay_in_comments(tmp_path):
@@ -129,9 +130,10 @@ def test_names_from_files_stay_in_comments(tmp_path):
     made = against_jax(tmp_path, scenario)
     assert made.stack_bytes < 65_536
     text = (tmp_path / "iblf_law.h").read_text()
-    assert text.isascii() and "int main" in text
+    assert text.isascii() and "int main" in text and "??" not in text
 
 
+@pytest.mark.filterwarnings("ignore:the simulated run")
 def test_what_cannot_be_written_says_why(base, tmp_path):
     @ij.component
     class Endless:
@@ -147,11 +149,41 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
             no = jnp.zeros(q.shape, bool)
             return ij.controllers.Command(x, dq, 0 * q, no, no), ()
 
+    @ij.component
+    class Whole:
+        """A law of whole numbers."""
+
+        gain: ij.Leaf = ij.leaf("1")
+
+        def init(self, q, dq, setting):
+            return ()
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            no = jnp.zeros(q.shape, bool)
+            return ij.controllers.Command(self.gain * jnp.abs((9.0 * q).astype(jnp.int32)), dq, 0 * q, no, no), ()
+
     with pytest.raises(ValueError, match="no fixed length"):
         ij.export(ij.with_parts(base, controller=Endless(1.0)), tmp_path)
+    with pytest.raises(ValueError, match=r"scenario: got .*no abs of kind"):
+        ij.export(ij.with_parts(base, controller=Whole(1.0)), tmp_path)
     with pytest.raises(ValueError, match="period"):
         ij.export(ij.presets.zhang_yan_2024(), tmp_path)
-    for wrong in ({"target": "rust"}, {"dtype": "half"}, {"name": "int"}, {"name": "a b"}, {"reference": "none"}):
+    several = jax.tree.map(lambda x: jnp.stack([x, x, x]), base)
+    for target in ("c", "wasm"):
+        with pytest.raises(ValueError, match="one scenario"):
+            ij.export(several, tmp_path, target=target)
+    with pytest.raises(ValueError, match="reference"):
+        ij.export(base, tmp_path, target="wasm", reference="told")
+    for wrong in (
+        {"target": "rust"},
+        {"dtype": "half"},
+        {"name": "int"},
+        {"name": "a b"},
+        {"name": "selftest"},
+        {"name": "Math"},
+        {"name": "test"},
+        {"reference": "none"},
+    ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             ij.export(base, tmp_path, **wrong)
 
@@ -174,6 +206,28 @@ def test_a_users_law_goes_out_without_a_name_in_files(base, tmp_path):
     made = against_jax(tmp_path, ij.with_parts(base, controller=Proportional([30.0, 20.0])))
     assert "scenario.toml" not in made.files and "scenario.toml" not in made.files["README.md"]
     assert "controller.gain" in [field.path for field in made.parameters.fields]
+
+
+def test_memories_may_hold_whole_numbers_and_flags(base, tmp_path):
+    @ij.component
+    class Counting:
+        """An observer of Euler that waits for its third sample."""
+
+        kf: ij.Leaf = ij.leaf("1/s")
+
+        def init(self, q, dq, model):
+            return jnp.zeros_like(q), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+
+        def estimate(self, t, q, dq, model, state):
+            return jnp.where(state[2], state[0] * state[1].astype(q.dtype), 0.0)
+
+        def derivative(self, t, q, dq, tau, model, state):
+            return tau, state[1], state[2]
+
+        def advance(self, t, q, dq, tau, model, state, period):
+            return state[0] + self.kf * period * tau, state[1] + 1, state[1] > 1
+
+    against_jax(tmp_path, ij.with_parts(base, observer=Counting(0.1), controller=members.LAWS["pd_gravity"]))
 
 
 MAIN = """
@@ -260,6 +314,15 @@ def test_a_closed_loop_as_an_fmu_is_simulate(lab, tmp_path):
         fmpy.simulate_fmu(file, stop_time=0.01, step_size=1e-3, output_interval=1.5e-3)
 
 
+def test_a_sampled_loop_without_noise_as_an_fmu_is_simulate(tmp_path):
+    lab = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
+    ij.export(lab, tmp_path, target="fmu-loop")
+    run = ij.simulate(lab, duration=0.2, dt=1e-3, record_every=10)
+    found = fmpy.simulate_fmu(str(tmp_path / "iblf_loop.fmu"), stop_time=0.2, step_size=1e-3, output_interval=1e-2, output=["q", "tau"])
+    for name in ("q", "tau"):
+        np.testing.assert_allclose(found[name], getattr(run, name), atol=1e-10, err_msg=name)
+
+
 def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     lab = ij.with_parts(lab, sampling=ij.Sampling(2e-3), actuator=ij.actuators.Ideal())
     with warnings.catch_warnings():
@@ -272,6 +335,23 @@ def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     told["time"], told["q"], told["dq"] = run.t, run.measured.q, run.measured.dq
     found = fmpy.simulate_fmu(file, stop_time=0.5, step_size=2e-3, output_interval=2e-3, output=["tau", "f_hat"], input=told)
     np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
+
+    about = fmpy.read_model_description(file)
+    places = {v.name: [v.valueReference] for v in about.modelVariables}
+    fmu = FMU3Slave(guid=about.guid, unzipDirectory=fmpy.extract(file, str(tmp_path / "unzipped")), modelIdentifier="iblf_law")
+    fmu.instantiate()
+    fmu.enterInitializationMode()
+    fmu.setFloat64(places["q"], [0.7, 0.75])
+    still = fmu.getFloat64(places["tau"], nValues=2)
+    np.testing.assert_allclose(still, lab.model.gravity(jnp.asarray([0.7, 0.75])), rtol=1e-12)
+    fmu.exitInitializationMode()
+    fmu.setFloat64(places["q"], [np.nan, 0.75])
+    fmu.doStep(0.0, 2e-3)
+    assert fmu.getFloat64(places["tau"], nValues=2) == still and fmu.getFloat64(places["status"]) == [1.0]
+    fmu.setFloat64(places["q"], [0.7, 0.75])
+    fmu.doStep(2e-3, 2e-3)
+    assert fmu.getFloat64(places["tau"], nValues=2) != still and fmu.getFloat64(places["status"]) == [0.0]
+    fmu.freeInstance()
 
 
 def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
@@ -300,6 +380,10 @@ def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
     found = run()
     np.testing.assert_allclose(found["q"], expected.q, atol=1e-10)
     np.testing.assert_allclose(found["tau"], expected.tau, atol=1e-10)
+
+    loop["start"](store)
+    for steps, recorded in ((5, 1), (5, 0), (1, 1)):
+        assert loop["run"](store, steps, 10) == recorded, "steps 0 and 10 of those from 0 to 10"
 
     k1 = next(x for x in table["parameters"] if x["path"] == "controller.k1")
     put(loop["parameters"](store) + 8 * k1["offset"], [3.0, 1.5])

@@ -25,11 +25,23 @@ RESERVED = frozenset(
         r"\w+",
         """auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return
         short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof bool true false class new delete
-        this template namespace private public protected virtual operator using try catch throw export import
-        real integer F I FN NAN INFINITY SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux unix""",
+        this template typename namespace private public protected friend virtual explicit mutable operator using try catch throw export
+        import and and_eq bitand bitor compl not not_eq or or_eq xor xor_eq alignas alignof constexpr decltype noexcept nullptr
+        static_assert thread_local typeid wchar_t const_cast dynamic_cast reinterpret_cast static_cast concept requires
+        real integer F I FN NULL NAN INFINITY SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux unix""",
     )
 )
 """Words of C and C++, of their headers, and of the generated code."""
+FILES = frozenset(
+    re.findall(
+        r"\w+",
+        """selftest vectors
+        assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef stdint stdio stdlib
+        string tgmath time wchar wctype
+        all clean edit_cache help install m package package_source preinstall rebuild_cache test""",
+    )
+)
+"""What no file may be called, in small letters: those beside it, headers of C, and targets and libraries of CMake."""
 
 
 def identifier(name: str) -> str:
@@ -40,7 +52,7 @@ def identifier(name: str) -> str:
 
 def comment(text: str) -> str:
     """Text that can stand in a C comment, whatever is in it: ASCII without the marks of comments, trigraphs or a line's end."""
-    return json.dumps(text)[1:-1].replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("\\", "|")
+    return re.sub(r"\?(?=\?)", "? ", json.dumps(text)[1:-1].replace("*/", "* /").replace("/*", "/ *").replace("\\", "|"))
 
 
 def number(x: float, is_float: bool) -> str:

@@ -19,7 +19,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine.plan import LIMITS
 from iblf_jax.lowering.packed import Shapes, lowered
 from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import Program, UnsupportedError
+from iblf_jax.lowering.program import Program
 from iblf_jax.sensors import Ideal, Measurement
 from iblf_jax.simulation.closed_loop import answered, stepping_observer
 from iblf_jax.simulation.scenario import Scenario
@@ -148,17 +148,38 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
       told_reference: the reference is told at every sample; else it is inside.
 
     Raises:
-      ValueError: the law cannot be written out; the message says why.
+      ValueError: a sensor whose velocity filter is not known.
+      UnsupportedError: the law does not lower; the message says why.
     """
     if not isinstance(scenario.sensor, Ideal) and not hasattr(scenario.sensor, "velocity"):
         kind = type(scenario.sensor).__name__
         raise checks.fail("scenario.sensor", kind, "one with a field `velocity`, or sensors.Ideal()", "It says how q' follows from q.")
     told = told_at(jnp.zeros((), scenario.initial.q.dtype), scenario.initial.q, told_reference)
-    memory = jax.eval_shape(start, scenario, told)[0]
-    begin = program_of(lambda scenario, told, memory, index: (memory, start(scenario, told)), scenario, told, ())
-    step = program_of(lambda scenario, told, memory, index: sample(scenario, told, memory), scenario, told, memory)
+    dtype = told.q.dtype
+    like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, told)[0])
+    memory = as_floats(like, dtype)
+
+    def first(scenario, told, carry, index):
+        memory, tau = start(scenario, told)
+        return (), (as_floats(memory, dtype), tau)
+
+    def one(scenario, told, carry, index):
+        memory, said = sample(scenario, told, of_floats(carry, like))
+        return as_floats(memory, dtype), said
+
+    begin, step = program_of(first, scenario, told, ()), program_of(one, scenario, told, memory)
     reads = any(node.op == "lane" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n for node in step.nodes)
     return ControlLaw(begin, step, number_names(memory), reads)
+
+
+def as_floats(memory: Any, dtype: Any) -> Any:
+    """A memory whose numbers are all of one type: whole numbers and flags as 0.0, 1.0, ..."""
+    return jax.tree.map(lambda x: x.astype(dtype), memory)
+
+
+def of_floats(memory: Any, like: Any) -> Any:
+    """What `as_floats` was given, of the types of `like`."""
+    return jax.tree.map(lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), memory, like)
 
 
 def told_at(t: jax.Array, q: jax.Array, told_reference: bool) -> Told:
@@ -176,7 +197,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
       carry: one, what goes from call to call.
 
     Raises:
-      ValueError: it does not lower; the message says why.
+      UnsupportedError: it does not lower; the message says why.
     """
     trees = [jax.tree.structure(x) for x in (scenario, given, carry)]
 
@@ -186,10 +207,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
         return jax.tree.leaves(after), jax.tree.leaves(results)
 
     shapes = [Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry)]
-    try:
-        return written_out(lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program)
-    except UnsupportedError as error:
-        raise checks.fail("scenario", f"what has no C ({error})", "a scenario whose operations are lowered") from None
+    return written_out(lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program)
 
 
 def number_names(tree: Any) -> tuple[str, ...]:

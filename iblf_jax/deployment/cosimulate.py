@@ -85,9 +85,8 @@ def cosimulate(
     """
     if integrator is not None:
         checks.one_of("integrator", integrator, INTEGRATORS)
+    check_single(scenario)
     scenario = canonical(with_period(scenario, period))
-    if not checks.is_concrete(scenario):
-        raise checks.fail("scenario", "traced values", "numbers", "MuJoCo has no derivatives: call this outside of jit, vmap and grad.")
     seed, throw = checks.seed(seed), checks.flag("throw", throw)
     names = tuple(getattr(scenario.plant, "joints", ()))
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
@@ -116,17 +115,23 @@ def _film_writer(path: str | Path) -> Callable:
     return partial(film_run, path=film_path(path, "film"))
 
 
-def with_period(scenario: Scenario, period: float | None) -> Scenario:
-    """The scenario, its law sampled with this period."""
+def check_single(scenario: Scenario) -> None:
+    """Raises ValueError for what is no scenario, a batch of them, or one of traced values."""
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
     if np.ndim(scenario.initial.q) != 1:
         raise checks.fail(
             "scenario", f"a batch, initial.q of shape {np.shape(scenario.initial.q)}", "one scenario", "Call it once for each."
         )
+    if not checks.is_concrete(scenario):
+        raise checks.fail("scenario", "traced values", "numbers", "Call this outside of jit, vmap and grad.")
+
+
+def with_period(scenario: Scenario, period: float | None) -> Scenario:
+    """The scenario, its law sampled with this period."""
     if period is None:
         if scenario.sampling is None:
-            raise checks.fail("period", None, "the period of the law [s]", "MuJoCo's robot is driven by a sampled law: period=1e-3.")
+            raise checks.fail("period", None, "the period of the law [s]", "Outside of the package a law is sampled: period=1e-3.")
         return scenario
     period = checks.positive_number("period", period, "s")
     if scenario.sampling is None:

@@ -17,15 +17,16 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe
-from iblf_jax.deployment.c_names import RESERVED
+from iblf_jax.deployment.c_names import FILES, RESERVED
 from iblf_jax.deployment.control_law import Told, control_law, sample, start
-from iblf_jax.deployment.cosimulate import with_period
+from iblf_jax.deployment.cosimulate import check_single, with_period
 from iblf_jax.deployment.fmu import law_fmu, loop_fmu
 from iblf_jax.deployment.loop_program import loop_program
 from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, operations_of, told, written
 from iblf_jax.deployment.write_loop import loop_files, wasm_files
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.files.scenario import scenario_to_toml
+from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -107,17 +108,23 @@ def export(
     checks.one_of("reference", reference, ("inside", "told"))
     is_loop = target in ("fmu-loop", "wasm")
     name = ("iblf_loop" if is_loop else "iblf_law") if name is None else name
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in RESERVED:
-        raise checks.fail("name", name, "a C identifier", 'Such as name="arm_law".')
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in RESERVED or name.lower() in FILES:
+        raise checks.fail("name", name, "a C identifier that is no word of C, its headers or CMake", 'Such as name="arm_law".')
     if target.startswith("fmu") and dtype != "double":
         raise checks.fail("dtype", dtype, '"double" for an FMU', "FMI's own numbers are.")
+    if is_loop and reference == "told":
+        raise checks.fail("reference", reference, '"inside" for a closed loop', "Only a law alone is told its reference.")
+    check_single(scenario)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
     scenario = canonical(astype(scenario, _available(dtype)))
-    if not checks.is_concrete(scenario):
-        raise checks.fail("scenario", "traced values", "numbers", "Call this outside of jit, vmap and grad.")
     folder = Path(folder)
-    return _loop(scenario, folder, target, name, dt, method, seed) if is_loop else _law(scenario, folder, target, name, reference == "told")
+    try:
+        if is_loop:
+            return _loop(scenario, folder, target, name, dt, method, seed)
+        return _law(scenario, folder, target, name, reference == "told")
+    except UnsupportedError as error:
+        raise checks.fail("scenario", f"what has no C ({error})", "a scenario whose operations are lowered") from None
 
 
 def _law(scenario: Scenario, folder: Path, target: str, name: str, is_told: bool) -> Exported:

@@ -47,7 +47,7 @@ def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
             name, _, power = word.partition("^")
             if name == "1":
                 continue
-            if name not in BASE or not (power or "1").lstrip("-").isdigit():
+            if name not in BASE or not (power or "1").lstrip("-").isdecimal():
                 return None
             for k, exponent in enumerate(BASE[name]):
                 found[k] += sign * int(power or 1) * exponent
@@ -94,6 +94,9 @@ def model_description(name: str, title: str, token: str, step: float, variables:
     for unit, powers in sorted(known.items()):
         base: dict[str, Any] = {k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p}
         Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", **base)
+    categories = Xml.SubElement(root, "LogCategories")
+    for category in ("logStatusWarning", "logStatusError"):
+        Xml.SubElement(categories, "Category", name=category)
     Xml.SubElement(root, "DefaultExperiment", startTime="0", stopTime="20", stepSize=repr(step))
     listed = Xml.SubElement(root, "ModelVariables")
     Xml.SubElement(

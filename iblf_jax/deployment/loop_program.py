@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.deployment.control_law import program_of
+from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.engine.step import Form, Inputs, advance, start
 from iblf_jax.lowering.program import Program
 from iblf_jax.simulation import accuracy
@@ -50,27 +50,25 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
       method: the integrator.
 
     Raises:
-      ValueError: it cannot be written out; the message says why.
+      UnsupportedError: it does not lower; the message says why.
     """
     dtype = scenario.initial.q.dtype
     settings = Settings(jnp.zeros((), dtype), jnp.zeros((4,), dtype) if has_noise(scenario) else ())
     like = (initial_state(scenario), jnp.int32(0))
 
-    def floats(carry):
-        return jax.tree.map(lambda x: x.astype(dtype), carry)
-
     def first(scenario, settings, carry, index):
-        return (), floats((initial_state(scenario), jnp.int32(0)))
+        return (), as_floats((initial_state(scenario), jnp.int32(0)), dtype)
 
     def step(scenario, settings, carry, index):
-        state, status = jax.tree.map(lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), carry, like)
-        inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), settings.noise)
+        state, status = of_floats(carry, like)
+        noise = settings.noise if has_noise(scenario) else () if scenario.sampling is None else jnp.zeros((4,), dtype)
+        inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), noise)
         size = accuracy.places(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(inputs, blank._replace(state=state, status=status), index, method, Form(scalar=True))
         told = [getattr(done.sample, OF_SAMPLE.get(name, name)) for name in OUTPUTS]
-        return floats((done.carry.state, done.carry.status)), (*told, done.carry.status.astype(dtype))
+        return as_floats((done.carry.state, done.carry.status), dtype), (*told, done.carry.status.astype(dtype))
 
-    shapes = jax.eval_shape(floats, like)
+    shapes = as_floats(like, dtype)
     begin = program_of(first, scenario, settings, ())
     return Loop(begin, program_of(step, scenario, settings, shapes), sum(x.size for x in jax.tree.leaves(shapes)))

@@ -210,7 +210,9 @@ def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> di
     v, reads, period = law.vectors, law.programs.reads_velocity, float(law.scenario.sampling.period)  # type: ignore[union-attr]
     of = "".join(f", {x}[k]" for x in REFERENCE) if v.reference else ""
     told_velocity = "It is told positions and velocities."
-    row = "\n| `scenario.toml` | what it was written from; `ij.export` with it writes this again |"
+    dtype, where = "float" if law.is_float else "double", "told" if v.reference else "inside"
+    again = f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype} --reference {where}"
+    row = f"\n| `scenario.toml` | what it was written from: `{again}` writes it again |"
     values |= {
         "samples": len(v.q),
         "duration": f"{len(v.q) * period:g}",

@@ -18,7 +18,7 @@
 
 typedef void *instance_t;
 typedef void (*log_t)(void *environment, int status, const char *category, const char *message);
-enum { OK = 0, ERROR = 3 };
+enum { OK = 0, WARNING = 1, ERROR = 3 };
 enum { INPUTS = ${inputs}, OUTPUTS = ${outputs}, VARIABLES = ${variables}, PARAMETERS = ${parameter_count} };
 static const char TOKEN[] = "${token}";
 
@@ -33,6 +33,7 @@ typedef struct {
   ${name}_state s;
   double time;
   int64_t index;
+  bool initializing;
   void *environment;
   log_t log;
 } fmu;
@@ -60,6 +61,7 @@ ${starts}  memset(f->outputs, 0, sizeof f->outputs);
   memset(&f->s, 0, sizeof f->s);
   f->time = 0.0;
   f->index = 0;
+  f->initializing = false;
 }
 
 EXPORT const char *fmi3GetVersion(void) { return "3.0"; }
@@ -86,11 +88,14 @@ EXPORT int fmi3EnterInitializationMode(instance_t i, bool has_tolerance, double 
   fmu *f = (fmu *)i;
   (void)has_tolerance; (void)tolerance; (void)has_end; (void)end;
   f->time = begin;
+  f->initializing = true;
   return OK;
 }
 
 EXPORT int fmi3ExitInitializationMode(instance_t i) {
-  return begin((fmu *)i);
+  fmu *f = (fmu *)i;
+  f->initializing = false;
+  return begin(f);
 }
 
 EXPORT int fmi3Terminate(instance_t i) { (void)i; return OK; }
@@ -100,6 +105,7 @@ EXPORT int fmi3Reset(instance_t i) { restart((fmu *)i); return OK; }
 EXPORT int fmi3GetFloat64(instance_t i, const uint32_t *references, size_t n, double *values, size_t count) {
   fmu *f = (fmu *)i;
   size_t k, done = 0;
+  if (f->initializing && begin(f) != OK) return ERROR;
   for (k = 0; k < n; k++) {
     const uint32_t v = references[k];
     const size_t size = v == 0 ? 1 : v <= VARIABLES ? (size_t)variable[v - 1].size : count + 1;
@@ -127,14 +133,19 @@ EXPORT int fmi3DoStep(instance_t i, double now, double step, bool no_return, boo
   fmu *f = (fmu *)i;
   const double wanted = step / STEP, count = floor(wanted + 0.5);
   double k;
+  int status = OK;
   (void)no_return;
   *event = *terminate = *early = false;
   *reached = now;
   if (!(count >= 1.0) || fabs(wanted - count) > 1e-6 * count) return failed(f, "a step must be a whole number of " STEP_TEXT " s");
-  for (k = 0; k < count; k++)
-    if (advance(f) != OK) return failed(f, "an input or a result is no number");
+  for (k = 0; k < count; k++) {
+    const int here = advance(f);
+    if (here == ERROR) return failed(f, "a result is no number");
+    if (here != OK) status = here;
+  }
   f->time = *reached = now + step;
-  return told(f);
+  told(f);
+  return status;
 }
 
 EXPORT int fmi3GetFMUState(instance_t i, void **state) {

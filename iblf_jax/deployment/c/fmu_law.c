@@ -1,25 +1,27 @@
 #define STEP ${step}
 #define STEP_TEXT "${step}"
 
-static int told(fmu *f) {
+static void told(fmu *f) {
   memcpy(f->outputs, f->s.tau, sizeof f->s.tau);
   memcpy(f->outputs + ${joints}, f->s.alpha, sizeof f->s.alpha);
   memcpy(f->outputs + 2 * ${joints}, f->s.f_hat, sizeof f->s.f_hat);
-  return OK;
 }
 
 static int begin(fmu *f) {
   const double *q = f->inputs;
   if (${name}_init(&f->p, &f->s, q, q + ${joints}${reference}) != 0) return failed(f, "an input is no number");
-  return told(f);
+  told(f);
+  return OK;
 }
 
-/* A sample: the torque of the period that begins now, from the inputs as they are. */
+/* A sample: the torque of the period that begins now, from the inputs as they are; the last good one, and a warning, where one is no number. */
 static int advance(fmu *f) {
   const double *q = f->inputs;
   double tau[${joints}];
   const int status = ${name}_step(&f->p, &f->s, STEP * (double)f->index, q, ${dq}${reference}, tau);
   f->index += 1;
   f->outputs[3 * ${joints}] = (double)status;
-  return status & ${upper}_NOT_FINITE ? ERROR : OK;
+  if ((status & ${upper}_NOT_FINITE) == 0) return OK;
+  if (f->log) f->log(f->environment, WARNING, "logStatusWarning", "an input or a result is no number: the torque is the last good one");
+  return WARNING;
 }

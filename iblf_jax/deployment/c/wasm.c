@@ -21,13 +21,14 @@ EXPORT(defaults) void module_defaults(void) { parameters = ${name}_defaults; }
 /* The state at t = 0, by the parameters as they are now. */
 EXPORT(start) void module_start(void) { ${name}_start(&parameters, settings, &state); }
 
-/* Makes so many steps; writes every `every`-th into the records, from the first on, and returns how many. */
+/* Makes so many steps; writes those whose number since the start is a multiple of `every` into the records, and returns how many. */
 EXPORT(run) int module_run(int steps, int every) {
   int k, row = 0;
   ${name}_real told[${upper}_TOLD];
   for (k = 0; k < steps && row < ROWS; k++) {
+    const int is_due = every > 0 && state.index % every == 0;
     ${name}_step(&parameters, settings, &state, told);
-    if (k % every == 0) memcpy(records + row++ * ${upper}_TOLD, told, sizeof told);
+    if (is_due) memcpy(records + row++ * ${upper}_TOLD, told, sizeof told);
   }
   return row;
 }
