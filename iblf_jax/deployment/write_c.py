@@ -33,8 +33,8 @@ LOOKUP = """static F f_lookup(const I *table, I size, I i) {
 """
 FRAME = 256
 """Bytes of a call besides its numbers, at most about."""
-ROUNDS_FOR = 200_000
-"""Calls that the self-test times, about."""
+ROUNDS_FOR = 10**8
+"""Operations that the self-test times, about."""
 
 
 def filled(template: str, values: dict[str, Any]) -> str:
@@ -216,7 +216,7 @@ def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> di
     values |= {
         "samples": len(v.q),
         "duration": f"{len(v.q) * period:g}",
-        "rounds": max(1, ROUNDS_FOR // len(v.q)),
+        "rounds": max(1, ROUNDS_FOR // (len(v.q) * law.programs.sample.size)),
         "tolerance": "1e-4" if law.is_float else "1e-10",
         "dq_of_k": "dq[k]" if reads else "NULL",
         "dq_of_0": "dq[0]" if reads else "NULL",
