@@ -53,11 +53,14 @@ def test_the_arm_of_the_examples_is_the_one_that_readme_speaks_of():
 
 
 def test_files_that_the_documentation_names_are_there():
-    texts = [(ROOT / "README.md").read_text(encoding="utf-8")]
+    texts = [
+        (ROOT / "README.md").read_text(encoding="utf-8"),
+        *(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md")),
+    ]
     for path in (ROOT / "notebooks").glob("*.ipynb"):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         texts += ["".join(cell["source"]) for cell in cells]
     named = {name for text in texts for name in re.findall(r"examples/[\w.]+\w", text)}
     assert {f"examples/{name}" for name in (*COMMANDS, "arm.urdf")} - named <= {"examples/arm.toml"}
-    assert all((ROOT / name).is_file() for name in named)
+    assert all((ROOT / name).exists() for name in named)
     assert not [text for text in texts if re.search(r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\[", text)]

@@ -16,8 +16,14 @@ import reference
 
 import iblf_jax as ij
 
-PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "```python" in page.read_text() and page.name != "other_solvers.md"]
+PAGES = [
+    page
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    if "```python" in page.read_text() and page.name != "other_solvers.md"
+]
 """Pages with Python; `test_vector_field` has the one about other solvers."""
+LONG = pytest.mark.release
+"""The guide takes two minutes of a processor; its short forms are the other pages."""
 
 
 def test_there_are_examples():
@@ -32,8 +38,9 @@ def test_a_script_of_the_gallery_makes_its_page(script):
     assert gallery.is_made(script)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=LONG if page.stem == "guide" else pytest.mark.slow) for page in PAGES], ids=lambda page: page.stem
+)
 def test_every_block_of_a_page_runs(page, tmp_path, monkeypatch):
     if page.stem == "sweep_on_a_cluster":
         pytest.importorskip("zarr")

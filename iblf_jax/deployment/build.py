@@ -28,15 +28,13 @@ def c_compiler() -> list[str]:
             return [path]
     if not wanted and importlib.util.find_spec("ziglang"):
         return zig()
-    raise ToolchainError(
-        "there is no C compiler" + (f" {wanted!r} ($CC)" if wanted else ' (cc, gcc, clang; pip install "iblf_jax[export]" has one)')
-    )
+    raise ToolchainError("there is no C compiler" + (f" {wanted!r} ($CC)" if wanted else " (cc, gcc, clang; pip install ziglang has one)"))
 
 
 def zig() -> list[str]:
     """The command of ziglang's C compiler; ToolchainError if it is not installed."""
     if not importlib.util.find_spec("ziglang"):
-        raise ToolchainError('ziglang is not installed: pip install "iblf_jax[export]"')
+        raise ToolchainError('ziglang is not installed: pip install ziglang, or ".[export]" in a clone')
     return [sys.executable, "-m", "ziglang", "cc"]
 
 
