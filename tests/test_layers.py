@@ -20,6 +20,7 @@ LAYER_OF = {
 
 UPWARD = {
     "certificates/result.py": {"plotting"},
+    "identification/result.py": {"plotting"},
     "simulation/results.py": {"files", "plotting"},
     "studies/comparison.py": {"plotting"},
     "studies/study.py": {"plotting"},
@@ -33,7 +34,7 @@ ONLY_IN = {
     "optax": ("tuning",),
     "argparse": ("cli",),
     "mujoco": ("robots", "deployment"),
-    "xarray": ("files", "studies", "cli", "plotting"),
+    "xarray": ("files", "studies", "identification", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""
 
