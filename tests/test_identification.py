@@ -10,9 +10,13 @@ import json
 
 import numpy as np
 import pytest
+import tomli_w
 import xarray
+from conftest import ROOT
 
 import iblf_jax as ij
+from iblf_jax import cli
+from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z
 from iblf_jax.identification.log import read
@@ -359,3 +363,28 @@ def test_joint_draws_in_a_file_and_in_a_design(tmp_path):
         study_from_dict({**data, "perturbations": {"plant.mass[0]": {**table["plant.mass[0]"], "group": 3}}}, "study")
     with pytest.raises(ValueError, match="joint_normal: rows"):
         ij.joint_normal([1.0, 2.0], [1.0, 2.0], "g")
+
+
+def test_the_command_line_identifies_and_writes_what_it_found(tmp_path, capsys):
+    out = tmp_path / "known"
+    assert cli.main(["identify", str(ROOT / "examples" / "identify.toml"), "--out", str(out)]) == 0, capsys.readouterr().err
+    assert "6 of 6 numbers told" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {"scenario.toml", "identification.json", "identification.html", "identification.png"}
+    found = ij.load_scenario(out / "scenario.toml")
+    np.testing.assert_allclose(found.model.mass, MASS, rtol=2e-3)
+    np.testing.assert_allclose(json.loads((out / "identification.json").read_text())["numbers"][1]["value"], found.plant.mass[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"identify": {"parameters": ["robot.mass"]}}, r"identify.log: got None, expected the path of a .csv or .nc file"),
+        ({"identify": {"log": "log.csv"}}, r"identify.parameters: got nothing"),
+        ({"identify": {"log": "log.csv", "parameters": ["robot.mass"], "windw": 1.0}}, r"identify.windw: got an unknown key"),
+        ({"identify": {"log": "log.csv", "parameters": ["robot.mass"]}, "limits": {"robot": {"mass": 3.0}}}, r"limits.robot.mass: got 3.0"),
+    ],
+)
+def test_a_wrong_file_is_told(change, words, tmp_path):
+    (tmp_path / "identify.toml").write_text(tomli_w.dumps({"preset": "zhang_yan_2024"} | change))
+    with pytest.raises(ValueError, match=words):
+        load_identification_file(tmp_path / "identify.toml")

@@ -121,6 +121,11 @@ class Identification:
         """What each number is called, (p,)."""
         return tuple(number.name for number in self.numbers)
 
+    @property
+    def wanted(self) -> tuple[Number, ...]:
+        """The numbers that were asked for."""
+        return self.numbers[: sum(math.prod(np.shape(paths.get(self.start, path))) for path in self.paths[: self.asked])]
+
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
         """Path -> value in the leaf's unit, NaN where the log cannot tell it."""
@@ -153,8 +158,7 @@ class Identification:
 
         x = value + L w,   L L^T = covariance,   w standard normal, the same for all paths
         """
-        asked = sum(math.prod(np.shape(paths.get(self.start, path))) for path in self.paths[: self.asked])
-        told = [i for i, number in enumerate(self.numbers[:asked]) if number.error is not None and number.verdict == "told"]
+        told = [i for i, number in enumerate(self.wanted) if number.error is not None and number.verdict == "told"]
         size, axes = np.linalg.eigh(self.covariance[np.ix_(told, told)])
         factor = np.zeros((len(self.numbers), len(told)))
         factor[told] = axes * np.sqrt(np.maximum(size, 0.0))
