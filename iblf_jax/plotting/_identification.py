@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -47,22 +47,18 @@ def identification(known: Identification) -> Figure:
 def _numbers(axes: Axes, known: Identification) -> None:
     """Change of each number from its start, in scales, with three standard errors."""
     chosen = known.numbers[:MOST_ROWS]
+    beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": _style.size(7)}
     for i, (number, scale) in enumerate(zip(chosen, known.scales, strict=False)):
         if number.value is None or number.error is None:
             axes.plot(0.0, i, marker="x", color=_style.alarm(), linestyle="none")
-            axes.annotate("cannot be told", (0.0, i), xytext=(8, 0), textcoords="offset points", va="center", color=_style.alarm(),
-                          fontsize=_style.size(7))  # fmt: skip
+            axes.text(1.01, i, "cannot be told", color=_style.alarm(), **beside)
             continue
         change, error = (number.value - number.start) / scale, 3.0 * number.error / scale
         axes.errorbar(change, i, xerr=error, fmt="o", markersize=3.5, capsize=2, color=_style.colour(0))
-        words = f"{number.value:.4g} {number.unit}"
-        away = (8, 0) if change < 0.0 else (-8, 0)
-        axes.annotate(words, (change + np.sign(away[0]) * error, i), xytext=away, textcoords="offset points", va="center",
-                      ha="left" if change < 0 else "right", fontsize=_style.size(7))  # fmt: skip
+        axes.text(1.01, i, f"{number.value:.4g} $\\pm$ {number.error:.1g} {number.unit}", **beside)
     axes.axvline(0.0, color=_style.bound(), linewidth=0.8)
     axes.set_yticks(range(len(chosen)), [plain(number.name) for number in chosen], fontsize=_style.size(7))
     axes.set_ylim(len(chosen) - 0.5, -0.5)
-    axes.margins(x=0.25)
     axes.set_xlabel("value less start, in the number's scale, with three standard errors")
 
 
