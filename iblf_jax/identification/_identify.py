@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -85,8 +86,9 @@ def identify(
     priors = {} if priors is None else checks.mapping("priors", priors, '{"plant.mass": (2.0, 0.1)}')
     if delay is not None and not abs(float(checks.as_floats("delay", delay))) <= LARGEST_DELAY:
         raise checks.fail("delay", delay, f"a time of at most {LARGEST_DELAY:g} s")
+    given = canonical(scenario)
     with jax.enable_x64(True):  # noise of 1e-4 rad leaves no room for the rounding of float32
-        start = canonical(astype(canonical(scenario), "float64"))
+        start = canonical(astype(given, "float64"))
         wanted = with_widths(start, paths) if checks.flag("widths", widths) else paths
         replayed, c = coordinates(start, wanted, limits)
         if c.delay and start.sampling is None:
@@ -110,7 +112,7 @@ def identify(
         before = replay.best_starts(first, noise)[1]
         scale = np.append(coordinate_scales(c, guess.scale), OFFSET)
         end = replay.refined(np.append(guess.z, guess.delay), ends, scale, noise, prior, iterations)
-        return judged(
+        found = judged(
             start,
             c,
             w,
@@ -124,6 +126,7 @@ def identify(
             tuple(x.name for x in logs),
             time.monotonic() - begin,
         )
+    return dataclasses.replace(found, scenario=astype(found.scenario, given.initial.q.dtype), start=given)
 
 
 def _is_continuous(log: Any) -> bool:

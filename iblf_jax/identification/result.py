@@ -10,7 +10,6 @@ import os
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from iblf_jax.core import checks, tables
@@ -417,8 +416,8 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
 
 
 def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) -> tuple[Scenario, list[str]]:
-    """The scenario with the new numbers, in its own type."""
-    dtype, scenario, notes = start.initial.q.dtype, start, []
+    """The scenario with the new numbers."""
+    scenario, notes = start, []
     for path, place in zip(c.paths, c.places, strict=True):
         own = x[place.start : place.start + place.size].reshape(place.shape)
         targets = ["plant" + path[5:], "model" + path[5:]] if path.startswith(("robot.", "plant.")) else [path]
@@ -431,4 +430,4 @@ def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) 
                 notes.append(f"The model has no {target}: its number is the plant's alone.")
     if c.delay:
         scenario = with_parameters(scenario, {DELAY: max(delay, 0.0)})
-    return jax.tree.map(lambda a: a.astype(dtype) if hasattr(a, "astype") else a, scenario), notes
+    return scenario, notes
