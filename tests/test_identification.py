@@ -84,6 +84,23 @@ def known(scenario, log):
     return ij.identify(scenario, log, PATHS)
 
 
+@pytest.fixture(scope="module")
+def heavier(scenario):
+    """The scenario with the plant's true masses."""
+    return ij.with_parameters(scenario, {"plant.mass": MASS})
+
+
+@pytest.fixture(scope="module")
+def run(heavier):
+    """The paper's motion of it."""
+    return ij.simulate(heavier, duration=6.0, dt=1e-3)
+
+
+def counted(run, rows=slice(None)):
+    """A log of rows of a run, in counts."""
+    return {"t": np.asarray(run.t)[rows], "q": COUNT * np.round(np.asarray(run.q)[rows] / COUNT), "tau": np.asarray(run.tau)[rows]}
+
+
 def z_scores(known, truth):
     return np.concatenate([(known.values[path] - x) / known.standard_errors[path] for path, x in truth.items()])
 
@@ -150,20 +167,45 @@ def test_a_delay_between_torque_and_position_is_found(scenario, log):
     assert np.max(np.abs(z_scores(known, TRUTH))) < 5.0
 
 
-def test_gaps_irregular_times_and_several_logs(scenario, log, known):
-    """Rows that are left out are gaps; a log in two halves is two logs."""
-    rng = np.random.default_rng(1)
-    rows = np.concatenate([np.arange(0, 700), np.arange(760, len(log["t"]))])
-    first = {name: x[rows[:700]] for name, x in log.items()}
-    second = {name: x[rows[700:]] for name, x in log.items()}
-    logs = read([first, second, {name: x[rows] for name, x in log.items()}], 2)
-    assert [len(one.stretches) for one in logs] == [1, 1, 2]
-    jittered = log["t"] + rng.uniform(-0.3, 0.3, len(log["t"])) * np.median(np.diff(log["t"]))
-    torque = Torque(read({**log, "t": jittered}, 2)[0], held=True)
-    np.testing.assert_allclose(torque.means(jittered, 0.0), log["tau"][:-1], rtol=1e-9, atol=1e-9)
+def test_irregular_times_and_a_gap(scenario, run, rng):
+    """Rows left out at random, and a third of a second at once; the torque of a continuous loop is interpolated."""
+    rows = np.sort(rng.choice(6000, 3500, replace=False))
+    log = counted(run, rows[(rows < 2000) | (rows > 2300)])
+    assert [len(one.stretches) for one in read(log, 2)] == [2]
+    known = ij.identify(scenario, log, ["robot.mass"], torque="interpolated", held_out=0)
+    assert np.max(np.abs(z_scores(known, {"robot.mass": MASS}))) < 4.0
+    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
+    assert all(np.isnan(one.held_back) for one in known.fit)
+
+
+def test_a_run_is_a_log(scenario, run):
+    """A Rollout of a continuous loop: without noise, the numbers come back."""
+    known = ij.identify(scenario, run, ["robot.mass"])
+    np.testing.assert_allclose(known.values["robot.mass"], MASS, rtol=1e-5)
+
+
+def test_several_logs_and_one_that_is_held_back(scenario, log):
+    first, second = ({name: x[part] for name, x in log.items()} for part in (slice(0, 700), slice(760, None)))
     both = ij.identify(scenario, [first, second], PATHS, held_out={name: x[:600] for name, x in log.items()})
     assert np.max(np.abs(z_scores(both, TRUTH))) < 4.0
     assert np.sum(~both.kept) == 4 and len(both.logs) == 3
+
+
+def test_the_torque_of_a_step_is_its_mean(log):
+    """Held, it is the logged number whatever the times are; late by half a step, that of two samples."""
+    jittered = log["t"] + np.random.default_rng(1).uniform(-1e-3, 1e-3, len(log["t"]))
+    torque = Torque(read({**log, "t": jittered}, 2)[0], held=True)
+    np.testing.assert_allclose(torque.means(jittered, 0.0), log["tau"][:-1], rtol=1e-9, atol=1e-9)
+    late = Torque(read(log, 2)[0], held=True).means(log["t"], 2e-3)
+    np.testing.assert_allclose(late[1:], 0.5 * (log["tau"][:-2] + log["tau"][1:-1]), rtol=1e-9, atol=1e-9)
+
+
+def test_a_delay_of_the_command_is_a_leaf(scenario, log):
+    commanded = {name: (np.roll(x, -1, axis=0) if name == "tau" else x)[:-1] for name, x in log.items()}  # one sample before it acts
+    lab = ij.with_parts(scenario, sampling=ij.Sampling(4e-3, delay=1e-3))
+    known = ij.identify(lab, commanded, [*PATHS, "sampling.delay"], widths=False)
+    assert abs(float(known.scenario.sampling.delay) - 4e-3) < 5 * known.delay_error < 1e-3
+    assert set(known.values) == set(PATHS)
 
 
 def test_outliers_are_borne_by_huber(scenario, log):
@@ -323,15 +365,12 @@ def test_whiteness_tells_noise_from_what_a_model_lacks(rng):
     assert statistics.whiteness(noise + np.cumsum(0.3 * rng.normal(size=noise.shape), axis=1)).p < 1e-6
 
 
-def test_an_excitation_is_inside_its_bounds_and_tells_more(scenario):
+def test_an_excitation_is_inside_its_bounds_and_tells_more(scenario, heavier, run):
     best = ij.excitation(scenario, PATHS, duration=6.0, iterations=15)
-    run = ij.simulate(ij.with_parts(scenario, reference=best), duration=6.0, dt=1e-3)
-    assert int(run.status) == 0 and float(np.min(run.metrics.margin)) > 0
-    usual = ij.simulate(scenario, duration=6.0, dt=1e-3)
-    found = []
-    for log in (run, usual):
-        counted = {"t": np.asarray(log.t), "q": COUNT * np.round(np.asarray(log.q) / COUNT), "tau": np.asarray(log.tau)}
-        found.append(ij.identify(scenario, counted, PATHS, widths=False, delay=0.0, torque="interpolated").singular_values)
+    rich = ij.simulate(ij.with_parts(heavier, reference=best), duration=6.0, dt=1e-3)
+    assert int(rich.status) == 0 and float(np.min(rich.metrics.margin)) > 0
+    options = {"widths": False, "delay": 0.0, "torque": "interpolated"}
+    found = [ij.identify(scenario, counted(x), PATHS, **options).singular_values for x in (rich, run)]
     assert np.sum(np.log(found[0])) > np.sum(np.log(found[1])) + 1.0  # seven times the determinant
     with pytest.raises(ValueError, match=r"bounds: got .* expected room for a motion"):
         _narrow(scenario)

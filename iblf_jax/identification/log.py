@@ -22,8 +22,8 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation.results import Rollout
 
-GAP = 3.0
-"""A time between samples that is so many times the usual one is a gap."""
+GAP, MOST = 3.0, 0.95
+"""A time between samples that is so many times what this share of them is below is a gap."""
 FEWEST = 50
 """Samples that a log must have."""
 UNITS = {"q": ("rad", "m", "1"), "dq": ("rad/s", "m/s", "1/s"), "tau": ("N m", "N", "Nm", "N*m", "N.m"), "t": ("s",)}
@@ -49,14 +49,20 @@ class Log(NamedTuple):
     dq: np.ndarray | None
 
     @property
+    def gap(self) -> float:
+        """Time between samples from which it is a gap [s]."""
+        return GAP * float(np.quantile(np.diff(self.t), MOST))
+
+    @property
     def step(self) -> float:
-        """The usual time between samples [s]."""
-        return float(np.median(np.diff(self.t)))
+        """The mean time between samples, gaps apart [s]."""
+        between = np.diff(self.t)
+        return float(np.mean(between[between <= self.gap]))
 
     @property
     def stretches(self) -> list[slice]:
         """The samples between gaps."""
-        ends = np.flatnonzero(np.diff(self.t) > GAP * self.step) + 1
+        ends = np.flatnonzero(np.diff(self.t) > self.gap) + 1
         return [slice(int(a), int(b)) for a, b in zip([0, *ends], [*ends, len(self.t)], strict=True)]
 
 

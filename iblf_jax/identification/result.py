@@ -27,6 +27,8 @@ WHITE, SLIGHT = 1e-3, 0.05
 """Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is above the second."""
 LACKS, FINEST = 1.5, 1e-5
 """Times the positions' noise from which what is left is not noise, and the least noise that counts [rad]."""
+CLEARLY = 1.1
+"""Times that standard errors are widened from which it is told."""
 AT_END = 1e-6
 """Distance from a limit, in scales, within which a number is at it."""
 
@@ -398,11 +400,9 @@ def _fits(start: Scenario, w: Windows, end: Refined, before: np.ndarray, white: 
 
 def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> list[str]:
     notes = []
-    if not all(one.is_white for one in fit):
-        widest = float(np.max(found.widened))
-        notes.append(
-            f"What is left is coloured: standard errors are the jackknife's over windows where these are larger, up to {widest:.2g} times."
-        )
+    widest = float(np.max(found.widened))
+    if not all(one.is_white for one in fit) and widest > CLEARLY:
+        notes.append(f"What is left is coloured: standard errors are up to {widest:.2g} times those of white noise.")
     worst = max(fit, key=lambda one: one.lacking)
     if worst.lacking > LACKS:
         notes.append(
@@ -428,6 +428,8 @@ def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) 
                 if target == path or target.startswith("plant"):
                     raise
                 notes.append(f"The model has no {target}: its number is the plant's alone.")
+    if c.delay and delay < 0.0:
+        notes.append("The logged torque acts before its time: it is not the command, and the scenario's delay is 0.")
     if c.delay:
         scenario = with_parameters(scenario, {DELAY: max(delay, 0.0)})
     return scenario, notes

@@ -194,23 +194,22 @@ class Replay:
         weak, z0, n = 1.0 / (WEAK * scale) ** 2, z.copy(), self.w.y.shape[-1]
         total = 0
 
-        def full(z, found, sigma):
-            after, stretches, q, dq = found
-            r = self.w.y - q
-            J, along = self._slopes(z, stretches, q, dq)
+        def full(z, found, sigma, known=None):
+            _, stretches, q, dq = found
+            r, (J, along) = self.w.y - q, known or self._slopes(z, stretches, q, dq)
             told, own, by_z = self._eliminated(r, J, sigma, n)
             x, slope = to_x(self.c, z[:-1])
             g, A = np.sum(told.scores[self.w.kept], axis=0) + weak * (z - z0), np.sum(told.information[self.w.kept], axis=0) + np.diag(weak)
             g[:-1] += slope.T @ prior.precision @ (x - prior.mean)
             A[:-1, :-1] += slope.T @ prior.precision @ slope
-            return Around(cost(z, r, sigma), g, A, {"starts": after, "own": own, "by_z": by_z, "told": told, "along": along})
+            return Around(cost(z, r, sigma), g, A, {"own": own, "by_z": by_z, "told": told, "known": (J, along), "found": found})
 
         def cost(z, r, sigma):
             away = to_x(self.c, z[:-1])[0] - prior.mean
             return self.cost(r, sigma) + 0.5 * float(np.sum(weak * (z - z0) ** 2) + away @ prior.precision @ away)
 
         def attempt(here, z, step, sigma):
-            after = here.carried["starts"] + here.carried["by_z"] @ step + here.carried["own"]
+            after = here.carried["found"][0] + here.carried["by_z"] @ step + here.carried["own"]
             found = self.moved(z + step, after)
             return cost(z + step, self.w.y - found[1], sigma), (after, *found)
 
@@ -218,17 +217,18 @@ class Replay:
         if not np.all(np.isfinite(rest)):
             raise checks.fail("window", Said("windows in which the replay runs away"), "shorter ones", "Such as window=0.1.")
         sigma = np.maximum(sigma, self._spread(rest))
+        found, known = (starts, *self.moved(z, starts)), None
         for again in range(ROUNDS):
-            here = full(z, (starts, *self.moved(z, starts)), sigma)
-            z, here, steps = search(
-                here, z, ends, scale, partial(attempt, sigma=sigma), partial(full, sigma=sigma), LATER if again else most
-            )
-            starts, told, total = here.carried["starts"], here.carried["told"], total + steps
-            before, sigma = sigma, self._spread(told.residuals)
-            finer = substeps_for(here.carried["along"], self.step)  # friction may have become sharper
-            if np.median(np.abs(sigma / before - 1.0)) < MOVED and np.mean(np.abs(sigma / before - 1.0)) < MOVED and finer <= self.substeps:
+            here = full(z, found, sigma, known)
+            most = LATER if again else most
+            z, here, steps = search(here, z, ends, scale, partial(attempt, sigma=sigma), partial(full, sigma=sigma), most)
+            found, known, told = here.carried["found"], here.carried["known"], here.carried["told"]  # the same at another sigma
+            before, sigma, total = sigma, self._spread(told.residuals), total + steps
+            finer, change = substeps_for(known[1], self.step), np.abs(sigma / before - 1.0)
+            if finer > self.substeps:  # friction has become sharper
+                self.substeps, found, known = finer, (found[0], *self.moved(z, found[0])), None
+            elif max(np.median(change), np.mean(change)) < MOVED:
                 break
-            self.substeps = max(finer, self.substeps)
         return Refined(z, told, total)
 
     def best_starts(self, z: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
