@@ -46,6 +46,13 @@ class Number(NamedTuple):
     verdict: str
     """"told", "cannot be told" or "at its limit"."""
 
+    @property
+    def digits(self) -> str:
+        """The value, to the second digit of its error."""
+        if self.value is None or not self.error:
+            return "" if self.value is None else f"{self.value:.5g}"
+        return f"{self.value:.{min(max(1 - math.floor(math.log10(self.error)), 0), 12)}f}"
+
 
 class Fit(NamedTuple):
     """What is left of one joint's positions, root of the mean square over windows, each from the start that fits it best."""
@@ -94,7 +101,7 @@ class Identification:
     delay: float
     """How late the logged torque acts [s]."""
     delay_error: float | None
-    """Its standard error; None if it was given, or cannot be told."""
+    """Its standard error, infinite if it cannot be told; None if it was given."""
     singular_values: np.ndarray
     """How well each combination is known, from the best on: their inverse is its standard error, in the numbers' scales, (p,)."""
     combinations: tuple[str, ...]
@@ -199,7 +206,7 @@ class Identification:
     def _rows(self) -> list[tuple[str, ...]]:
         rows: list[tuple[str, ...]] = []
         for x in self.numbers:
-            found = ("", "", "") if x.value is None or x.error is None else (f"{x.value:.5g}", f"{x.error:.2g}", _share(x.error, x.value))
+            found = (x.digits, f"{x.error:.2g}", _share(x.error, x.value)) if x.value is not None and x.error is not None else ("", "", "")
             rows.append((x.name, x.unit, f"{x.start:.5g}", *found, x.verdict))
         return rows
 
@@ -217,8 +224,9 @@ class Identification:
 
     def _lines(self) -> list[str]:
         lines = [f"  cannot be told: {words}" for words in self.untold]
-        late = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
-        return [*lines, f"  the logged torque acts {1e3 * self.delay:.3g} ms late ({late})", *(f"  {note}" for note in self.notes)]
+        error = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
+        late = f"acts {1e3 * self.delay:.3g} ms late ({error})" if self.delay_error != math.inf else "is late by what the log cannot tell"
+        return [*lines, f"  the logged torque {late}", *(f"  {note}" for note in self.notes)]
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the residuals as plain numbers, strings and lists, for strict JSON (no NaN, no infinity)."""
@@ -343,7 +351,7 @@ def judged(
     names = (*c.names, "the torque's delay")
     numbers = tuple(_number(c, i, float(x[i]), found, end, ends, scale) for i in range(p))
     untold = tuple(in_words(found.directions[:, i], names) for i in range(free) if not found.singular[i] > 1.0 / UNKNOWN)
-    delay_error = float(found.errors[p]) if delay_found and np.isfinite(found.errors[p]) else None
+    delay_error = float(found.errors[p]) if delay_found else None
     scenario, notes = _with_numbers(start, c, x, end.z[-1])
     return Identification(
         scenario,

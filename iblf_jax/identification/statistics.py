@@ -39,7 +39,7 @@ class Known(NamedTuple):
     directions: np.ndarray
     """One a column, (p, p), in scales."""
     widened: np.ndarray
-    """By how much the errors are larger than those of white noise, (p,), at least 1."""
+    """By how much the jackknife's errors are larger than those of white noise, (p,), at least 1."""
 
 
 def known(information: np.ndarray, scores: np.ndarray, prior: np.ndarray, scale: np.ndarray, lacking: float = 1.0) -> Known:
@@ -51,7 +51,7 @@ def known(information: np.ndarray, scores: np.ndarray, prior: np.ndarray, scale:
       scale: of each number, (p,).
       lacking: by how much what is left is more than noise, >= 1.
     """
-    own, g = information * scale[:, None] * scale, scores * scale
+    own, g = information * scale[:, None] * scale / lacking**2, scores * scale / lacking**2
     size, V = np.linalg.eigh(np.sum(own, axis=0) + prior * scale[:, None] * scale)
     order = np.argsort(size)[::-1]
     size, V = np.maximum(size[order], 1e-13 * size.max(initial=1e-300)), V[:, order]
@@ -59,8 +59,8 @@ def known(information: np.ndarray, scores: np.ndarray, prior: np.ndarray, scale:
     clear = size > UNKNOWN**-2
     inverse = (V[:, clear] / size[clear]) @ V[:, clear].T
     errors = np.sqrt(np.diag(inverse))
-    spread = np.sqrt(np.maximum(np.diag(_left_out(own, g, V[:, clear], size[clear])), 0.0))
-    widened = lacking * np.where(errors > 0, np.maximum(1.0, spread / np.maximum(errors, 1e-300)), 1.0)
+    spread = lacking * np.sqrt(np.maximum(np.diag(_left_out(own, g, V[:, clear], size[clear])), 0.0))
+    widened = np.where(errors > 0, np.maximum(1.0, spread / np.maximum(errors, 1e-300)), 1.0)
     told = np.sqrt(share @ (1.0 / size)) * widened < UNKNOWN
     covariance = np.where(told[:, None] & told, inverse * widened[:, None] * widened, 0.0) * scale[:, None] * scale
     return Known(np.where(told, errors * widened * scale, np.inf), covariance, np.sqrt(size), V, widened)

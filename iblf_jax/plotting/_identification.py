@@ -33,12 +33,13 @@ def identification(known: Identification) -> Figure:
     rows = min(len(known.numbers), MOST_ROWS)
     heights = [max(1.8, 0.45 + 0.17 * rows), 2.1, 2.1]
     figure = _style.new_figure(_style.WIDTH, 0.6 + sum(heights))
-    grid = figure.add_gridspec(3, 2, height_ratios=heights)
-    _numbers(figure.add_subplot(grid[0, :]), known)
-    _singular(figure.add_subplot(grid[1, 0]), known)
-    _joints(figure.add_subplot(grid[1, 1]), known)
-    _left(figure.add_subplot(grid[2, 0]), known)
-    _correlations(figure.add_subplot(grid[2, 1]), known)
+    grid = figure.add_gridspec(3, 1, height_ratios=heights)
+    _numbers(figure.add_subplot(grid[0].subgridspec(1, 1)[0]), known)  # a grid of its own, as its words stand at the right
+    middle, last = (grid[i].subgridspec(1, 2) for i in (1, 2))
+    _singular(figure.add_subplot(middle[0]), known)
+    _joints(figure.add_subplot(middle[1]), known)
+    _left(figure.add_subplot(last[0]), known)
+    _correlations(figure.add_subplot(last[1]), known)
     untold = sum(number.value is None for number in known.numbers)
     _style.head(figure, ["Parameters from a log", *([f"{untold} numbers cannot be told"] if untold else [])])
     return figure
@@ -55,7 +56,7 @@ def _numbers(axes: Axes, known: Identification) -> None:
             continue
         change, error = (number.value - number.start) / scale, 3.0 * number.error / scale
         axes.errorbar(change, i, xerr=error, fmt="o", markersize=3.5, capsize=2, color=_style.colour(0))
-        axes.text(1.01, i, f"{number.value:.4g} $\\pm$ {number.error:.1g} {number.unit}", **beside)
+        axes.text(1.01, i, f"{number.digits} $\\pm$ {number.error:.2g} {number.unit}", **beside)
     axes.axvline(0.0, color=_style.bound(), linewidth=0.8)
     axes.set_yticks(range(len(chosen)), [plain(number.name) for number in chosen], fontsize=_style.size(7))
     axes.set_ylim(len(chosen) - 0.5, -0.5)
@@ -68,7 +69,7 @@ def _singular(axes: Axes, known: Identification) -> None:
     axes.bar(np.arange(len(error)) + 1, error, width=0.7, color=[_style.alarm() if x >= 0.5 else _style.colour(0) for x in error])
     axes.axhline(0.5, color=_style.alarm(), linewidth=0.8)
     axes.set_yscale("log")
-    axes.set_xlabel("combination, from the best known on")
+    axes.set_xlabel("combination, the best known first")
     axes.set_ylabel("standard error,\nin scales")
     axes.grid(axis="x", visible=False)
 
@@ -87,7 +88,7 @@ def _joints(axes: Axes, known: Identification) -> None:
     axes.set_yscale("log")
     axes.margins(y=0.3)
     axes.set_ylabel(_style.label("rms of what is left", "rad"))
-    axes.legend(ncols=3, fontsize=_style.size(6.5), loc="upper center")
+    axes.legend(ncols=3, fontsize=_style.size(6.5), loc="upper center", handlelength=1.2, columnspacing=1.0)
     axes.grid(axis="x", visible=False)
 
 
