@@ -20,7 +20,7 @@ from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z
 from iblf_jax.identification.log import read
-from iblf_jax.identification.shooting import Torque
+from iblf_jax.identification.shooting import Replay, Torque, windows
 
 MASS, VISCOUS, COULOMB, WIDTH = np.array([2.0, 0.85]), np.array([0.15, 0.08]), np.array([0.2, 0.1]), 0.05
 LENGTH, CENTRE, INERTIA = (0.35, 0.31), (0.175, 0.155), (0.06125, 0.02042125)
@@ -355,6 +355,10 @@ def test_standard_errors_are_those_of_repeated_noise(rng):
         assert 0.85 < np.mean([k.errors[0] for _, k in found]) / spread < 1.35
     known = found[0][1]
     assert np.isinf(known.errors[1:]).all() and np.isfinite(known.errors[0])
+    wider = statistics.known(A, -np.einsum("wka,wk->wa", Y, rng.normal(size=(W, K))), np.zeros((p, p)), np.ones(p), lacking=3.0)
+    usual = statistics.known(A, np.zeros((W, p)), np.zeros((p, p)), np.ones(p))
+    assert wider.errors[0] >= 3.0 * usual.errors[0] * (1 - 1e-9)
+    np.testing.assert_allclose(3.0 * wider.singular[:2], usual.singular[:2])
     words = statistics.in_words(known.directions[:, -1], ("a", "b", "c"))
     assert words == "0.89 b - 0.45 c"
 
@@ -427,3 +431,20 @@ def test_a_wrong_file_is_told(change, words, tmp_path):
     (tmp_path / "identify.toml").write_text(tomli_w.dumps({"preset": "zhang_yan_2024"} | change))
     with pytest.raises(ValueError, match=words):
         load_identification_file(tmp_path / "identify.toml")
+
+
+def test_the_tangents_of_a_replay_are_those_of_finite_differences(scenario, log):
+    """By the start, a mass, friction and the torque's offset in time; and e is the inverse of the acceleration."""
+    replayed_, c = coordinates(scenario, ["plant.mass[1]", "disturbance.viscous[0]"], {})
+    (one,) = read({name: x[:200] for name, x in log.items()}, 2)
+    cut = windows([one], 0.25, [0.0], held=True)
+    replay = Replay(replayed_, c, cut, [one], True, "squares", 1)
+    z, starts = np.append(c.x, 5e-4), np.concatenate([cut.q, cut.dq], axis=1)
+    stretches, q, dq = replay.moved(z, starts)
+    J, along = replay._slopes(z, stretches, q, dq)
+    for i in range(7):
+        step = 1e-4 * (np.arange(7) == i)
+        after, before = (replay.moved(z + s * step[4:], starts + s * step[:4])[1] for s in (1.0, -1.0))
+        share = 2e-3 if i < 6 else 0.05  # the offset's is taken over a sample, as a held torque is a staircase
+        np.testing.assert_allclose(J[..., i], (after - before) / 2e-4, atol=share * np.max(np.abs(J[..., i])))
+    np.testing.assert_allclose(along.torque, np.asarray(stretches.tau).reshape(-1, 2), atol=1e-9)
