@@ -91,10 +91,6 @@ def identify(
         start = canonical(astype(given, "float64"))
         wanted = with_widths(start, paths) if checks.flag("widths", widths) else paths
         replayed, c = coordinates(start, wanted, limits)
-        if c.delay and start.sampling is None:
-            raise checks.fail(
-                "paths", DELAY, "a scenario with a Sampling that has a delay", "The delay is found anyhow: leave the path out."
-            )
         if c.delay:
             delay = None
         logs, back = _logs(log, held_out, start.n)

@@ -353,6 +353,8 @@ def judged(
     untold = tuple(in_words(found.directions[:, i], names) for i in range(free) if not found.singular[i] > 1.0 / UNKNOWN)
     delay_error = float(found.errors[p]) if delay_found else None
     scenario, notes = _with_numbers(start, c, x, end.z[-1])
+    if c.delay and end.z[-1] < -3.0 * found.errors[p]:
+        notes.append("The logged torque acts before its time: it is not the command, and the scenario's delay is 0.")
     return Identification(
         scenario,
         start,
@@ -436,8 +438,6 @@ def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) 
                 if target == path or target.startswith("plant"):
                     raise
                 notes.append(f"The model has no {target}: its number is the plant's alone.")
-    if c.delay and delay < 0.0:
-        notes.append("The logged torque acts before its time: it is not the command, and the scenario's delay is 0.")
     if c.delay:
         scenario = with_parameters(scenario, {DELAY: max(delay, 0.0)})
     return scenario, notes
