@@ -23,6 +23,7 @@ PAGES: dict[str, tuple[str, str]] = {
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
     "tuning": ("Tuning", "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning"),
+    "identification": ("Parameters from logs", "identify Identification excitation"),
     "out": (
         "Out of Python, files and reports",
         "export Exported explore cosimulate report load_scenario save_scenario load_rollouts save_rollouts",

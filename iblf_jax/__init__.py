@@ -49,6 +49,7 @@ from iblf_jax.simulation.vector_field import VectorField as VectorField
 from iblf_jax.simulation.vector_field import vector_field as vector_field
 from iblf_jax.studies.distributions import choice as choice
 from iblf_jax.studies.distributions import factor as factor
+from iblf_jax.studies.distributions import joint_normal as joint_normal
 from iblf_jax.studies.distributions import log_uniform as log_uniform
 from iblf_jax.studies.distributions import normal as normal
 from iblf_jax.studies.distributions import offset as offset
@@ -72,6 +73,9 @@ if TYPE_CHECKING:
     from iblf_jax.files.tuning import load_tuning as load_tuning
     from iblf_jax.files.tuning import save_tuning as save_tuning
     from iblf_jax.files.tuning import tune_file as tune_file
+    from iblf_jax.identification import Identification as Identification
+    from iblf_jax.identification import excitation as excitation
+    from iblf_jax.identification import identify as identify
     from iblf_jax.reports import report as report
     from iblf_jax.studies import distributed as distributed
     from iblf_jax.studies.compare import compare as compare
@@ -110,6 +114,9 @@ _ON_FIRST_USE = {
     "Exported": ("iblf_jax.deployment.export", "Exported"),
     "falsify": ("iblf_jax.tuning", "falsify"),
     "Front": ("iblf_jax.tuning", "Front"),
+    "excitation": ("iblf_jax.identification", "excitation"),
+    "Identification": ("iblf_jax.identification", "Identification"),
+    "identify": ("iblf_jax.identification", "identify"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
     "load_tuning": ("iblf_jax.files.tuning", "load_tuning"),
     "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from iblf_jax.certificates import Certificate
+    from iblf_jax.identification import Identification
     from iblf_jax.simulation.results import Rollout
     from iblf_jax.studies.comparison import Comparison
     from iblf_jax.studies.study import Study
@@ -160,6 +161,10 @@ def _tuning(found: TuneResult) -> Shown:
     return Shown("Tuning", words, {"Gains": gains}, {"The search, and runs before and after": found.plot}, found.scenario)
 
 
+def _identification(found: Identification) -> Shown:
+    return Shown("Identification", found.words(), found.tables_html(), {"Numbers and what is left": found.plot}, found.scenario, on_card=2)
+
+
 KINDS: dict[str, Callable[[Any], Shown]] = {
     "Scenario": _scenario,
     "Rollout": _rollout,
@@ -167,6 +172,7 @@ KINDS: dict[str, Callable[[Any], Shown]] = {
     "Certificate": _certificate,
     "Comparison": _comparison,
     "TuneResult": _tuning,
+    "Identification": _identification,
 }
 """Class of a result -> its parts; by name, so that what is not looked at is not imported."""
 
@@ -205,7 +211,7 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     """Writes a result as one HTML file that needs nothing else: words, tables, figures, the scenario and the versions.
 
     Args:
-      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, or any other result of this package.
+      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, Identification, or any other result of this package.
       path: the file, ".html"; its folder must exist.
       title: the heading; the kind of the result if not given.
 

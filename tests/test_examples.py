@@ -19,6 +19,7 @@ COMMANDS = {
     "study.toml": ["montecarlo", "--quiet"],
     "sweep.toml": ["sweep", "--store", "sweep.zarr", "--quiet"],
     "tune.toml": ["tune", "--quiet"],
+    "identify.toml": ["identify"],
 }
 """File -> the command that its first line names, and its options."""
 
@@ -40,7 +41,8 @@ def test_examples_run(name, tmp_path, monkeypatch, capsys):
     command, *options = COMMANDS[name]
     assert cli.main([command, str(EXAMPLES / name), *options]) == 0, capsys.readouterr().err
     said = capsys.readouterr().out
-    assert {"arm.toml": "status: ok", "study.toml": "512 runs", "sweep.toml": "768 runs", "tune.toml": "peak torque < 14 N m"}[name] in said
+    words = {"arm.toml": "status: ok", "study.toml": "512 runs", "sweep.toml": "768 runs", "tune.toml": "peak torque < 14 N m"}
+    assert (words | {"identify.toml": "6 of 6 numbers told"})[name] in said
 
 
 def test_the_arm_of_the_examples_is_the_one_that_readme_speaks_of():

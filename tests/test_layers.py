@@ -20,6 +20,7 @@ LAYER_OF = {
 
 UPWARD = {
     "certificates/result.py": {"plotting", "reports"},
+    "identification/result.py": {"plotting", "reports"},
     "simulation/results.py": {"files", "plotting", "reports"},
     "simulation/scenario.py": {"reports"},
     "studies/comparison.py": {"plotting", "reports"},
@@ -34,7 +35,7 @@ ONLY_IN = {
     "optax": ("tuning",),
     "argparse": ("cli",),
     "mujoco": ("robots", "deployment"),
-    "xarray": ("files", "studies", "cli", "plotting"),
+    "xarray": ("files", "studies", "identification", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""
 

@@ -28,6 +28,7 @@ PROMISED = [
         "presets",
         "testing",
     ),
+    *("identify", "Identification", "excitation", "joint_normal"),
     *("distributed", "certificates", "Study", "TuneResult", "Sensitivity", "Certificate", "Counterexample", "Attack", "Front"),
 ]
 

@@ -23,7 +23,7 @@ from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
 
-COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "export", "presets", "parameters")
+COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "identify", "export", "presets", "parameters")
 
 
 LONGEST_WORD = 400

@@ -206,7 +206,7 @@ def from_dict(data: dict[str, Any], source: str = "", *, other_tables: Iterable[
         scenario = _from_preset(data) if "preset" in data else _from_components(data, folder)
         if "dtype" in data:
             scenario = astype(scenario, _dtype(data["dtype"]))
-        changes = _flat(as_table(data.get("parameters", {}), "parameters"), "")
+        changes = by_path(as_table(data.get("parameters", {}), "parameters"), "parameters")
         scenario = construct(with_parameters, {"scenario": scenario, "values": changes}, "parameters")
         return ScenarioFile(scenario, _run_table(data.get("run", {})))
     except ValueError as error:
@@ -270,13 +270,13 @@ def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
     return construct(preset, values, "arguments")
 
 
-def _flat(table: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """Path -> value: `"controller.K2" = 1` and `controller.K2 = 1` mean the same."""
-    flat: dict[str, Any] = {}
+def by_path(table: dict[str, Any], name: str, prefix: str = "") -> dict[str, Any]:
+    """Path -> numbers of a table [name]: `"controller.K2" = 1` and `controller.K2 = 1` mean the same."""
+    found: dict[str, Any] = {}
     for key, value in table.items():
         path = f"{prefix}.{key}" if prefix else key
-        flat |= _flat(value, path) if isinstance(value, dict) else {path: numbers(value, f"parameters.{path}")}
-    return flat
+        found |= by_path(value, name, path) if isinstance(value, dict) else {path: numbers(value, f"{name}.{path}")}
+    return found
 
 
 def _dtype(name: Any) -> Any:

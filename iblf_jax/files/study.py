@@ -15,9 +15,10 @@ A study file is a scenario file (`files.scenario`) with more tables:
     [grid]                                                         # path -> values, or how it is drawn in a random design
     "controller.K2" = [10.0, 20.0, 40.0]
 
-A draw names its kind (factor, offset or value), its distribution (uniform, normal, log_uniform or choice), that one's numbers, and
-`shared = true` where all entries of a vector leaf get the same.  [perturbations] is the same table in tuning files.  Every refusal is a
-ValueError that names file and key.
+A draw names its kind (factor, offset or value), its distribution (uniform, normal, log_uniform, choice or joint_normal), that one's
+numbers, and `shared = true` where all entries of a vector leaf get the same.  Leaves that vary together are joint_normal, each with its
+mean, its rows of the covariance's factor, and the group = "name" of their draws.  [perturbations] is the same table in tuning files.  Every
+refusal is a ValueError that names file and key.
 """
 
 from __future__ import annotations
@@ -152,11 +153,16 @@ def _perturbation(table: Any, path: str) -> Perturbation:
     shared = table.get("shared", False)
     if not isinstance(shared, bool):
         raise checks.fail(f"{path}.shared", shared, "true or false")
-    values = {word: numbers(table[word], f"{path}.{word}") for word in taken if word in table}
+    values = {word: _argument(word, table[word], f"{path}.{word}") for word in taken if word in table}
     for word, needed in taken.items():
         if needed and word not in values:
             raise checks.fail(f"{path}.{word}", Words("nothing"), "a number or a list of numbers", f"{name} needs it.")
     return getattr(distributions, kind)(construct(_made_by(name), values, path), shared=shared)
+
+
+def _argument(word: str, value: Any, path: str) -> Any:
+    """What a distribution is given: numbers, or the name of a group."""
+    return checks.word(path, value, "a name") if word == "group" else numbers(value, path)
 
 
 def _said_as_now(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:

@@ -22,6 +22,7 @@ from iblf_jax.plotting._figures import uncertain_terms as uncertain_terms
 from iblf_jax.plotting._figures import velocities as velocities
 from iblf_jax.plotting._figures import velocity_errors as velocity_errors
 from iblf_jax.plotting._figures import velocity_portrait as velocity_portrait
+from iblf_jax.plotting._identification import identification as identification
 from iblf_jax.plotting._overview import overview as overview
 from iblf_jax.plotting._studies import bands as bands
 from iblf_jax.plotting._studies import histograms as histograms

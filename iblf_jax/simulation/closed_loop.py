@@ -211,6 +211,20 @@ def change(scenario: Scenario, t: jax.Array, around: Any, dt: jax.Array | None =
     return Surroundings(rate, after.held.commands[0], (after.controller, after.observer, after.held.sensor))
 
 
+def acceleration(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array) -> jax.Array:
+    """q" of the plant under a torque that acts, (n,) [rad/s^2]."""
+    plant = at_time(scenario.plant, t)
+    pushed = tau + scenario.disturbance.torque(t, q, dq, plant, scenario.model) + friction_torque(plant, dq)
+    return solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
+
+
+def torque_needed(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array) -> jax.Array:
+    """The torque under which the plant moves like this, (n,) [N m]: the inverse of `acceleration`."""
+    plant = at_time(scenario.plant, t)
+    against = scenario.disturbance.torque(t, q, dq, plant, scenario.model) + friction_torque(plant, dq)
+    return matvec(plant.mass_matrix(q), ddq) + plant.coriolis(q, dq, dq) + plant.gravity(q) - against
+
+
 @jax.jit  # so that it is traced once for all the places that call it, and `lowering` sees that they call one function
 def evaluate(
     scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0, torque: jax.Array | None = None
@@ -224,9 +238,7 @@ def evaluate(
       dt: the time that the sample stands for, () [s].
       torque: what arrives at the actuator, (n,) [N m], where the law is sampled; the last command if not given.
     """
-    plant, model = at_time(scenario.plant, t), scenario.model
-    q, dq = state.q, state.dq
-
+    model, q, dq = scenario.model, state.q, state.dq
     if scenario.sampling is None:
         f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
         command, controller_rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
@@ -234,8 +246,7 @@ def evaluate(
     else:
         asked, said = state.held.commands[0] if torque is None else torque, state.held.said
     delivered = scenario.actuator.deliver(asked, dq, state.actuator)
-    pushed = delivered.tau + scenario.disturbance.torque(t, q, dq, plant, model) + friction_torque(plant, dq)
-    ddq = solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
+    ddq = acceleration(scenario, t, q, dq, delivered.tau)
     rate = LoopState(dq, ddq, (), (), delivered.rate)
     if scenario.sampling is None:
         told = scenario.observer.derivative(t, q, dq, asked, model, state.observer)

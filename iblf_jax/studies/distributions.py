@@ -6,6 +6,7 @@ A distribution is known by its quantile function F^-1, which turns a uniform num
     normal        mean + std Phi^-1(u)
     log_uniform   low (high / low)^u
     choice        the first value whose cumulative weight reaches u
+    joint_normal  mean + sum_k rows_k Phi^-1(u_k), with the same u_1 ... u_d for all leaves of a group: so leaves may vary together
 
 so that independent draws, Latin hypercubes and Sobol points differ in their u only.  A draw z changes a leaf that holds x0 to
 
@@ -31,7 +32,11 @@ KINDS = ("factor", "offset", "value")
 
 
 class Distribution(Protocol):
-    """What the package asks of a distribution: a component with these two methods."""
+    """What the package asks of a distribution: a component with these two methods.
+
+    One whose leaves vary together has, as `group`, the name of the draws that they share, and, as `draws`, how many uniform numbers these
+    are: its `quantile` is given all of them.
+    """
 
     def quantile(self, u: jax.Array) -> jax.Array:
         """F^-1(u), elementwise, for u in (0, 1)."""
@@ -152,6 +157,42 @@ class Choice:
 
 
 @component
+class JointNormal:
+    """Gaussian, of leaves that vary together.
+
+    Args:
+      mean: centre of the draws, () or as the leaf, in its unit.
+      rows: what each draw of the group adds per standard deviation, (d,) or, for m numbers, (m, d), in the leaf's unit: with the rows of
+        all leaves of the group as a matrix L, L L^T is their covariance.
+      group: name of the draws, d of them, that the leaves share.
+    """
+
+    mean: jax.Array = leaf("", shape="any")
+    rows: jax.Array = leaf("", shape="any")
+    group: str = static()
+
+    def check(self) -> None:
+        """Raises ValueError for rows that do not fit the mean, or a group without a name."""
+        if self.rows.ndim != self.mean.ndim + 1 or self.rows.shape[:-1] != self.mean.shape:
+            raise checks.fail("joint_normal: rows", self.rows, f"shape {(*self.mean.shape, 'd')}: d numbers for each of the mean's")
+        if not isinstance(self.group, str) or not self.group:
+            raise checks.fail("joint_normal: group", self.group, "a name")
+
+    @property
+    def draws(self) -> int:
+        """How many uniform numbers the group has, d."""
+        return self.rows.shape[-1]
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """Mean + rows Phi^-1(u), for the u of the group, (d,)."""
+        return self.mean + jnp.sum(self.rows * jax.scipy.special.ndtri(u), axis=-1)
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """The whole line."""
+        return np.full(self.mean.shape, -np.inf), np.full(self.mean.shape, np.inf)
+
+
+@component
 class Perturbation:
     """A distribution and how its draw acts on a leaf; made by `factor`, `offset` and `value`.
 
@@ -253,6 +294,27 @@ def log_uniform(low: Any, high: Any) -> LogUniform:
     return LogUniform(low, high)
 
 
+def joint_normal(mean: Any, rows: Any, group: str) -> JointNormal:
+    """Gaussian, of leaves that vary together.
+
+        z = mean + rows w,   w standard normal, (d,), the same for all leaves of the group
+
+    Args:
+      mean: as the perturbed leaf.
+      rows: (..., d), as the leaf with one number more for each of its entries: L of the covariance L L^T of all leaves of the group.
+      group: name of the draws that they share.
+
+    Returns:
+      A distribution for `factor`, `offset` or `value`.
+
+    Raises:
+      ValueError: rows that do not fit the mean, or no name.
+
+    Source: `Identification.perturbations` is made of them.
+    """
+    return JointNormal(mean, rows, group)
+
+
 def choice(values: Any, weights: Any = None) -> Choice:
     """One of a list of numbers.
 
@@ -331,5 +393,5 @@ def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
     return Perturbation(distribution, "value", shared)
 
 
-MEMBERS = {"uniform": Uniform, "normal": Normal, "log_uniform": LogUniform, "choice": Choice}
+MEMBERS = {"uniform": Uniform, "normal": Normal, "log_uniform": LogUniform, "choice": Choice, "joint_normal": JointNormal}
 """Every distribution by the name that files give it."""

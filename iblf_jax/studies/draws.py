@@ -5,7 +5,8 @@ Run i draws, for the leaf that is addressed by `path`,
     u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),    value = perturbation(nominal, F^-1(u))
 
 so a draw depends on seed, run and path only: not on the chunk, the device, the number of runs or the other perturbations.  u lies in
-the open interval (0, 1), in the middle of the cells that the generator's uniform numbers start.  `robot.` perturbs plant and model
+the open interval (0, 1), in the middle of the cells that the generator's uniform numbers start; leaves that vary together share it, under
+the name of their group.  `robot.` perturbs plant and model
 with the same u, each around its own nominal value.
 """
 
@@ -150,8 +151,19 @@ def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, 
 
 
 def sample_size(targets: tuple[Target, ...], perturbations: Mapping[str, Perturbation]) -> dict[str, tuple[int, ...]]:
-    """Path of the user -> shape of its u: the leaf's, or () where one draw is shared."""
-    return {t.source: () if perturbations[t.path].shared else t.shape for t in targets}
+    """Name of the draws -> shape of their u: path of the user, the leaf's or () where one draw is shared; or a group, and its size."""
+    return {drawn_as(t, perturbations[t.path]): _shape_of_u(t, perturbations[t.path]) for t in targets}
+
+
+def drawn_as(target: Target, perturbation: Perturbation) -> str:
+    """The name of a target's draws: the path that the user wrote, or the group of leaves that vary together."""
+    return getattr(perturbation.distribution, "group", "") or target.source
+
+
+def _shape_of_u(target: Target, perturbation: Perturbation) -> tuple[int, ...]:
+    if getattr(perturbation.distribution, "group", ""):
+        return (perturbation.distribution.draws,)  # type: ignore[attr-defined]
+    return () if perturbation.shared else target.shape
 
 
 def uniform_numbers(key: jax.Array, index: jax.Array, source: str, shape: tuple[int, ...], dtype) -> jax.Array:
@@ -183,7 +195,8 @@ def draw(cases: Cases, targets: tuple[Target, ...], index: jax.Array, point: Map
     made, drawn, admissible = {}, {}, jnp.asarray(True)
     for target in targets:
         nominal = jnp.asarray(paths.get(scenario, target.path))
-        value = cases.perturbations[target.path].apply(nominal, numbers[target.source].astype(dtype))
+        perturbation = cases.perturbations[target.path]
+        value = perturbation.apply(nominal, numbers[drawn_as(target, perturbation)].astype(dtype))
         fine = jnp.all(jnp.isfinite(value))
         if target.sign is not None:
             fine &= jnp.all(value > 0 if target.sign == "positive" else value >= 0)

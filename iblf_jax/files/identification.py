@@ -1,0 +1,81 @@
+"""Identification files: whose parameters, from which log, as typed, validated TOML.
+
+An identification file is a scenario file (`files.scenario`) with up to three more tables:
+
+    preset = "zhang_yan_2024"                                  # or the scenario written out: where the search starts
+    [identify]                                                 # the arguments of `identify`: held_out, window, torque, delay, loss, ...
+    log = "log.csv"                                            # beside this file; or a list of files
+    parameters = ["robot.mass", "disturbance.viscous"]
+    [limits]                                                   # path -> [low, high]
+    "robot.mass" = [0.1, 5.0]
+    [priors]                                                   # path -> [mean, standard deviation]; of a vector, two lists
+    "robot.mass" = [[2.0, 0.8], 0.1]
+
+Everything is checked; each refusal is a ValueError that names the dotted key.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from iblf_jax.core import checks
+from iblf_jax.files.scenario import by_path, from_dict, read_toml
+from iblf_jax.files.values import Words, as_table, known_keys
+from iblf_jax.identification import Identification, identify
+
+TABLES = ("identify", "limits", "priors")
+ARGUMENTS = ("window", "torque", "delay", "loss", "widths", "iterations")
+"""What [identify] may hold besides `log`, `parameters` and `held_out`."""
+
+
+def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
+    """The arguments of `identify` that an identification file describes, the scenario among them.
+
+    Args:
+      path: a file in the format at the head of this module.
+
+    Raises:
+      ValueError: the file is not TOML or does not describe an identification; the message names file, key and remedy.
+      OSError: the file cannot be read.
+    """
+    data, source, folder = read_toml(path), os.fspath(path), Path(path).parent
+    file = from_dict(data, source=source, other_tables=TABLES, folder=folder)
+    try:
+        table = as_table(data.get("identify", {}), "identify")
+        known_keys(table, "identify", ("log", "parameters", "held_out", *ARGUMENTS))
+        if not isinstance(table.get("parameters"), list):
+            raise checks.fail("identify.parameters", table.get("parameters", Words("nothing")), 'a list of paths, such as ["robot.mass"]')
+        options: dict[str, Any] = {key: table[key] for key in ARGUMENTS if key in table}
+        if "held_out" in table:
+            share = isinstance(table["held_out"], int | float)
+            options["held_out"] = table["held_out"] if share else _logs(table["held_out"], "identify.held_out", folder)
+        for name in ("limits", "priors"):
+            given = by_path(as_table(data.get(name, {}), name), name)
+            options[name] = {key: _pair(x, f"{name}.{key}") for key, x in given.items()}
+        log = _logs(table.get("log", Words("nothing")), "identify.log", folder)
+    except ValueError as error:
+        raise checks.inside(source, error) from error
+    return {"scenario": file.scenario, "log": log, "paths": table["parameters"], **options}
+
+
+def _pair(value: Any, key: str) -> tuple[Any, ...]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise checks.fail(key, value, "a list of two, each a number or a list of numbers")
+    return tuple(value)
+
+
+def _logs(given: Any, key: str, folder: Path) -> list[Path]:
+    """The files of one log or of several, beside the file that names them."""
+    names = given if isinstance(given, list) and given else [given]
+    return [folder / checks.word(key, None if isinstance(name, Words) else name, "the path of a .csv or .nc file") for name in names]
+
+
+def identify_file(path: str | os.PathLike, **options: Any) -> Identification:
+    """Runs `identify` on an identification file; options replace the file's.
+
+    Raises:
+      ValueError, OSError: as `load_identification_file` and `identify`.
+    """
+    return identify(**{**load_identification_file(path), **options})

@@ -1,0 +1,189 @@
+"""`identify`: parameters of a robot from its log."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import astype
+from iblf_jax.engine.replay import slopes_under
+from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, coordinates, to_x, to_z, with_widths
+from iblf_jax.identification.log import Log, Said, read
+from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
+from iblf_jax.identification.result import Identification, judged
+from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
+from iblf_jax.identification.smoothing import Smoothed, smoothed
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
+
+LOSSES = ("squares", "huber")
+TORQUES = ("held", "interpolated")
+
+
+def identify(
+    scenario: Scenario,
+    log: Any,
+    paths: list[str],
+    *,
+    held_out: Any = 0.2,
+    window: float = 0.5,
+    torque: str | None = None,
+    delay: float | None = None,
+    loss: str = "squares",
+    widths: bool = True,
+    limits: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    iterations: int = 30,
+) -> Identification:
+    """Parameters of a robot from what it logged: linear regression, refined by simulation error over windows.
+
+        minimise  sum over windows, samples, joints of  rho((y - q) / sigma) / 2,    q the plant under the logged torque
+
+    Each window of the log has a start of its own, which is looked for too; sigma of each joint is estimated.  The motion comes from
+    positions alone; of a law nothing need be known.
+
+    Args:
+      scenario: on a robot of n joints; its plant's numbers are where the search starts.
+      log: t (N,) [s], q (N, n) [rad], tau (N, n) [N m], dq (N, n) [rad/s] if there is one: an xarray Dataset, a mapping, a `Rollout`, a CSV
+        file (its heading: t, q[0], ..., tau[0], ...) or a netCDF file, or a list of these.  Times may be irregular and have gaps.
+      paths: of leaves of robot (plant and model), plant, model or disturbance; "sampling.delay" for the torque's delay.
+      held_out: the share of each log, at its end, that is held back to judge the result; or a log, or a list of logs, for that.
+      window: length of the windows [s]; longer ones know more, and more of what the model lacks.
+      torque: "held" from a sample to the next, as a digital loop does, or "interpolated", for torques that were measured; if not given,
+        interpolated for a `Rollout` of a continuous loop, else held.
+      delay: how late the logged torque acts [s]; found too if not given.
+      loss: "squares", or "huber" for logs with outliers.
+      widths: whether the width of a Coulomb friction is looked for with it: that of dry friction is nearly 0, and a width that is wrong
+        spoils all numbers (7 joints with dry friction: by up to 34 %, where the width is found by less than 1 %).
+      limits: path -> (low, high) in the leaf's unit, None for the default: masses are above 0, friction and damping not below.
+      priors: path -> (mean, standard deviation) of what is known from elsewhere, in the leaf's unit.
+      iterations: Gauss-Newton steps, at most.
+
+    Returns:
+      An `Identification`: values with standard errors, what the log cannot tell, the fit, and `.scenario` with the new numbers.
+
+    Raises:
+      ValueError: a path that does not move the plant; a log that is incomplete, has rows without numbers, times that do not increase,
+        wrong units or columns, or in which the robot stands still; the message names what came and the remedy.
+      OSError: a file cannot be read.
+
+    Source: H. G. Bock's multiple shooting; L. Ljung, System Identification, 2nd ed., 1999; C. Rucker, P. M. Wensing 2022 for inertias.
+    """
+    begin = time.monotonic()
+    torque = ("interpolated" if _is_continuous(log) else "held") if torque is None else torque
+    checks.one_of("torque", torque, TORQUES)
+    checks.one_of("loss", loss, LOSSES)
+    window = checks.positive_number("window", window, "s")
+    iterations = checks.positive_integer("iterations", iterations)
+    limits = {} if limits is None else checks.mapping("limits", limits, '{"plant.mass": (0.1, 5.0)}')
+    priors = {} if priors is None else checks.mapping("priors", priors, '{"plant.mass": (2.0, 0.1)}')
+    if delay is not None and not abs(float(checks.as_floats("delay", delay))) <= LARGEST_DELAY:
+        raise checks.fail("delay", delay, f"a time of at most {LARGEST_DELAY:g} s")
+    given = canonical(scenario)
+    with jax.enable_x64(True):  # noise of 1e-4 rad leaves no room for the rounding of float32
+        start = canonical(astype(given, "float64"))
+        wanted = with_widths(start, paths) if checks.flag("widths", widths) else paths
+        replayed, c = coordinates(start, wanted, limits)
+        if c.delay:
+            delay = None
+        logs, back = _logs(log, held_out, start.n)
+        held = torque == "held"
+        w = windows(logs, window, back, held)
+        _enough(w, len(c.x), logs, window)
+        seen = smoothed([fitted for x, share in zip(logs, back, strict=True) for fitted in _front(x, 1.0 - share)], held)
+        prior = _prior(c, priors)
+        guess = started(replayed, c, seen, "log", delay)
+        replay = Replay(replayed, c, w, logs, held, loss, _substeps(replayed, c, guess.z, seen, min(x.step for x in logs)))
+        noise = np.maximum(seen.noise, 1e-9)
+        fixed = None if delay is None else float(delay)
+        ends = tuple(np.append(x, side * LARGEST_DELAY if fixed is None else fixed) for x, side in ((c.low, -1.0), (c.high, 1.0)))
+        first = np.append(to_z(c, c.x), guess.delay)
+        before = replay.best_starts(first, noise)[1]
+        scale = np.append(coordinate_scales(c, guess.scale), OFFSET)
+        end = replay.refined(np.append(guess.z, guess.delay), ends, scale, noise, prior, iterations)
+        found = judged(
+            start,
+            c,
+            w,
+            end,
+            prior,
+            before,
+            guess,
+            len([path for path in paths if path != DELAY]),
+            ends,
+            fixed is None,
+            tuple(x.name for x in logs),
+            time.monotonic() - begin,
+        )
+    return dataclasses.replace(found, scenario=astype(found.scenario, given.initial.q.dtype), start=given)
+
+
+def _is_continuous(log: Any) -> bool:
+    """Whether a log is of runs whose law was not sampled."""
+    runs = log if isinstance(log, list | tuple) else [log]
+    return all(isinstance(run, Rollout) and run.scenario.sampling is None for run in runs)
+
+
+def _logs(log: Any, held_out: Any, n: int) -> tuple[list[Log], list[float]]:
+    """The logs, and which share of each is held back."""
+    logs = read(log, n)
+    if isinstance(held_out, int | float) and not isinstance(held_out, bool):
+        if not 0.0 <= held_out <= 0.9:
+            raise checks.fail("held_out", held_out, "a share from 0 to 0.9, or a log")
+        return logs, [float(held_out)] * len(logs)
+    others = read(held_out, n, "held_out")
+    return logs + others, [0.0] * len(logs) + [1.0] * len(others)
+
+
+def _front(log: Log, share: float) -> list[Log]:
+    """The first share of a log; nothing of one that is held back."""
+    count = round(share * len(log.t))
+    return (
+        [log._replace(t=log.t[:count], q=log.q[:count], tau=log.tau[:count], dq=None if log.dq is None else log.dq[:count])]
+        if count
+        else []
+    )
+
+
+def _enough(w: Windows, p: int, logs: list[Log], length: float) -> None:
+    """Raises ValueError for logs that are too short for what is looked for."""
+    n = w.y.shape[-1] if len(w.t) else 1
+    numbers = int(np.sum(w.kept)) * (w.t.shape[1] - 2) * n if len(w.t) else 0
+    if numbers < 3 * p or not numbers:
+        came = Said(
+            f"{sum(x.t[-1] - x.t[0] for x in logs):.3g} s of log between gaps, in {int(np.sum(w.kept))} windows of {length:g} s to fit"
+        )
+        raise checks.fail(
+            "log",
+            came,
+            f"at least one window, and 3 measured numbers for each of the {p} looked for",
+            "Log for longer, or take a shorter window.",
+        )
+
+
+def _prior(c: Coordinates, priors: Mapping[str, Any]) -> Prior:
+    mean, precision = c.x.copy(), np.zeros((len(c.x), len(c.x)))
+    for path, given in priors.items():
+        if path not in c.paths:
+            raise checks.fail("priors", path, f"one of the paths: {', '.join(c.paths)}")
+        place = c.places[c.paths.index(path)]
+        if not isinstance(given, tuple | list) or len(given) != 2:
+            raise checks.fail(f"priors[{path!r}]", given, "(mean, standard deviation), each a number or one an entry")
+        own = slice(place.start, place.start + place.size)
+        centre, std = (np.broadcast_to(np.asarray(checks.as_floats(f"priors[{path!r}]", x), float), place.shape).ravel() for x in given)
+        checks.check_values(f"priors[{path!r}]: standard deviation", std, "positive")
+        mean[own], precision[own, own] = centre, np.diag(std**-2)
+    return Prior(mean, precision)
+
+
+def _substeps(scenario: Scenario, c: Coordinates, z: np.ndarray, seen: Smoothed, step: float) -> int:
+    """Steps of the integrator from sample to sample."""
+    points = (jnp.asarray(x) for x in (seen.t, seen.q, seen.dq, seen.tau))
+    return substeps_for(slopes_under(scenario, jnp.asarray(to_x(c, z)[0]), *points, places=c.places), step)

@@ -1,0 +1,444 @@
+"""What `identify` gives back: an `Identification`, which prints as a table."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.core import checks, tables
+from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, to_x
+from iblf_jax.identification.regression import Start
+from iblf_jax.identification.shooting import Prior, Refined, Windows
+from iblf_jax.identification.statistics import UNKNOWN, Known, Whiteness, in_words, known, whiteness
+from iblf_jax.robots import joint_names
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.distributions import Perturbation, joint_normal, value
+
+WHITE, SLIGHT = 1e-3, 0.05
+"""Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is above the second."""
+LACKS, FINEST = 1.5, 1e-5
+"""Times the positions' noise from which what is left is not noise, and the least noise that counts [rad]."""
+CLEARLY = 1.1
+"""Times that standard errors are widened from which it is told."""
+AT_END = 1e-6
+"""Distance from a limit, in scales, within which a number is at it."""
+
+
+class Number(NamedTuple):
+    """One number that was looked for."""
+
+    name: str
+    unit: str
+    start: float
+    value: float | None
+    """None where the log cannot tell it."""
+    error: float | None
+    """Standard error."""
+    verdict: str
+    """"told", "cannot be told" or "at its limit"."""
+
+    @property
+    def digits(self) -> str:
+        """The value, to the second digit of its error."""
+        if self.value is None or not self.error:
+            return "" if self.value is None else f"{self.value:.5g}"
+        return f"{self.value:.{min(max(1 - math.floor(math.log10(self.error)), 0), 12)}f}"
+
+
+class Fit(NamedTuple):
+    """What is left of one joint's positions, root of the mean square over windows, each from the start that fits it best."""
+
+    joint: str
+    before: float
+    """With the numbers of the start [rad]."""
+    after: float
+    held_back: float
+    """On windows that were not fitted [rad]; NaN without any."""
+    correlation: float
+    """The largest autocorrelation of what is left, in size."""
+    white: float
+    """Probability of one as large in white noise."""
+    explained: float
+    """Share of the torque's variation that the regression explained."""
+    noise: float
+    """What smooth curves leave of the logged positions: noise and counts of the encoder [rad]."""
+
+    @property
+    def lacking(self) -> float:
+        """How many times the noise of the positions is left."""
+        return self.after / max(self.noise, FINEST)
+
+    @property
+    def is_white(self) -> bool:
+        """Whether what is left is noise: no correlation that is both certain and of a size."""
+        return self.white >= WHITE or self.correlation < SLIGHT
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Identification:
+    """Parameters from a log: values, how well they are known, and what the log cannot tell."""
+
+    scenario: Scenario
+    """With the new numbers, in plant and model alike where the paths were the robot's or the plant's; what the log cannot tell is left
+    where it agrees with what it can."""
+    start: Scenario
+    paths: tuple[str, ...]
+    """As asked for, and after them the widths of friction that were looked for with it."""
+    asked: int
+    """How many of the paths were asked for."""
+    numbers: tuple[Number, ...]
+    covariance: np.ndarray
+    """Of the numbers, (p, p); zero where one cannot be told."""
+    delay: float
+    """How late the logged torque acts [s]."""
+    delay_error: float | None
+    """Its standard error, infinite if it cannot be told; None if it was given."""
+    singular_values: np.ndarray
+    """How well each combination is known, from the best on: their inverse is its standard error, in the numbers' scales, (p,)."""
+    combinations: tuple[str, ...]
+    """The combinations, each number in its scale, by their paths."""
+    untold: tuple[str, ...]
+    """Those that the log cannot tell."""
+    scales: np.ndarray
+    """(p,), in the numbers' units."""
+    fit: tuple[Fit, ...]
+    residuals: np.ndarray
+    """Logged less replayed positions, (W, K + 1, n) [rad]."""
+    times: np.ndarray
+    """(W, K + 1) [s]."""
+    kept: np.ndarray
+    """Which windows were fitted, (W,)."""
+    autocorrelations: np.ndarray
+    """Of the residuals, lags 1, 2, ..., (n, L)."""
+    notes: tuple[str, ...]
+    logs: tuple[str, ...]
+    steps: int
+    seconds: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each number is called, (p,)."""
+        return tuple(number.name for number in self.numbers)
+
+    @property
+    def wanted(self) -> tuple[Number, ...]:
+        """The numbers that were asked for."""
+        return self.numbers[: sum(math.prod(np.shape(paths.get(self.start, path))) for path in self.paths[: self.asked])]
+
+    @cached_property
+    def values(self) -> dict[str, np.ndarray]:
+        """Path -> value in the leaf's unit, NaN where the log cannot tell it."""
+        return self._by_path([math.nan if number.value is None else number.value for number in self.numbers])
+
+    @cached_property
+    def standard_errors(self) -> dict[str, np.ndarray]:
+        """Path -> standard error in the leaf's unit, infinite where the log cannot tell it."""
+        return self._by_path([math.inf if number.error is None else number.error for number in self.numbers])
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Of the numbers' errors, (p, p); NaN where one cannot be told."""
+        size = np.sqrt(np.diag(self.covariance))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self.covariance / size[:, None] / size
+
+    def _by_path(self, x: list[float]) -> dict[str, np.ndarray]:
+        found, first = {}, 0
+        for path in self.paths:
+            shape = np.shape(paths.get(self.start, path))
+            size = math.prod(shape)
+            found[path] = np.array(x[first : first + size]).reshape(shape)
+            first += size
+        return found
+
+    @cached_property
+    def perturbations(self) -> dict[str, Perturbation]:
+        """What the log leaves open, for `monte_carlo`, `sweep` and `tune`: the told numbers of the plant, jointly normal.
+
+        x = value + L w,   L L^T = covariance,   w standard normal, the same for all paths
+        """
+        told = [i for i, number in enumerate(self.wanted) if number.error is not None and number.verdict == "told"]
+        size, axes = np.linalg.eigh(self.covariance[np.ix_(told, told)])
+        factor = np.zeros((len(self.numbers), len(told)))
+        factor[told] = axes * np.sqrt(np.maximum(size, 0.0))
+        found, first = {}, 0
+        for path in self.paths[: self.asked]:
+            own, shape = _of_plant(path), np.shape(paths.get(self.start, path))
+            these = range(first, first + math.prod(shape))
+            first += len(these)
+            if all(i in told for i in these):
+                mean = np.array([self.numbers[i].value for i in these]).reshape(shape)
+                found[own] = value(joint_normal(mean, factor[list(these)].reshape(*shape, -1), GROUP))
+                continue
+            for i in these:
+                if i in told:
+                    entry = _of_plant(self.numbers[i].name)
+                    found[entry] = value(joint_normal(self.numbers[i].value, factor[i], GROUP))
+        return found
+
+    def __repr__(self) -> str:
+        return "\n".join(
+            [self._heading(), *tables.as_text([HEADING, *self._rows()]), "", *tables.as_text([FIT, *self._fits()]), *self._lines()]
+        )
+
+    def _repr_html_(self) -> str:
+        from iblf_jax import reports
+
+        return reports.card(self)
+
+    def words(self) -> list[str]:
+        """What there is to say besides the tables, line by line."""
+        return [self._heading(), *(line.strip() for line in self._lines())]
+
+    def tables_html(self) -> dict[str, str]:
+        """Its tables as HTML, numbers that the log cannot tell in bold."""
+        bold = [i for i, number in enumerate(self.numbers) if number.value is None]
+        return {"Numbers": tables.as_html(HEADING, self._rows(), bold), "Fit": tables.as_html(FIT, self._fits())}
+
+    def _heading(self) -> str:
+        W, back = int(np.sum(self.kept)), int(np.sum(~self.kept))
+        length = float(np.mean(self.times[:, -1] - self.times[:, 0]))
+        told = sum(number.value is not None for number in self.numbers)
+        windows = f"{W} windows of {length:.3g} s fitted, {back} held back"
+        return f"Identification: {told} of {len(self.numbers)} numbers told; {windows}; {self.steps} steps, {self.seconds:.3g} s"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        rows: list[tuple[str, ...]] = []
+        for x in self.numbers:
+            found = (x.digits, f"{x.error:.2g}", _share(x.error, x.value)) if x.value is not None and x.error is not None else ("", "", "")
+            rows.append((x.name, x.unit, f"{x.start:.5g}", *found, x.verdict))
+        return rows
+
+    def _fits(self) -> list[tuple[str, ...]]:
+        return [
+            (
+                f.joint,
+                *(f"{x:.3g}" for x in (f.before, f.after, f.held_back)),
+                f"{f.correlation:.2g}",
+                "white" if f.is_white else "coloured",
+                f"{f.explained:.1%}",
+            )
+            for f in self.fit
+        ]
+
+    def _lines(self) -> list[str]:
+        lines = [f"  cannot be told: {words}" for words in self.untold]
+        error = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
+        late = f"acts {1e3 * self.delay:.3g} ms late ({error})" if self.delay_error != math.inf else "is late by what the log cannot tell"
+        return [*lines, f"  the logged torque {late}", *(f"  {note}" for note in self.notes)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the residuals as plain numbers, strings and lists, for strict JSON (no NaN, no infinity)."""
+        return _for_json({
+            "what": "iblf_jax identification",
+            "logs": self.logs,
+            "numbers": [number._asdict() for number in self.numbers],
+            "covariance": self.covariance,
+            "correlation": self.correlation,
+            "delay": self.delay,
+            "delay_error": self.delay_error,
+            "singular_values": self.singular_values,
+            "combinations": self.combinations,
+            "untold": self.untold,
+            "scales": self.scales,
+            "fit": [fit._asdict() for fit in self.fit],
+            "autocorrelations": self.autocorrelations,
+            "windows": {"fitted": int(np.sum(self.kept)), "held_back": int(np.sum(~self.kept))},
+            "notes": self.notes,
+            "steps": self.steps,
+            "seconds": self.seconds,
+        })  # fmt: skip
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the report: numbers as JSON, or numbers and figure as one page of HTML; the ending, ".json" or ".html", decides.
+
+        Raises:
+          ValueError: another ending.
+          OSError: the file cannot be written.
+        """
+        target = checks.file_to_write("path", path, "a file that ends in .json or .html")
+        ending = target.suffix.lower()
+        if ending not in (".json", ".html"):
+            raise checks.fail("path", str(target), "a file that ends in .json or .html")
+        if ending == ".json":
+            target.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
+            return
+        from iblf_jax import reports
+
+        reports.report(self, target)
+
+    def plot(self, **options):
+        """Figure: values with their errors, what is known how well, and what is left.  Options as `plotting.identification`."""
+        from iblf_jax import plotting
+
+        return plotting.identification(self, **options)
+
+
+GROUP = "identified"
+"""Name of the draws that all identified numbers share."""
+HEADING = ("number", "unit", "start", "value", "standard error", "relative", "verdict")
+FIT = ("joint", "rms before [rad]", "rms after [rad]", "rms held back [rad]", "autocorrelation", "what is left is", "torque explained")
+
+
+def _share(error: float, of: float) -> str:
+    return f"{100 * error / abs(of):.2g} %" if of else ""
+
+
+def _of_plant(path: str) -> str:
+    return "plant" + path[5:] if path.startswith(("robot.", "model.")) else path
+
+
+def _for_json(x: Any) -> Any:
+    if isinstance(x, dict):
+        return {str(key): _for_json(y) for key, y in x.items()}
+    if isinstance(x, list | tuple):
+        return [_for_json(y) for y in x]
+    if isinstance(x, np.ndarray | np.generic):
+        return _for_json(x.tolist())
+    return x if not isinstance(x, float) or math.isfinite(x) else None
+
+
+def judged(
+    start: Scenario,
+    c: Coordinates,
+    w: Windows,
+    end: Refined,
+    prior: Prior,
+    before: np.ndarray,
+    guess: Start,
+    asked: int,
+    ends: tuple[np.ndarray, ...],
+    delay_found: bool,
+    logs: tuple[str, ...],
+    seconds: float,
+) -> Identification:
+    """The result.
+
+    Args:
+      start: the user's scenario.
+      c, w: coordinates and windows.
+      end: of the search.
+      prior: what was known before.
+      before: residuals with the numbers of the start.
+      guess: of the regression.
+      asked: how many of the paths the user wrote.
+      ends: limits of z.
+      delay_found: whether the delay was looked for.
+      logs: their names.
+      seconds: what it took.
+    """
+    x, slope = to_x(c, end.z[:-1])
+    p = len(x)
+    by_x = np.eye(p + 1)
+    by_x[:p, :p] = np.linalg.inv(slope)
+    free = p + 1 if delay_found else p
+    information = (by_x.T @ end.told.information[w.kept] @ by_x)[:, :free, :free]
+    scores = (end.told.scores[w.kept] @ by_x)[:, :free]
+    precision = np.zeros((p + 1, p + 1))
+    precision[:p, :p] = prior.precision
+    scale = np.append(guess.scale, OFFSET)
+    white = [whiteness(end.told.residuals[w.kept][:, :, j]) for j in range(w.y.shape[-1])]
+    fit = _fits(start, w, end, before, white, guess)
+    lacking = max(one.lacking for one in fit)
+    found = known(information, scores, precision[:free, :free], scale[:free], lacking if lacking > LACKS else 1.0)
+    names = (*c.names, "the torque's delay")
+    numbers = tuple(_number(c, i, float(x[i]), found, end, ends, scale) for i in range(p))
+    untold = tuple(in_words(found.directions[:, i], names) for i in range(free) if not found.singular[i] > 1.0 / UNKNOWN)
+    delay_error = float(found.errors[p]) if delay_found else None
+    scenario, notes = _with_numbers(start, c, x, end.z[-1])
+    if c.delay and end.z[-1] < -3.0 * found.errors[p]:
+        notes.append("The logged torque acts before its time: it is not the command, and the scenario's delay is 0.")
+    return Identification(
+        scenario,
+        start,
+        c.paths,
+        asked,
+        numbers,
+        found.covariance[:p, :p],
+        float(end.z[-1]),
+        delay_error,
+        found.singular,
+        tuple(in_words(found.directions[:, i], names) for i in range(free)),
+        untold,
+        scale[:p],
+        fit,
+        end.told.residuals,
+        w.t,
+        w.kept,
+        np.array([one.correlations for one in white]),
+        (*notes, *_notes(found, numbers, fit)),
+        logs,
+        end.steps,
+        seconds,
+    )
+
+
+def _number(c: Coordinates, i: int, x: float, found: Known, end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray) -> Number:
+    error = float(found.errors[i])
+    if not np.isfinite(error):
+        return Number(c.names[i], c.units[i], float(c.x[i]), None, None, "cannot be told")
+    at_end = min(abs(end.z[i] - ends[0][i]), abs(end.z[i] - ends[1][i])) < AT_END * scale[i]
+    return Number(c.names[i], c.units[i], float(c.x[i]), x, error, "at its limit" if at_end else "told")
+
+
+def _fits(start: Scenario, w: Windows, end: Refined, before: np.ndarray, white: list[Whiteness], guess: Start) -> tuple[Fit, ...]:
+    def size(r, windows):
+        return np.sqrt(np.mean(r[windows] ** 2, axis=(0, 1))) if np.any(windows) else np.full(r.shape[-1], np.nan)
+
+    first, fitted, others = size(before, w.kept), size(end.told.residuals, w.kept), size(end.told.residuals, ~w.kept)
+    return tuple(
+        Fit(
+            joint=name,
+            before=float(first[j]),
+            after=float(fitted[j]),
+            held_back=float(others[j]),
+            correlation=float(np.max(np.abs(white[j].correlations))),
+            white=white[j].p,
+            explained=float(guess.explained[j]),
+            noise=float(guess.noise[j]),
+        )
+        for j, name in enumerate(joint_names(start.plant, start.n))
+    )
+
+
+def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> list[str]:
+    notes = []
+    widest = float(np.max(found.widened))
+    if not all(one.is_white for one in fit) and widest > CLEARLY:
+        notes.append(f"What is left is coloured: standard errors are up to {widest:.2g} times those of white noise.")
+    worst = max(fit, key=lambda one: one.lacking)
+    if worst.lacking > LACKS:
+        notes.append(
+            f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its positions: the model lacks something "
+            "(dry friction that is not looked for, play, a torque in between samples), and all standard errors are that much larger for it."
+        )
+    for number in numbers:
+        if number.verdict == "at its limit":
+            notes.append(f"{number.name} is at its limit, {number.value:.4g} {number.unit}: its standard error says nothing.")
+    return notes
+
+
+def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) -> tuple[Scenario, list[str]]:
+    """The scenario with the new numbers."""
+    scenario, notes = start, []
+    for path, place in zip(c.paths, c.places, strict=True):
+        own = x[place.start : place.start + place.size].reshape(place.shape)
+        targets = ["plant" + path[5:], "model" + path[5:]] if path.startswith(("robot.", "plant.")) else [path]
+        for target in targets:
+            try:
+                scenario = with_parameters(scenario, {target: own})
+            except ValueError:
+                if target == path or target.startswith("plant"):
+                    raise
+                notes.append(f"The model has no {target}: its number is the plant's alone.")
+    if c.delay:
+        scenario = with_parameters(scenario, {DELAY: max(delay, 0.0)})
+    return scenario, notes

@@ -1,0 +1,450 @@
+"""Parameters from logs that another program made: values and their errors, what a log cannot tell, and logs that are wrong.
+
+The other program is `independent_log`: a two-link arm with friction in NumPy, from p1 ... p5, moved by RK4 under a held torque, its
+encoders of 14 bits; it shares nothing with the package.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import tomli_w
+import xarray
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax import cli
+from iblf_jax.files.identification import load_identification_file
+from iblf_jax.identification import statistics
+from iblf_jax.identification.coordinates import coordinates, to_x, to_z
+from iblf_jax.identification.log import read
+from iblf_jax.identification.shooting import Replay, Torque, windows
+
+MASS, VISCOUS, COULOMB, WIDTH = np.array([2.0, 0.85]), np.array([0.15, 0.08]), np.array([0.2, 0.1]), 0.05
+LENGTH, CENTRE, INERTIA = (0.35, 0.31), (0.175, 0.155), (0.06125, 0.02042125)
+PATHS = ["robot.mass", "disturbance.viscous", "disturbance.coulomb"]
+COUNT = 2.0 * np.pi / 2**14
+
+
+def acceleration(q, dq, tau):
+    """Of the arm that is logged, from the five numbers of section 1 of the literature."""
+    (m1, m2), (l1, _), (c1, c2), (I1, I2) = MASS, LENGTH, CENTRE, INERTIA
+    p1, p2, p3, p4, p5 = m1 * c1**2 + m2 * l1**2 + I1, m2 * c2**2 + I2, m2 * l1 * c2, m1 * c1 + m2 * l1, m2 * c2
+    cosine, sine = np.cos(q[1]), np.sin(q[1])
+    M = np.array([[p1 + p2 + 2 * p3 * cosine, p2 + p3 * cosine], [p2 + p3 * cosine, p2]])
+    coriolis = p3 * sine * np.array([-dq[1] * (2 * dq[0] + dq[1]), dq[0] ** 2])
+    outer = p5 * 9.81 * np.cos(q[0] + q[1])
+    gravity = np.array([p4 * 9.81 * np.cos(q[0]) + outer, outer])
+    return np.linalg.solve(M, tau - coriolis - gravity - VISCOUS * dq - COULOMB * np.tanh(dq / WIDTH))
+
+
+def independent_log(duration=8.0, step=4e-3, seed=0):
+    """t, q in counts, tau: PD about a sum of sinusoids, from the counts."""
+    rng = np.random.default_rng(seed)
+    A, W, P = rng.uniform(0.2, 0.4, (3, 2)), np.array([[1.0, 1.4], [2.3, 3.1], [4.1, 5.3]]), rng.uniform(0, 6.28, (3, 2))
+
+    def reference(t):
+        return np.array([0.6, 0.5]) + np.sum(A * np.sin(W * t + P), axis=0), np.sum(A * W * np.cos(W * t + P), axis=0)
+
+    q, dq = reference(0.0)
+    before, speed, rows = q, dq, []
+    for k in range(round(duration / step)):
+        y = COUNT * np.round(q / COUNT)
+        speed, before = 0.6 * speed + 0.4 * (y - before) / step if k else speed, y
+        wanted, rate = reference(k * step)
+        tau = np.array([8.0, 2.0]) * np.cos(np.cumsum(y)) + np.array([40.0, 8.0]) * (wanted - y) + np.array([4.0, 0.6]) * (rate - speed)
+        rows.append((k * step, y, tau))
+        for _ in range(2):
+            h, (k1, a1) = 0.5 * step, (dq, acceleration(q, dq, tau))
+            k2, a2 = dq + h / 2 * a1, acceleration(q + h / 2 * k1, dq + h / 2 * a1, tau)
+            k3, a3 = dq + h / 2 * a2, acceleration(q + h / 2 * k2, dq + h / 2 * a2, tau)
+            k4, a4 = dq + h * a3, acceleration(q + h * k3, dq + h * a3, tau)
+            q, dq = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), dq + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    t, y, tau = map(np.array, zip(*rows, strict=True))
+    return {"t": t, "q": y, "tau": tau}
+
+
+@pytest.fixture(scope="module")
+def log():
+    return independent_log()
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """What is believed before: other masses, hardly any friction."""
+    robot = ij.robots.TwoLink(mass=[1.6, 1.0], length=LENGTH, centre=CENTRE, inertia=INERTIA)
+    friction = ij.disturbances.Friction(viscous=0.05, coulomb=0.05, width=0.05)
+    return ij.with_parts(ij.presets.zhang_yan_2024(), robot=robot, disturbance=friction)
+
+
+@pytest.fixture(scope="module")
+def known(scenario, log):
+    return ij.identify(scenario, log, PATHS)
+
+
+@pytest.fixture(scope="module")
+def heavier(scenario):
+    """The scenario with the plant's true masses."""
+    return ij.with_parameters(scenario, {"plant.mass": MASS})
+
+
+@pytest.fixture(scope="module")
+def run(heavier):
+    """The paper's motion of it."""
+    return ij.simulate(heavier, duration=6.0, dt=1e-3)
+
+
+def counted(run, rows=slice(None)):
+    """A log of rows of a run, in counts."""
+    return {"t": np.asarray(run.t)[rows], "q": COUNT * np.round(np.asarray(run.q)[rows] / COUNT), "tau": np.asarray(run.tau)[rows]}
+
+
+def z_scores(known, truth):
+    return np.concatenate([(known.values[path] - x) / known.standard_errors[path] for path, x in truth.items()])
+
+
+TRUTH = {"robot.mass": MASS, "disturbance.viscous": VISCOUS, "disturbance.coulomb": COULOMB}
+
+
+def test_true_values_are_within_their_errors_and_masses_within_a_percent(known):
+    assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
+    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
+    assert np.max(known.standard_errors["robot.mass"]) < 1e-3  # an error that is too large covers anything
+    assert all(number.verdict == "told" for number in known.numbers[:6])
+    assert abs(known.delay) < 4.0 * known.delay_error < 1e-3
+
+
+def test_the_fit_is_as_good_as_the_encoder_also_on_what_was_held_back(known):
+    for one in known.fit:
+        for left in (one.after, one.held_back):
+            assert 0.9 < left / (COUNT / np.sqrt(12)) < 1.15
+        assert one.before > 30 * one.after and one.explained > 0.99
+    assert 0 < np.sum(~known.kept) < np.sum(known.kept)
+
+
+def test_the_scenario_has_the_new_numbers_in_plant_and_model(known, scenario):
+    for robot in (known.scenario.plant, known.scenario.model):
+        np.testing.assert_allclose(robot.mass, known.values["robot.mass"])
+    np.testing.assert_allclose(known.scenario.disturbance.coulomb, known.values["disturbance.coulomb"])
+    assert known.scenario.initial.q.dtype == scenario.initial.q.dtype
+    np.testing.assert_array_equal(known.scenario.controller.K2, scenario.controller.K2)
+
+
+def test_what_a_log_leaves_open_is_drawn_together(known):
+    """The draws of a study have the covariance of the identification, also between leaves."""
+    assert set(known.perturbations) == {"plant.mass", "disturbance.viscous", "disturbance.coulomb"}
+    study = ij.monte_carlo(known.scenario, known.perturbations, runs=2000, duration=0.01, dt=1e-3)
+    drawn = np.concatenate([np.asarray(study.samples[path]) for path in known.perturbations], axis=1)
+    size = np.sqrt(np.diag(known.covariance)[:6])
+    np.testing.assert_allclose(drawn.std(axis=0), size, rtol=0.1)
+    np.testing.assert_allclose(np.corrcoef(drawn.T), known.correlation[:6, :6], atol=0.1)
+    assert np.max(np.abs(known.correlation[:6, :6] - np.eye(6))) > 0.3  # else the line above says nothing
+    np.testing.assert_allclose(drawn.mean(axis=0), np.concatenate(list(known.values.values()))[:6], atol=0.1 * size.max())
+
+
+def test_what_a_log_cannot_tell_is_not_the_start_as_an_answer(scenario, log):
+    """m1, lc1 and I1 enter as two numbers, p1 and p4: these are right in the scenario, and the three are not told."""
+    start = ij.with_parameters(scenario, {"robot.mass[1]": MASS[1]})
+    three = ["robot.mass[0]", "robot.centre[0]", "robot.inertia[0]"]
+    known = ij.identify(start, log, [*three, *PATHS[1:]], widths=False)
+    for number in known.numbers[:3]:
+        assert (number.value, number.error, number.verdict) == (None, None, "cannot be told")
+        assert np.isnan(known.values[number.name]) and np.isinf(known.standard_errors[number.name])
+    assert len(known.untold) == 1 and all(name in known.untold[0] for name in three)
+    assert set(known.perturbations) == set(PATHS[1:])
+    (m, _), (lc, _), (J, _) = (np.asarray(getattr(known.scenario.model, name)) for name in ("mass", "centre", "inertia"))
+    assert abs(m - MASS[0]) > 0.01  # it was not found by chance
+    np.testing.assert_allclose(m * lc, MASS[0] * CENTRE[0], rtol=1e-3)
+    np.testing.assert_allclose(m * lc**2 + J, MASS[0] * CENTRE[0] ** 2 + INERTIA[0], rtol=1e-3)
+
+
+def test_a_delay_between_torque_and_position_is_found(scenario, log):
+    late = log | {"t": log["t"][:-2], "q": log["q"][2:], "tau": log["tau"][:-2]}  # positions of 8 ms later
+    known = ij.identify(scenario, late, PATHS, widths=False)
+    assert abs(known.delay + 8e-3) < 5 * known.delay_error
+    assert np.max(np.abs(z_scores(known, TRUTH))) < 5.0
+
+
+def test_irregular_times_and_a_gap(scenario, run, rng):
+    """Rows left out at random, and a third of a second at once; the torque of a continuous loop is interpolated."""
+    rows = np.sort(rng.choice(6000, 3500, replace=False))
+    log = counted(run, rows[(rows < 2000) | (rows > 2300)])
+    assert [len(one.stretches) for one in read(log, 2)] == [2]
+    known = ij.identify(scenario, log, ["robot.mass"], torque="interpolated", held_out=0)
+    assert np.max(np.abs(z_scores(known, {"robot.mass": MASS}))) < 4.0
+    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
+    assert all(np.isnan(one.held_back) for one in known.fit)
+
+
+def test_a_run_is_a_log(scenario, run):
+    """A Rollout of a continuous loop: without noise, the numbers come back."""
+    known = ij.identify(scenario, run, ["robot.mass"])
+    np.testing.assert_allclose(known.values["robot.mass"], MASS, rtol=1e-5)
+
+
+def test_several_logs_and_one_that_is_held_back(scenario, log):
+    first, second = ({name: x[part] for name, x in log.items()} for part in (slice(0, 700), slice(760, None)))
+    both = ij.identify(scenario, [first, second], PATHS, held_out={name: x[:600] for name, x in log.items()})
+    assert np.max(np.abs(z_scores(both, TRUTH))) < 4.0
+    assert np.sum(~both.kept) == 4 and len(both.logs) == 3
+
+
+def test_the_torque_of_a_step_is_its_mean(log):
+    """Held, it is the logged number whatever the times are; late by half a step, that of two samples."""
+    jittered = log["t"] + np.random.default_rng(1).uniform(-1e-3, 1e-3, len(log["t"]))
+    torque = Torque(read({**log, "t": jittered}, 2)[0], held=True)
+    np.testing.assert_allclose(torque.means(jittered, 0.0), log["tau"][:-1], rtol=1e-9, atol=1e-9)
+    late = Torque(read(log, 2)[0], held=True).means(log["t"], 2e-3)
+    np.testing.assert_allclose(late[1:], 0.5 * (log["tau"][:-2] + log["tau"][1:-1]), rtol=1e-9, atol=1e-9)
+
+
+def test_a_delay_of_the_command_is_a_leaf(scenario, log):
+    commanded = {name: (np.roll(x, -1, axis=0) if name == "tau" else x)[:-1] for name, x in log.items()}  # one sample before it acts
+    lab = ij.with_parts(scenario, sampling=ij.Sampling(4e-3, delay=1e-3))
+    known = ij.identify(lab, commanded, [*PATHS, "sampling.delay"], widths=False)
+    assert abs(float(known.scenario.sampling.delay) - 4e-3) < 5 * known.delay_error < 1e-3
+    assert set(known.values) == set(PATHS)
+
+
+def test_outliers_are_borne_by_huber(scenario, log):
+    rng, q = np.random.default_rng(2), log["q"].copy()
+    hit = rng.choice(q.size, 40, replace=False)
+    q.ravel()[hit] += rng.choice([-0.05, 0.05], 40)
+    known = ij.identify(scenario, {**log, "q": q}, PATHS, loss="huber", widths=False)
+    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 2e-3
+
+
+def test_priors_and_limits(scenario, log):
+    """What was known before is believed for what it is worth; what is at a limit is said to be."""
+    options = {"widths": False, "priors": {"robot.mass": (MASS, 1e-7)}, "limits": {"disturbance.coulomb": (0.0, [0.199, 0.15])}}
+    held = ij.identify(scenario, log, PATHS, **options)
+    np.testing.assert_allclose(held.values["robot.mass"], MASS, atol=5e-7)
+    assert np.max(held.standard_errors["robot.mass"]) < 5e-7
+    at_limit = held.numbers[held.names.index("disturbance.coulomb[0]")]
+    assert (at_limit.verdict, at_limit.value) == ("at its limit", 0.199)
+    assert any("disturbance.coulomb[0] is at its limit" in note for note in held.notes)
+    with pytest.raises(ValueError, match=r"priors: got 'plant.g', expected one of the paths"):
+        ij.identify(scenario, log, PATHS, priors={"plant.g": (9.81, 0.1)})
+    with pytest.raises(ValueError, match=r"limits\['robot.mass'\].*a start between"):
+        ij.identify(scenario, log, PATHS, limits={"robot.mass": (3.0, 4.0)})
+
+
+# ------------------------------------------------------------------------------------------------------- logs that are wrong
+
+WRONG = {
+    "degrees": (lambda x: {**x, "q": np.degrees(x["q"])}, "It would fit in degrees"),
+    "newton_millimetres": (lambda x: {**x, "tau": 1e3 * x["tau"]}, "times what the scenario's robot needs .* Convert it to N m"),
+    "kilopond_metres": (lambda x: {**x, "tau": x["tau"] / 9.81}, "with tau in kgf m, they would explain"),
+    "torques_exchanged": (lambda x: {**x, "tau": x["tau"][:, ::-1]}, r"with tau\[0\] and tau\[1\] exchanged"),
+    "positions_exchanged": (lambda x: {**x, "q": x["q"][:, ::-1]}, r"with q\[0\] and q\[1\] exchanged"),
+    "other_sign": (lambda x: {**x, "tau": -x["tau"]}, "with tau of the other sign"),
+    "rows_without_numbers": (
+        lambda x: {**x, "q": np.where(np.arange(len(x["q"]))[:, None] == 7, np.nan, x["q"])},
+        r"got 1 of 2000, the first is row 7 \(in q\)",
+    ),
+    "standing": (lambda x: {**x, "q": x["q"][:1] + COUNT * (np.arange(len(x["q"]))[:, None] % 3 == 0)}, "a robot that stands still"),
+    "times_turn_back": (lambda x: {**x, "t": np.where(np.arange(len(x["t"])) == 9, 0.0, x["t"])}, "times that increase"),
+    "no_torque": (lambda x: {"t": x["t"], "q": x["q"]}, r"got no tau, expected t, q and tau: tau\[0\]"),
+    "joints": (lambda x: {**x, "q": x["q"][:, :1]}, "got 1 joints, expected .* as the scenario has 2 joints"),
+    "short": (lambda x: {name: y[:60] for name, y in x.items()}, "0 windows of 0.5 s to fit"),
+    "shorter": (lambda x: {name: y[:9] for name, y in x.items()}, "got 9 samples, expected at least 50"),
+    "velocities": (lambda x: {**x, "dq": np.degrees(np.gradient(x["q"], x["t"], axis=0))}, r"expected the rate of q\[\d\]"),
+    "nothing": (lambda x: 3.0, "expected a Dataset, a Rollout, the path"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_log_is_told(name, scenario, log):
+    spoil, words = WRONG[name]
+    with pytest.raises(ValueError, match=words):
+        ij.identify(scenario, spoil(log), PATHS)
+
+
+@pytest.mark.parametrize(
+    ("paths", "words"),
+    [
+        (["controller.K2"], "a leaf of robot, plant, model or disturbance"),
+        (["model.mass", "plant.mass"], "plant or model"),
+        (["robot.mass", "plant.mass[0]"], "paths that do not overlap"),
+        (["robot.masss"], "Did you mean"),
+        ([], "a list such as"),
+    ],
+)
+def test_a_wrong_path_is_told(paths, words, scenario, log):
+    with pytest.raises(ValueError, match=words):
+        ij.identify(scenario, log, paths)
+
+
+def test_units_that_a_dataset_states_are_read(log):
+    data = xarray.Dataset({name: (("time",) if x.ndim == 1 else ("time", "joint"), x) for name, x in log.items()})
+    data["q"].attrs["units"] = "deg"
+    with pytest.raises(ValueError, match=r"units of q: got 'deg', expected rad"):
+        read(data, 2)
+    data["q"].attrs["units"] = "rad"
+    np.testing.assert_array_equal(read(data.transpose("joint", "time"), 2)[0].q, log["q"])
+
+
+def test_files(tmp_path, log):
+    table = np.column_stack([log["t"], log["q"], log["tau"]])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t, q[0], q[1], tau[0], tau[1]", comments="", fmt="%.17g")
+    xarray.Dataset({name: (("time",) if x.ndim == 1 else ("time", "joint"), x) for name, x in log.items()}).to_netcdf(
+        tmp_path / "log.nc", engine="scipy"
+    )
+    for name in ("log.csv", "log.nc"):
+        (found,) = read(tmp_path / name, 2)
+        for key in ("t", "q", "tau"):
+            np.testing.assert_array_equal(getattr(found, key), log[key])
+    (tmp_path / "bad.csv").write_text("t, q[0], q[2], tau[0]\n" + "0, 1, 2, 3\n" * 60)
+    with pytest.raises(ValueError, match=r"expected a column q\[1\]"):
+        read(tmp_path / "bad.csv", 2)
+    with pytest.raises(FileNotFoundError):
+        read(tmp_path / "none.csv", 2)
+
+
+# ------------------------------------------------------------------------------------------------------------ report, parts
+
+
+def test_the_report_is_words_json_and_a_page(known, tmp_path):
+    text = repr(known)
+    assert "robot.mass[0]" in text and "held back" in text and "6 of" not in text.split("\n")[2]
+    known.save(tmp_path / "known.json")
+    data = json.loads((tmp_path / "known.json").read_text())
+    assert data["numbers"][0]["value"] == known.numbers[0].value
+    known.save(tmp_path / "known.html")
+    page = (tmp_path / "known.html").read_text()
+    assert page.startswith("<!doctype html>") and "data:image/png;base64," in page and "robot.mass[1]" in page
+    with pytest.raises(ValueError, match=r"ends in .json or .html"):
+        known.save(tmp_path / "known.txt")
+
+
+def test_inertias_stay_those_of_bodies(rng):
+    """Any z is a body, and z, x and their derivative belong together."""
+    scenario = ij.presets.iiwa14()
+    _, c = coordinates(scenario, ["plant.mass", "plant.inertia", "plant.link[iiwa_link_3].centre"], {})
+    z = to_z(c, c.x)
+    np.testing.assert_allclose(to_x(c, z)[0], c.x, rtol=1e-9, atol=1e-12)
+    wild = z + rng.normal(size=z.shape) * (np.arange(len(z)) >= 7)
+    x, slope = to_x(c, wild)
+    for at in c.bodies:
+        xx, yy, zz, xy, xz, yz = x[at : at + 6]
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        assert moments[0] > 0 and moments[0] + moments[1] > moments[2]
+    step = 1e-6 * rng.normal(size=z.shape)
+    np.testing.assert_allclose((to_x(c, wild + step)[0] - to_x(c, wild - step)[0]) / 2, slope @ step, rtol=1e-5, atol=1e-9)
+
+
+def test_standard_errors_are_those_of_repeated_noise(rng):
+    """Windows of a linear model, white and coloured: the errors are the spread of the estimates; what has no information is named."""
+    W, K, p = 40, 30, 3
+    Y = rng.normal(size=(W, K, p))
+    Y[..., 2] = 2.0 * Y[..., 1]  # the log sees x1 + 2 x2 only
+    A = np.swapaxes(Y, 1, 2) @ Y
+
+    def estimate(colour):
+        noise = rng.normal(size=(W, K)) + colour * rng.normal(size=(W, 1))
+        g = -np.einsum("wka,wk->wa", Y, noise)
+        x = np.linalg.lstsq(A.sum(axis=0), -g.sum(axis=0), rcond=1e-9)[0]
+        rest = noise - Y @ x
+        return x, statistics.known(A / np.mean(rest**2), -np.einsum("wka,wk->wa", Y, rest) / np.mean(rest**2), np.zeros((p, p)), np.ones(p))
+
+    for colour in (0.0, 2.0):
+        found = [estimate(colour) for _ in range(300)]
+        spread = np.std([x[0] for x, _ in found])
+        assert 0.85 < np.mean([k.errors[0] for _, k in found]) / spread < 1.35
+    known = found[0][1]
+    assert np.isinf(known.errors[1:]).all() and np.isfinite(known.errors[0])
+    wider = statistics.known(A, -np.einsum("wka,wk->wa", Y, rng.normal(size=(W, K))), np.zeros((p, p)), np.ones(p), lacking=3.0)
+    usual = statistics.known(A, np.zeros((W, p)), np.zeros((p, p)), np.ones(p))
+    assert wider.errors[0] >= 3.0 * usual.errors[0] * (1 - 1e-9)
+    np.testing.assert_allclose(3.0 * wider.singular[:2], usual.singular[:2])
+    words = statistics.in_words(known.directions[:, -1], ("a", "b", "c"))
+    assert words == "0.89 b - 0.45 c"
+
+
+def test_whiteness_tells_noise_from_what_a_model_lacks(rng):
+    noise = rng.normal(size=(30, 200))
+    assert statistics.whiteness(noise).p > 1e-3
+    assert statistics.whiteness(noise + np.cumsum(0.3 * rng.normal(size=noise.shape), axis=1)).p < 1e-6
+
+
+def test_an_excitation_is_inside_its_bounds_and_tells_more(scenario, heavier, run):
+    best = ij.excitation(scenario, PATHS, duration=6.0, iterations=15)
+    rich = ij.simulate(ij.with_parts(heavier, reference=best), duration=6.0, dt=1e-3)
+    assert int(rich.status) == 0 and float(np.min(rich.metrics.margin)) > 0
+    options = {"widths": False, "delay": 0.0, "torque": "interpolated"}
+    found = [ij.identify(scenario, counted(x), PATHS, **options).singular_values for x in (rich, run)]
+    assert np.sum(np.log(found[0])) > np.sum(np.log(found[1])) + 1.0  # seven times the determinant
+    with pytest.raises(ValueError, match=r"bounds: got .* expected room for a motion"):
+        _narrow(scenario)
+
+
+def _narrow(scenario):
+    start = np.asarray(scenario.initial.q)
+    narrow = ij.Bounds(lower=ij.bounds.Sinusoid(offset=start - 0.3, amplitude=0.29, frequency=3.0), upper=ij.bounds.Constant(start + 0.02))
+    ij.excitation(
+        ij.with_parts(scenario, bounds=narrow, reference=ij.references.Sinusoid(offset=start, amplitude=0.0)), PATHS, duration=4.0
+    )
+
+
+def test_joint_draws_in_a_file_and_in_a_design(tmp_path):
+    """The same table as any perturbation; a group without a name, or rows that do not fit, are refused."""
+    from iblf_jax.files.study import study_from_dict
+
+    rows = {"plant.mass[0]": [0.1, 0.0], "plant.mass[1]": [0.05, 0.02]}
+    table = {path: {"value": "joint_normal", "mean": 1.0, "rows": row, "group": "g"} for path, row in rows.items()}
+    data = {"preset": "zhang_yan_2024", "run": {"duration": 0.01, "dt": 1e-3}, "study": {"runs": 1024}, "perturbations": table}
+    file = study_from_dict(data, "study")
+    options = {"runs": 1024, "duration": 0.01, "dt": 1e-3}
+    for sampler in ("independent", "sobol"):
+        drawn = ij.monte_carlo(file.scenario, file.perturbations, sampler=sampler, **options).samples
+        found = np.cov(np.stack([np.asarray(drawn[path]) for path in rows]))
+        L = np.array(list(rows.values()))
+        np.testing.assert_allclose(found, L @ L.T, atol=8e-4)
+    with pytest.raises(ValueError, match="group: got 3, expected a name"):
+        study_from_dict({**data, "perturbations": {"plant.mass[0]": {**table["plant.mass[0]"], "group": 3}}}, "study")
+    with pytest.raises(ValueError, match="joint_normal: rows"):
+        ij.joint_normal([1.0, 2.0], [1.0, 2.0], "g")
+
+
+def test_the_command_line_identifies_and_writes_what_it_found(tmp_path, capsys):
+    out = tmp_path / "known"
+    assert cli.main(["identify", str(ROOT / "examples" / "identify.toml"), "--out", str(out)]) == 0, capsys.readouterr().err
+    assert "6 of 6 numbers told" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {"scenario.toml", "identification.json", "identification.html", "identification.png"}
+    found = ij.load_scenario(out / "scenario.toml")
+    np.testing.assert_allclose(found.model.mass, MASS, rtol=2e-3)
+    np.testing.assert_allclose(json.loads((out / "identification.json").read_text())["numbers"][1]["value"], found.plant.mass[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"identify": {"parameters": ["robot.mass"]}}, r"identify.log: got None, expected the path of a .csv or .nc file"),
+        ({"identify": {"log": "log.csv"}}, r"identify.parameters: got nothing"),
+        ({"identify": {"log": "log.csv", "parameters": ["robot.mass"], "windw": 1.0}}, r"identify.windw: got an unknown key"),
+        ({"identify": {"log": "log.csv", "parameters": ["robot.mass"]}, "limits": {"robot": {"mass": 3.0}}}, r"limits.robot.mass: got 3.0"),
+    ],
+)
+def test_a_wrong_file_is_told(change, words, tmp_path):
+    (tmp_path / "identify.toml").write_text(tomli_w.dumps({"preset": "zhang_yan_2024"} | change))
+    with pytest.raises(ValueError, match=words):
+        load_identification_file(tmp_path / "identify.toml")
+
+
+def test_the_tangents_of_a_replay_are_those_of_finite_differences(scenario, log):
+    """By the start, a mass, friction and the torque's offset in time; and e is the inverse of the acceleration."""
+    replayed_, c = coordinates(scenario, ["plant.mass[1]", "disturbance.viscous[0]"], {})
+    (one,) = read({name: x[:200] for name, x in log.items()}, 2)
+    cut = windows([one], 0.25, [0.0], held=True)
+    replay = Replay(replayed_, c, cut, [one], True, "squares", 1)
+    z, starts = np.append(c.x, 5e-4), np.concatenate([cut.q, cut.dq], axis=1)
+    stretches, q, dq = replay.moved(z, starts)
+    J, along = replay._slopes(z, stretches, q, dq)
+    for i in range(7):
+        step = 1e-4 * (np.arange(7) == i)
+        after, before = (replay.moved(z + s * step[4:], starts + s * step[:4])[1] for s in (1.0, -1.0))
+        share = 2e-3 if i < 6 else 0.05  # the offset's is taken over a sample, as a held torque is a staircase
+        np.testing.assert_allclose(J[..., i], (after - before) / 2e-4, atol=share * np.max(np.abs(J[..., i])))
+    np.testing.assert_allclose(along.torque, np.asarray(stretches.tau).reshape(-1, 2), atol=1e-9)

@@ -1,0 +1,72 @@
+"""Seven joints that MuJoCo moved: an engine that shares nothing with the package, under a computed torque with wrong masses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import disturbances
+
+COUNT = 2.0 * np.pi / 2**14
+DAMPING, ARMATURE = np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2]), np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+FACTOR = np.array([1.0, 1.1, 0.9, 1.08, 0.93, 1.05, 1.4])
+"""True masses by those of the file."""
+MIDDLE = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
+
+
+def described(arm, mass):
+    """The arm as an MJCF."""
+
+    def words(x):
+        return " ".join(f"{float(y):.17g}" for y in np.ravel(x))
+
+    text = '<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="RK4" gravity="0 0 -9.81"/><worldbody>'
+    for i in range(arm.n):
+        text += f'<body pos="{words(arm.position[i])}" quat="{words(arm.rotation[i])}"><joint axis="{words(arm.axis[i])}" '
+        text += f'damping="{DAMPING[i]}" armature="{ARMATURE[i]}"/><inertial pos="{words(arm.centre[i])}" mass="{mass[i]:.17g}" '
+        text += f'fullinertia="{words(arm.inertia[i])}"/>'
+    return text + "</body>" * arm.n + "</worldbody></mujoco>"
+
+
+def logged(arm, duration, seed=0, step=2e-3):
+    """t, q in counts and the held torque."""
+    import mujoco
+
+    rng = np.random.default_rng(seed)
+    A, P = rng.uniform(0.1, 0.3, (3, 7)), rng.uniform(0, 6.28, (3, 7))
+    W = np.array([[1.0], [2.2], [4.0]]) * rng.uniform(0.8, 1.2, (3, 7))
+    nominal = np.asarray(arm.mass)
+    true, known = (mujoco.MjModel.from_xml_string(described(arm, mass)) for mass in (nominal * FACTOR, nominal))
+    moving, thinking = mujoco.MjData(true), mujoco.MjData(known)
+    moving.qpos[:], moving.qvel[:] = MIDDLE + np.sum(A * np.sin(P), axis=0), np.sum(A * W * np.cos(P), axis=0)
+    before, speed, M, rows = None, moving.qvel.copy(), np.zeros((7, 7)), []
+    for k in range(round(duration / step)):
+        t, y = k * step, COUNT * np.round(moving.qpos / COUNT)
+        speed, before = speed if before is None else 0.7 * speed + 0.3 * (y - before) / step, y
+        wanted = [MIDDLE + np.sum(A * np.sin(W * t + P), axis=0), np.sum(A * W * np.cos(W * t + P), axis=0)]
+        thinking.qpos[:], thinking.qvel[:] = y, speed
+        mujoco.mj_forward(known, thinking)
+        mujoco.mj_fullM(known, thinking, M)
+        push = -np.sum(A * W**2 * np.sin(W * t + P), axis=0) + 100.0 * (wanted[0] - y) + 20.0 * (wanted[1] - speed)
+        tau = M @ push + thinking.qfrc_bias + DAMPING * wanted[1]
+        rows.append((t, y, tau))
+        moving.qfrc_applied[:] = tau
+        mujoco.mj_step(true, moving, nstep=4)
+    return dict(zip(("t", "q", "tau"), map(np.array, zip(*rows, strict=True)), strict=True))
+
+
+@pytest.mark.release
+def test_seven_joints_of_mujoco():
+    """Masses, damping and armature within their errors, masses within a percent; the first link's mass and armature are one number."""
+    pytest.importorskip("mujoco")
+    scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=disturbances.Nothing())
+    start = ij.with_parameters(scenario, {"robot.damping": 0.5, "robot.armature": 0.05})
+    known = ij.identify(start, logged(scenario.plant, 12.0), ["robot.mass", "robot.damping", "robot.armature"])
+    truth = {"robot.mass": np.asarray(scenario.plant.mass) * FACTOR, "robot.damping": DAMPING, "robot.armature": ARMATURE}
+    z = np.concatenate([(known.values[path] - x) / known.standard_errors[path] for path, x in truth.items()])
+    untold = {number.name for number in known.numbers if number.value is None}
+    assert untold == {"robot.mass[0]", "robot.armature[0]"}
+    assert np.nanmax(np.abs(z)) < 4.0 and np.mean(np.abs(z[np.isfinite(z)]) < 3.0) > 0.9
+    assert np.nanmax(np.abs(known.values["robot.mass"] / truth["robot.mass"] - 1.0)) < 0.01
+    assert all(one.after < 1.15 * COUNT / np.sqrt(12) for one in known.fit)
