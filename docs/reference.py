@@ -19,7 +19,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "studies": (
         "Studies",
         "monte_carlo Study sweep load_sweep StoreError sensitivity Sensitivity compare Comparison factor offset value uniform normal "
-        "log_uniform choice",
+        "log_uniform choice joint_normal",
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
     "tuning": ("Tuning", "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning"),

@@ -314,7 +314,7 @@ def test_the_report_is_words_json_and_a_page(known, tmp_path):
     assert data["numbers"][0]["value"] == known.numbers[0].value
     known.save(tmp_path / "known.html")
     page = (tmp_path / "known.html").read_text()
-    assert page.startswith("<!doctype html>") and "data:image/png;base64," in page and "robot.mass[1]" in page
+    assert page.startswith("<!DOCTYPE html>") and "data:image/png;base64," in page and "robot.mass[1]" in page
     with pytest.raises(ValueError, match=r"ends in .json or .html"):
         known.save(tmp_path / "known.txt")
 
