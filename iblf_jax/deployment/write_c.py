@@ -166,7 +166,7 @@ def shared_values(
 ) -> dict[str, Any]:
     """What the templates of laws and loops ask for alike; `start` and `sample` are generated functions."""
     is_float = dtype == np.float32
-    return {
+    values = {
         "name": name,
         "upper": name.upper(),
         "guard": f"{name.upper()}_H",
@@ -183,6 +183,7 @@ def shared_values(
         "start": start,
         "sample": sample,
     }
+    return values | {"prelude": filled("prelude.c", values)}
 
 
 def title_of(scenario: Scenario) -> str:

@@ -1,24 +1,6 @@
 /* ${title}
    Written by iblf_jax ${version}; what it offers stands in ${name}.h. */
-#include "${name}.h"
-
-#include <math.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
-
-typedef ${name}_real real;
-typedef ${name}_real F;
-typedef ${integer} I;
-typedef I integer;
-#define FN(name) ${suffix}
-${plain}
-${lookup}
-const ${name}_parameters ${name}_defaults = ${defaults};
-
-${start}
-${sample}
-static int are_finite(const real *x, int count) {
+${prelude}static int are_finite(const real *x, int count) {
   int k, yes = 1;
   for (k = 0; k < count; k++) yes = yes && FN(fabs)(x[k]) < (real)INFINITY;
   return yes;

@@ -1,22 +1,6 @@
 /* The closed loop of ${title}
    Written by iblf_jax ${version}; what it offers stands in ${name}.h. */
-#include "${name}.h"
-
-#include <math.h>
-#include <string.h>
-
-typedef ${name}_real real;
-typedef ${name}_real F;
-typedef ${integer} I;
-typedef I integer;
-#define FN(name) ${suffix}
-${plain}
-${lookup}
-const ${name}_parameters ${name}_defaults = ${defaults};
-
-${start}
-${sample}
-void ${name}_start(const ${name}_parameters *p, const real *settings, ${name}_state *s) {
+${prelude}void ${name}_start(const ${name}_parameters *p, const real *settings, ${name}_state *s) {
   s->index = 0;
   ${name}_begin(p, settings, s->memory);
 }
