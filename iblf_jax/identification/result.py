@@ -232,7 +232,9 @@ class Identification:
     def _lines(self) -> list[str]:
         lines = [f"  cannot be told: {words}" for words in self.untold]
         error = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
-        late = f"acts {1e3 * self.delay:.3g} ms late ({error})" if self.delay_error != math.inf else "is late by what the log cannot tell"
+        early = self.delay < -3.0 * (self.delay_error or 0.0)
+        late = f"acts {1e3 * (-self.delay if early else self.delay):.3g} ms {'before its time' if early else 'late'} ({error})"
+        late = late if self.delay_error != math.inf else "is late by what the log cannot tell"
         return [*lines, f"  the logged torque {late}", *(f"  {note}" for note in self.notes)]
 
     def to_dict(self) -> dict[str, Any]:
