@@ -420,7 +420,9 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
     if worst.lacking > LACKS:
         notes.append(
             f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its positions: the model lacks something "
-            "(dry friction that is not looked for, play, a torque in between samples), and all standard errors are that much larger for it."
+            "(dry friction that is not looked for, a column of the other sign, play, a torque in between samples), and all standard "
+            "errors are that much larger for it"
+            + ("; a model that fits tells more." if any(number.value is None for number in numbers) else ".")
         )
     for number in numbers:
         if number.verdict == "at its limit":
