@@ -107,6 +107,8 @@ def coordinates(scenario: Scenario, given: Any, limits: Mapping[str, Any]) -> tu
       ValueError: an unknown or overlapping path, one that does not move the plant, or limits that exclude the start.
     """
     wanted = [checks.word("paths", path, "a path") for path in checks.listed("paths", given, '["plant.mass", "plant.damping"]')]
+    if DELAY in wanted and scenario.sampling is None:
+        raise checks.fail("paths", DELAY, "a scenario with a sampling, which holds it", "Leave it out: known.delay is found in any case.")
     check_paths(scenario, wanted, "paths")
     scenario, moved = replayed_scenario(scenario, wanted)
     for path in limits:

@@ -105,10 +105,19 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
     if path.suffix.lower() != ".csv":
         raise checks.fail("log", str(path), "a file that ends in .csv or .nc")
     with open(path, newline="", encoding="utf-8-sig") as file:
-        heading = [word.strip() for word in next(csv.reader(file), [])]
+        heading = [word.strip().removeprefix("# ") for word in next(csv.reader(file), [])]  # numpy.savetxt's begins with "# "
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # no rows at all, or rows of other lengths: told below
-            rows = np.genfromtxt(file, delimiter=",", ndmin=2, invalid_raise=False)
+            warnings.simplefilter("ignore")  # no rows at all: told below
+            try:
+                rows = np.genfromtxt(file, delimiter=",", ndmin=2)
+            except ValueError as error:
+                short = re.search(r"Line #(\d+) \(got (\d+) columns instead of (\d+)\)", str(error))
+                if short is None:
+                    raise checks.fail(str(path), Said(str(error)), "rows of numbers") from error
+                came = Said(f"{short[2]} columns in row {int(short[1]) - 1}")
+                raise checks.fail(
+                    str(path), came, f"{short[3]}, as in the rows before", "Leave this row out: a gap is understood."
+                ) from error
     if "t" not in heading or rows.shape[1] != len(heading):
         came = Said(f"the heading {', '.join(heading) or 'of an empty file'} and rows of {rows.shape[1]} columns")
         raise checks.fail(str(path), came, "a column t, and one column for each word of the heading", "It begins t, q[0], q[1], ...")
@@ -186,5 +195,10 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
-        raise checks.fail(f"{what}: t", Said(f"{t[k]:.9g} and then {t[k + 1]:.9g} in rows {k} and {k + 1}"), "times that increase")
+        raise checks.fail(
+            f"{what}: t",
+            Said(f"{t[k]:.9g} and then {t[k + 1]:.9g} in rows {k} and {k + 1}"),
+            "times that increase",
+            "Leave out rows that repeat a time, or log times with more digits.",
+        )
     return Log(what, t, found["q"], found["tau"], found.get("dq"))

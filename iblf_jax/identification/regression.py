@@ -44,6 +44,8 @@ OTHER_UNITS = {
 """Torques as they are logged too, and their factor to N m."""
 SLOWEST = 0.02
 """Speed, root of the mean square over all joints, below which a robot stands still [rad/s]."""
+FAR = 0.1
+"""Motion that one who stands still does not make [rad]: if it is that slow, the times are in another unit."""
 OUTSIDE = 0.1
 """Part of a joint's range by which a log may be outside of it."""
 LARGEST_DELAY = 0.1
@@ -110,7 +112,7 @@ def started(scenario: Any, c: Coordinates, seen: Smoothed, what: str, delay: flo
         rest = residual(_slopes(scenario, c, to_x(c, z[:-1])[0], seen).torque, z[-1])
         sigma = np.sqrt(np.mean(rest**2, axis=0)) + 1e-3 * sigma
     explained = _explained(rest, seen.tau)
-    if np.sum(rest**2) > (1 - POOR) * np.sum((seen.tau - seen.tau.mean(axis=0)) ** 2):
+    if _left(rest, seen.tau) > 1 - POOR or np.sum(rest**2) > (1 - POOR) * np.sum((seen.tau - seen.tau.mean(axis=0)) ** 2):
         _say_what_is_wrong(scenario, c, seen, rest, what)
     _same_size(c, to_x(c, z[:-1])[0], what)
     return Start(z[:p], float(z[-1]), scale, explained, seen.noise)
@@ -134,6 +136,11 @@ def _explained(rest: np.ndarray, tau: np.ndarray) -> np.ndarray:
     return 1.0 - np.sum(rest**2, axis=0) / np.maximum(spread, 1e-300)
 
 
+def _left(rest: np.ndarray, tau: np.ndarray) -> float:
+    """Share of the torques' variation that is left, the mean over the joints: a small joint whose column is wrong is seen too."""
+    return float(np.mean(np.minimum(1.0 - _explained(rest, tau), 1.0)))
+
+
 # ------------------------------------------------------------------------------------------------------------ does it belong?
 
 
@@ -141,6 +148,14 @@ def _moves(scenario: Any, seen: Smoothed, what: str) -> None:
     """Raises ValueError for a robot that stands still, or that is where it cannot be."""
     speed = np.sqrt(np.mean(seen.dq**2, axis=0))
     if np.sqrt(np.sum(speed**2)) < SLOWEST:
+        far, long = float(np.max(np.ptp(seen.q, axis=0))), float(np.ptp(seen.t))
+        if far > FAR:
+            raise checks.fail(
+                f"{what}: t",
+                Said(f"{far:.3g} rad of motion in {long:.4g} s"),
+                f"times in s, and motion of at least {SLOWEST:g} rad/s",
+                "Divide times in ms by 1000.",
+            )
         raise checks.fail(
             what,
             Said(f"a robot that stands still: its joints move at {np.sqrt(np.sum(speed**2)):.2g} rad/s (root of the mean square)"),
@@ -226,21 +241,24 @@ def _say_what_is_wrong(scenario: Any, c: Coordinates, seen: Smoothed, rest: np.n
     """Raises ValueError if other columns or units explain the torques, or if nothing does."""
     spread = np.sum((seen.tau - seen.tau.mean(axis=0)) ** 2)
     share = 1.0 - np.sum(rest**2) / spread
-    best, words = 1.0 - share, ""
+    own, words = _left(rest, seen.tau), ""
+    best = own
+    same = _slopes(scenario, c, c.x, seen)
     for said, other in _otherwise(seen):
-        found = _slopes(scenario, c, c.x, other)
+        found = same if other.q is seen.q else _slopes(scenario, c, c.x, other)
         J, r = np.asarray(found.by_x), other.tau - np.asarray(found.torque)
-        A = np.concatenate([J.reshape(-1, J.shape[-1])], axis=0)
+        A = J.reshape(-1, J.shape[-1])
         weight = np.tile(1.0 / (other.tau.std(axis=0) + 1e-9), len(r))
         step = np.linalg.lstsq(A * weight[:, None], r.ravel() * weight, rcond=1e-6)[0]
-        left = float(np.sum((r.ravel() - A @ step) ** 2) / np.sum((other.tau - other.tau.mean(axis=0)) ** 2))
+        left = _left(r - J @ step, other.tau)
         if left < min(0.5 * best, 1.0 - LITTLE):
             best, words = left, said
     if words:
         raise checks.fail(
             what,
             Said(
-                f"torques of which these parameters explain {max(share, 0.0):.0%}; {words}, they would explain {max(1.0 - best, 0.0):.0%}"
+                f"torques of which these parameters explain {1.0 - own:.0%}, the mean over joints; "
+                f"{words}, they would explain {1.0 - best:.0%}"
             ),
             "columns in order and SI units",
             "Check the log.",
@@ -261,8 +279,18 @@ def _otherwise(seen: Smoothed) -> Any:
     yield "with q in degrees", seen._replace(q=seen.q * turn, dq=seen.dq * turn, ddq=seen.ddq * turn)
     for words, factor in OTHER_UNITS.items():
         yield words, seen._replace(tau=factor * seen.tau)
+    for j in range(n if n > 1 else 0):
+        sign = np.where(np.arange(n) == j, -1.0, 1.0)
+        yield f"with tau[{j}] of the other sign", seen._replace(tau=sign * seen.tau)
+        yield f"with q[{j}] of the other sign", seen._replace(q=sign * seen.q, dq=sign * seen.dq, ddq=sign * seen.ddq)
+        yield (
+            f"with q[{j}] and tau[{j}] of the other sign",
+            seen._replace(q=sign * seen.q, dq=sign * seen.dq, ddq=sign * seen.ddq, tau=sign * seen.tau),
+        )
     for i, j in itertools.combinations(range(n), 2):
         order = list(range(n))
         order[i], order[j] = j, i
         yield f"with tau[{i}] and tau[{j}] exchanged", seen._replace(tau=seen.tau[:, order])
-        yield f"with q[{i}] and q[{j}] exchanged", seen._replace(q=seen.q[:, order], dq=seen.dq[:, order], ddq=seen.ddq[:, order])
+        moved = seen._replace(q=seen.q[:, order], dq=seen.dq[:, order], ddq=seen.ddq[:, order])
+        yield f"with q[{i}] and q[{j}] exchanged", moved
+        yield f"with joints {i} and {j} exchanged, q and tau", moved._replace(tau=seen.tau[:, order])

@@ -232,7 +232,9 @@ class Identification:
     def _lines(self) -> list[str]:
         lines = [f"  cannot be told: {words}" for words in self.untold]
         error = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
-        late = f"acts {1e3 * self.delay:.3g} ms late ({error})" if self.delay_error != math.inf else "is late by what the log cannot tell"
+        early = self.delay < -3.0 * (self.delay_error or 0.0)
+        late = f"acts {1e3 * (-self.delay if early else self.delay):.3g} ms {'before its time' if early else 'late'} ({error})"
+        late = late if self.delay_error != math.inf else "is late by what the log cannot tell"
         return [*lines, f"  the logged torque {late}", *(f"  {note}" for note in self.notes)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -418,7 +420,9 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
     if worst.lacking > LACKS:
         notes.append(
             f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its positions: the model lacks something "
-            "(dry friction that is not looked for, play, a torque in between samples), and all standard errors are that much larger for it."
+            "(dry friction that is not looked for, a column of the other sign, play, a torque in between samples), and all standard "
+            "errors are that much larger for it"
+            + ("; a model that fits tells more." if any(number.value is None for number in numbers) else ".")
         )
     for number in numbers:
         if number.verdict == "at its limit":

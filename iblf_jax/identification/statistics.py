@@ -20,8 +20,9 @@ import numpy as np
 
 UNKNOWN = 0.5
 """Standard error, in scales, from which a number, or a combination of numbers, counts as not told."""
-FEWEST_WINDOWS = 12
-"""Below which leaving out one window says nothing."""
+FEWEST_WINDOWS = 4
+"""Below which leaving out one window says nothing.  A few windows say it roughly, but counts of an encoder are far from white: without it,
+10 to 25 % of the numbers of 12 logs of 6 and 4 s, at 500 Hz and 14 bits, were more than three standard errors off."""
 LAGS = 20
 CLEAR = 0.1
 """Part of a direction's largest share from which a number is named in it."""
