@@ -10,20 +10,20 @@ import sys
 import warnings
 
 import arm_cases
-import fmpy
 import jax
 import jax.numpy as jnp
 import members
 import numpy as np
 import pytest
-import wasmtime
-from fmpy.fmi3 import FMU3Slave
-from fmpy.validation import validate_fmu
 
 import iblf_jax as ij
 from iblf_jax.deployment.control_law import Told, control_law, sample, start
 from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, written
 from iblf_jax.simulation.scenario import canonical
+
+fmpy, wasmtime = pytest.importorskip("fmpy"), pytest.importorskip("wasmtime")
+validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu
+FMU3Slave = pytest.importorskip("fmpy.fmi3").FMU3Slave
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")
 SANE = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover")
