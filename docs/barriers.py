@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from reference import _body
+from reference import body
 
 import iblf_jax as ij
 
@@ -52,7 +52,7 @@ def write(folder: Path) -> None:
     names = []
     for name, cls in ij.barriers.MEMBERS.items():
         draw(cls(), folder / f"barrier_{name}.png")
-        text = f"# {cls.__name__}\n\n{_body(inspect.getdoc(cls) or '')}\n\n![V1, slope and alpha](barrier_{name}.png)\n\n"
+        text = f"# {cls.__name__}\n\n{body(inspect.getdoc(cls) or '')}\n\n![V1, slope and alpha](barrier_{name}.png)\n\n"
         told = f"Drawn for bounds at {LOWER:g} and {UPPER:g} rad, the upper one falling by 0.1 rad/s; k1 = 1 1/s, o = 0.1 1/s^2."
         (folder / f"barrier_{name}.md").write_text(text + told + " Beyond the bounds the guard goes on along the tangent.\n")
         names.append(f"barrier_{name}")

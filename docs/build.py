@@ -7,7 +7,6 @@ CONTRIBUTING and of the benchmarks' results.  Any warning of Sphinx is an error.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import subprocess
@@ -19,16 +18,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 import nbformat
+from gallery import digest
 
 SITE = ROOT / "out" / "site"
 SOURCE = SITE / "source"
 EXECUTED = SITE / "notebooks"
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-
-
-def digest(notebook: Path) -> str:
-    """What an executed notebook says of the one that it was made from."""
-    return hashlib.sha256(notebook.read_bytes()).hexdigest()[:16]
 
 
 def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
@@ -86,8 +81,7 @@ def assemble() -> None:
     flags.write(SOURCE / "how_to")
     barriers.write(SOURCE / "theory")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "benchmarks.md")
-    guide = (ROOT / "CONTRIBUTING.md").read_text()
-    (SOURCE / "contributing.md").write_text(guide)
+    shutil.copy(ROOT / "CONTRIBUTING.md", SOURCE / "contributing.md")
 
 
 def main() -> int:

@@ -21,9 +21,9 @@ MADE = ROOT / "out" / "site" / "gallery"
 DPI = 110
 
 
-def digest(script: Path) -> str:
-    """What a page says of the script that it was made from."""
-    return hashlib.sha256(script.read_bytes()).hexdigest()[:16]
+def digest(source: Path) -> str:
+    """What a page says of the script, or of the notebook, that it was made from."""
+    return hashlib.sha256(source.read_bytes()).hexdigest()[:16]
 
 
 def is_made(script: Path) -> bool:

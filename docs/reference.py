@@ -39,7 +39,7 @@ def page_of(thing: Any, name: str, level: int = 2) -> str:
     lines = [f"{'#' * level} {name}", ""]
     if callable(thing):
         lines += ["```python", f"{name}{_signature(thing)}", "```", ""]
-    return "\n".join([*lines, _body(doc), ""])
+    return "\n".join([*lines, body(doc), ""])
 
 
 def _signature(thing: Any) -> str:
@@ -52,7 +52,7 @@ def _signature(thing: Any) -> str:
     return text if len(text) < 90 else text.replace("(", "(\n    ", 1).replace(", ", ",\n    ").replace(") ->", "\n) ->")
 
 
-def _body(doc: str) -> str:
+def body(doc: str) -> str:
     """A docstring in Markdown: sections as lists, what is set in (equations, code) as text."""
     out, section, inside = list[str](), "", False
     first, _, rest = doc.partition("\n")
@@ -92,7 +92,7 @@ def write(folder: Path) -> None:
         module = getattr(ij, family)
         members = {cls.__name__: cls for cls in module.MEMBERS.values()}
         texts = [page_of(cls, name) for name, cls in members.items()]
-        (folder / f"{family}.md").write_text(f"# {family.capitalize()}\n\n{_body(inspect.getdoc(module) or '')}\n\n" + "\n".join(texts))
+        (folder / f"{family}.md").write_text(f"# {family.capitalize()}\n\n{body(inspect.getdoc(module) or '')}\n\n" + "\n".join(texts))
         names.append(family)
     listed = "\n".join(names)
     (folder / "index.md").write_text(

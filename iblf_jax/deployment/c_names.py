@@ -101,6 +101,11 @@ class Parameters(NamedTuple):
         assert len(numbers) == sum(np.size(x) for x in jax.tree.leaves(scenario))
         return Parameters(tuple(_in_order(_nested(fields))), tuple(numbers))
 
+    @property
+    def size(self) -> int:
+        """How many numbers they are."""
+        return sum(math.prod(field.shape) for field in self.fields)
+
     def declaration(self, real: str, joints: Sequence[str] = ()) -> str:
         """The members of the struct, of the type `real`."""
         return "\n".join(_members(_nested(self.fields), 1, real, joints)) or f"  {real} none;"

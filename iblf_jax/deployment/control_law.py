@@ -66,7 +66,7 @@ class Told(NamedTuple):
     ddq_d: Any = ()
 
 
-class Said(NamedTuple):
+class Outputs(NamedTuple):
     """What it answers."""
 
     tau: jax.Array
@@ -79,7 +79,7 @@ class Said(NamedTuple):
 
 
 FLAGS = ("outside", "guarded", "saturated", "infeasible")
-"""Fields of `Said` that are flags, in the order of their bits."""
+"""Fields of `Outputs` that are flags, in the order of their bits."""
 
 
 def _at(scenario: Scenario, told: Told) -> Scenario:
@@ -98,7 +98,7 @@ def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
     return Memory(scenario.controller.init(q, dq, scenario.setting), observer, filtered), scenario.model.gravity(q)
 
 
-def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Said]:
+def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Outputs]:
     """One sample: the memory at the next one, and what is said."""
     scenario, velocity, n = _at(scenario, told), _velocity(scenario), scenario.n
     dq, filtered = told.dq, ()
@@ -110,7 +110,7 @@ def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Said
     infeasible = jnp.zeros((), bool)
     for slack in jax.tree.leaves((command.slack, command.region_slack)):
         infeasible |= jnp.any(slack > 0)
-    said = Said(
+    said = Outputs(
         command.tau,
         command.alpha,
         answer.f_hat,
@@ -133,7 +133,7 @@ class ControlLaw(NamedTuple):
     start: Program
     """Of `start`; its samples are the memory and the torque."""
     sample: Program
-    """Of `sample`; it carries the memory, and its samples are `Said`."""
+    """Of `sample`; it carries the memory, and its samples are `Outputs`."""
     memory: tuple[str, ...]
     """What each number of the memory is."""
     reads_velocity: bool

@@ -153,7 +153,7 @@ def _loop(scenario: Scenario, folder: Path, target: str, name: str, dt: float, m
         loop_fmu(scenario, made, settings, folder / f"{name}.fmu")
         files = (f"{name}.fmu",)
     width = loop.step.dtype.itemsize
-    sizes = {"state": width * loop.size + 8, "parameters": width * sum(math.prod(f.shape) for f in made.parameters.fields)}
+    sizes = {"state": width * loop.size + 8, "parameters": width * made.parameters.size}
     return Exported(folder, target, files, operations_of(loop.step), sizes, tuple(field.path for field in made.parameters.fields))
 
 

@@ -91,7 +91,6 @@ def _loop(scenario: Scenario, dt: float, method: str) -> dict[str, Any]:
         table = json.loads((Path(folder) / "iblf_loop.json").read_text())
     for row in table["parameters"]:
         row |= _slider(scenario, row)
-    table["count"] = sum(int(np.prod(row["shape"])) for row in table["parameters"])
     table["flags"] = [(int(flag), words) for flag, words in WORDS.items()]
     table["failed"] = int(FAILED)
     return {"wasm": module, "table": table}

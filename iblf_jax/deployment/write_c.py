@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -135,7 +134,7 @@ def written(law: Law) -> Written:
     sample = plain_function(programs.sample, f"{name}_sample", seen, inputs, _places(results[1]), SEGMENT)
     operations = operations_of(programs.sample)
     state_bytes = real_bytes * (max(size, 1) + 3 * n)
-    parameter_bytes = real_bytes * max(1, sum(math.prod(f.shape) for f in parameters.fields))
+    parameter_bytes = real_bytes * max(1, parameters.size)
     stack_bytes = max(stack_of(start, real_bytes), stack_of(sample, real_bytes)) + real_bytes * results[1]
     keep = "memcpy(s->memory, result, sizeof s->memory);\n{}" if size else ""
     values = shared_values(scenario, name, programs.sample.dtype, parameters, law.joints, start, sample) | {

@@ -75,7 +75,7 @@ def table(written: WrittenLoop, settings: list[float]) -> dict[str, Any]:
     values, n = written.values, written.values["joints"]
     columns = [{"name": name, "unit": unit, "offset": k * n, "size": n} for k, (name, unit) in enumerate(OUTPUTS.items())]
     columns.append({"name": "status", "unit": "1", "offset": len(OUTPUTS) * n, "size": 1})
-    said = {"parameters": rows, "settings": settings, "records": columns, "record": values["told"]}
+    said = {"parameters": rows, "count": offset, "settings": settings, "records": columns, "record": values["told"]}
     return said | {"bytes": 8 if values["type"] == "double" else 4, "joints": n, "method": values["method"], "version": __version__}
 
 
