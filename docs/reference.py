@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import equations
+
 import iblf_jax as ij
 
 SECTIONS = ("Args", "Returns", "Raises", "Source")
@@ -53,31 +55,29 @@ def _signature(thing: Any) -> str:
 
 
 def body(doc: str) -> str:
-    """A docstring in Markdown: sections as lists, what is set in (equations, code) as text."""
-    out, section, inside = list[str](), "", False
+    """A docstring in Markdown: sections as lists, what is set in as an equation, or as code where it is Python's."""
+    out, section, set_in = list[str](), "", list[str]()
     first, _, rest = doc.partition("\n")
     if re.match(r"[\w']+ = ", first):
-        out, doc = ["```text", re.sub(r" {4,}", "    ", first), "```"], rest
-    for line in doc.splitlines():
+        out, doc = [equations.block([first])], rest
+    for line in [*doc.splitlines(), ""]:
         head = re.fullmatch(rf"({'|'.join(SECTIONS)}):(.*)", line)
-        set_in = line.startswith("    ") and not section
-        if inside and not set_in and line.strip():
-            out.append("```\n")
-            inside = False
+        if line.startswith("    ") and not section:
+            set_in.append(line[4:])
+            continue
+        if set_in:
+            python = any(text.startswith(("@", "class ", "def ")) for text in set_in)
+            out += ["\n```python", *set_in, "```\n"] if python else ["", equations.block(set_in)]
+            set_in = []
         if head:
             section = head[1]
             out.append(f"\n**{section}**{head[2] and ':' + head[2]}\n")
-        elif set_in:
-            if not inside:
-                out.append("\n```text")
-                inside = True
-            out.append(line[4:])
         elif section in ("Args", "Raises") and re.match(r"  \S", line):
             what, _, rest = line.strip().partition(": ")
             out.append(f"- **{what}**: {rest}" if rest else f"- {what}")
         else:
             out.append(line.strip() if section else line)
-    return "\n".join(out + (["```"] if inside else []))
+    return "\n".join(out)
 
 
 def write(folder: Path) -> None:

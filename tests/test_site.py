@@ -10,6 +10,7 @@ import pytest
 from conftest import ROOT
 
 sys.path.insert(0, str(ROOT / "docs"))
+import equations
 import flags
 import gallery
 import reference
@@ -63,3 +64,24 @@ def test_every_public_name_is_in_the_reference():
     modules = {name for name in classes if type(getattr(ij, name)).__name__ == "module"}
     missing = classes - listed - modules - {"TYPE_CHECKING"}
     assert not missing, f"docs/reference.py lacks {sorted(missing)}"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("s = e1 / cos(theta)^2", r"s = e_{1} / \cos (\theta )^{2}"),
+        ("f_hat = eta + kf M0 q'", r"\hat{f} = \eta  + k_{f}\,M_{0}\,q'"),
+        ("V1 = int_0^xi 2 s ds    (2.6), (3.1)", r"V_{1} = \int _{0}^{\xi } 2 s\,\mathrm{d} s\quad\text{(2.6), (3.1)}"),
+        ("k = k_u if e1 > 0,   z_(k+1) <= 1", "k = k_{u}\\ \\text{if}\\ e_{1} > 0, \\\\\nz_{k+1} \\le  1"),
+    ],
+)
+def test_an_equation_for_terminals_is_one_in_tex(text, expected):
+    assert equations.tex(text) == expected
+
+
+def test_every_equation_of_the_reference_is_shown_as_one():
+    members = [cls for family in reference.FAMILIES for cls in getattr(ij, family).MEMBERS.values()]
+    pages = [reference.page_of(thing, thing.__name__) for thing in [*members, ij.simulate, ij.identify, ij.Sampling]]
+    shown = [text for page in pages for text in re.findall(r"\$\$\n(.*?)\n\$\$", page, re.DOTALL)]
+    assert len(shown) > len(members) / 2
+    assert all(text.count("{") == text.count("}") for text in (shown_text.replace(r"\{", "").replace(r"\}", "") for shown_text in shown))

@@ -16,11 +16,11 @@ from iblf_jax.core.pytree import component, static
 
 @component
 class Tan:
-    """V1 = k^2/pi tan(th),   th = pi e1^2 / (2 k^2),   k = k_u if e1 > 0 else k_l.
+    """V1 = k^2/pi tan(theta),   theta = pi e1^2 / (2 k^2),   k = k_u if e1 > 0 else k_l.
 
-        s = e1 / cos(th)^2,   alpha = q_d' + e1 k'/k - k^2/(2 pi e1) (k1 + 2 k'/k) sin 2th
+        s = e1 / cos(theta)^2,   alpha = q_d' + e1 k'/k - k^2/(2 pi e1) (k1 + 2 k'/k) sin(2 theta)
 
-    sin(2th)/e1 is removable at e1 = 0 and written as such.  At e2 = 0, V1' = -k1 V1.  For k -> infinity s -> e1 and the gain of
+    sin(2 theta)/e1 is removable at e1 = 0 and written as such.  At e2 = 0, V1' = -k1 V1.  For k -> infinity s -> e1 and the gain of
     alpha is k1/2.
 
     Args:
@@ -47,7 +47,7 @@ class Tan:
         return e / _cos_th(e / k) ** 2
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
-        """cos(th)^2, (n,) [1]."""
+        """cos(theta)^2, (n,) [1]."""
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return _cos_th(e / k) ** 2
 
