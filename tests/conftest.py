@@ -1,4 +1,4 @@
-"""Settings of all tests: float64, a compilation cache on disk, no display, and the compiled runs that many tests share."""
+"""Settings of all tests: float64, no compilation cache on disk, no display, and the compiled runs that many tests share."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 os.environ.setdefault("MPLBACKEND", "Agg")
-# In the environment, so that notebooks, benchmarks and commands, which are processes of their own, find what tests compiled.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")  # to keep a smaller one takes longer than it saves
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-
+# In the environment, for notebooks, benchmarks and commands too, which are processes of their own.  Few programs are met twice, and to keep
+# what is compiled takes longer (15 to 25 % of a test file's time) than to compile these few again.
+os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "0")
 # Where in Python an operation was written stands in no program that is compiled, and costs a tenth of the tracing.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # Tracing makes millions of objects that live as long as the process: at Python's own setting a tenth of its time is a search for garbage.
@@ -59,7 +57,7 @@ compiler of kernels (`plain_compiler`).  `test_users_settings.py` runs tests as 
 TEST_AS_USERS=1 in the environment."""
 
 MEMORY = 3 * 2**30
-"""Bytes of a process from which what it has compiled is let go after a test: what is needed again comes from the cache on disk."""
+"""Bytes of a process from which what it has compiled is let go after a test: what is needed again is compiled again."""
 
 
 def resident() -> int:
@@ -95,7 +93,7 @@ def pytest_configure(config):
 def bounded_memory(memory):
     """Compiled programs of hundreds of tests would take 10 GB a process.
 
-    Not all of it comes back (four tenths of what programs took stays), and what is needed again is traced again, so a process that is still
+    Not all of it comes back (four tenths of what programs took stays), and what is needed again is made again, so a process that is still
     large afterwards is left alone until it has grown by a quarter of MEMORY: it would let go after every test.
     """
     yield
@@ -126,8 +124,8 @@ def short_run(paper) -> ij.Rollout:
 
 @pytest.fixture(scope="session")
 def compiled() -> Path:
-    """The folder of compiled programs, shared between the processes of all tests: a worker's own would have each compile the same."""
-    return Path(jax.config.jax_compilation_cache_dir)
+    """The folder of compiled programs of the processes that a study is divided among, or that are killed and started again."""
+    return ROOT / ".jax_cache"
 
 
 @pytest.fixture(scope="session")

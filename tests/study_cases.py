@@ -105,6 +105,7 @@ def environment(cache: Path, **more: str) -> dict[str, str]:
 
     chosen = {
         "JAX_ENABLE_X64": str(int(jax.config.jax_enable_x64)),
+        "JAX_ENABLE_COMPILATION_CACHE": "1",
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }

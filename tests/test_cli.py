@@ -302,6 +302,7 @@ def test_the_cache_is_only_a_help(cache, tmp_path, monkeypatch):
     seen = {}
     monkeypatch.setattr(jax.config, "update", seen.__setitem__)
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
+    monkeypatch.setattr(type(jax.config), "jax_enable_compilation_cache", True, raising=False)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
     monkeypatch.setattr("iblf_jax.core.cache._reloads_badly", lambda: False)

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -73,7 +72,7 @@ def test_two_processes_agree_with_one(compiled, tmp_path):
 
 
 @pytest.mark.slow
-def test_slurm_says_where_the_processes_meet(tmp_path):
+def test_slurm_says_where_the_processes_meet(tmp_path, compiled):
     """Two processes with the variables that `srun` gives them, and `--distributed` alone."""
     file, path = tmp_path / "sweep.toml", tmp_path / "sweep.zarr"
     file.write_text(cases.SWEEP)
@@ -82,7 +81,7 @@ def test_slurm_says_where_the_processes_meet(tmp_path):
     port = next(last + i for i in range(2**12) if is_free(last + i))
     common = {"SLURM_JOB_ID": str(port - last), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
     words = ("-m", "iblf_jax", "sweep", str(file), "--store", str(path), "--distributed", "--quiet")
-    both = [cases.start_python(Path(jax.config.jax_compilation_cache_dir), *words, **common, SLURM_PROCID=i, SLURM_LOCALID=i) for i in "01"]
+    both = [cases.start_python(compiled, *words, **common, SLURM_PROCID=i, SLURM_LOCALID=i) for i in "01"]
     for rank, process in enumerate(both):
         out, errors = process.communicate(timeout=300)
         assert process.returncode == 1, errors  # some runs leave their bounds

@@ -7,7 +7,6 @@ import re
 import signal
 import time
 import tomllib
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -103,12 +102,12 @@ def test_every_run_ok_is_zero_interrupted_is_130_and_full_is_3(command, monkeypa
 
 
 @pytest.mark.slow
-def test_ctrl_c_from_outside(command, tmp_path):
+def test_ctrl_c_from_outside(command, tmp_path, compiled):
     """As a user does it: a process, SIGINT after its first unit, the same command again."""
     text = SWEEP.replace("300", "2000")
     (tmp_path / "sweep.toml").write_text(text)
     words = ("sweep", "sweep.toml", "--store", "s.zarr", "--quiet")
-    process = cases.start_python(Path(jax.config.jax_compilation_cache_dir), "-m", "iblf_jax", *words)
+    process = cases.start_python(compiled, "-m", "iblf_jax", *words)
     while not (tmp_path / "s.zarr/done/c/0").exists() and process.poll() is None:
         time.sleep(0.001)
     process.send_signal(signal.SIGINT)

@@ -172,6 +172,7 @@ def chosen_cache(monkeypatch, badly=False):
     seen, said = {}, []
     monkeypatch.setattr(jax.config, "update", seen.__setitem__)
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
+    monkeypatch.setattr(type(jax.config), "jax_enable_compilation_cache", True, raising=False)
     monkeypatch.setattr(warnings, "warn", lambda text, *_, **__: said.append(text))
     monkeypatch.setattr("iblf_jax.core.cache._reloads_badly", lambda: badly)
     keep_programs.cache_clear()

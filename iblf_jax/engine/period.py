@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.step_size import LOOKS, along_reference, round_down
-from iblf_jax.simulation.closed_loop import LoopState, initial_state, sampled
+from iblf_jax.engine.step_size import LOOKS, round_down, start_and_along
+from iblf_jax.simulation.closed_loop import LoopState, sampled
 from iblf_jax.simulation.sampling import Sampling, under_way, with_room
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import jacobian, period_map
@@ -55,9 +55,7 @@ def _maps(scenario: Scenario, times: jax.Array) -> jax.Array:
         state = sampled(scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype))
         return period_map(scenario, state, jacobian(scenario, t, state))
 
-    along = along_reference(scenario, times)
-    states = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), along)
-    return jax.vmap(at)(jnp.concatenate([zero[None], times]), states)
+    return jax.vmap(at)(jnp.concatenate([zero[None], times]), start_and_along(scenario, times))
 
 
 def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0) -> float:

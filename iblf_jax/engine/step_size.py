@@ -123,21 +123,20 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
 
 
 @jax.jit
-def along_reference(scenario: Scenario, times: jax.Array) -> LoopState:
-    """States of a loop that follows its reference exactly, time axis first."""
+def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
+    """The state at the start, and those of a loop that follows its reference exactly; time axis first, (1 + T, ...)."""
 
     def at(t):
         tube = scenario.setting.tube(t)
         return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
 
-    return jax.vmap(at)(times)
+    return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), jax.vmap(at)(times))
 
 
 def fastest_along(scenario: Scenario, times: np.ndarray) -> float:
     """The fastest mode at the start and along the reference at some times [1/s]; infinite where the loop has no finite derivative."""
-    states = along_reference(scenario, jnp.asarray(times, scenario.initial.q.dtype))
-    along = [(t, jax.tree.map(lambda x, i=i: x[i], states)) for i, t in enumerate(times)]
-    return max(_mode(scenario, t, state) for t, state in [(0.0, initial_state(scenario)), *along])
+    states = start_and_along(scenario, jnp.asarray(times, scenario.initial.q.dtype))
+    return max(_mode(scenario, t, jax.tree.map(lambda x, i=i: x[i], states)) for i, t in enumerate([0.0, *times]))
 
 
 def _mode(scenario: Scenario, t: float | jax.Array, state: LoopState) -> float:

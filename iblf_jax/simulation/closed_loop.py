@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -74,6 +75,7 @@ class LoopState(NamedTuple):
     """A `Held` where the law is sampled."""
 
 
+@partial(jax.jit, inline=True)  # so that it is traced once for all the places that ask for it
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; torques that are under way then are those that hold the model still."""
     q, dq, n = scenario.initial.q, scenario.initial.dq, scenario.n
