@@ -74,7 +74,7 @@ def test_the_run_does_its_job(scenario, run):
     assert np.all(np.abs(run.e1[-1]) < 0.08)
     assert float(run.metrics.rmse.max()) < 0.12
     assert np.all(np.asarray(run.metrics.peak_torque) < 0.6 * np.asarray(scenario.model.effort))
-    assert ij.recommended_dt(scenario) >= RUN["dt"]
+    assert ij.recommended_dt(scenario, duration=RUN["duration"]) >= RUN["dt"]
 
 
 def test_bounds_are_inside_the_joint_limits(scenario):
