@@ -15,6 +15,7 @@ from iblf_jax.engine import execute, machine_function, plan, transformable
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
 from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.simulation import stability
 from iblf_jax.simulation.integrators import TABLEAUS, Tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
@@ -153,3 +154,11 @@ def test_the_length_of_a_function_is_that_of_its_inner_ones():
     closed = jax.make_jaxpr(lambda x: inner(x) * inner(2.0 * x))(1.0)
     assert sum(1 for _ in machine_function._operations(closed.jaxpr)) == 8
     assert machine_function.length(inner, 1.0) == 3
+
+
+@pytest.mark.parametrize("size", [40, 63, 64, 72])
+def test_large_sums_are_left_to_loops_of_xla(size):
+    """The map of a sampled loop of six joints has 72 rows: XLA refuses to search as many numbers within a machine function."""
+    A = np.random.default_rng(size).standard_normal((size, size))
+    found = jax.jit(machine_function.machine_function(stability.spectral_radius))(A)
+    assert float(found) == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), rel=1e-3)

@@ -18,7 +18,7 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
-from iblf_jax.engine.plan import LARGEST_ARRAY, LONGEST_FUNCTION
+from iblf_jax.engine.plan import LARGEST_ARRAY, LARGEST_REDUCED, LONGEST_FUNCTION
 
 REFUSED = frozenset(
     {
@@ -90,6 +90,9 @@ def _operations(jaxpr: Jaxpr) -> Iterator:
 
 def _is_trusted(operation) -> bool:
     name = operation.primitive.name
+    if name in REFUSED:
+        return False
+    if name.startswith(("reduce_", "arg")):
+        return all(v.aval.size <= LARGEST_REDUCED for v in operation.invars)
     computed = [v.aval for v in operation.outvars if jax.numpy.issubdtype(v.aval.dtype, jax.numpy.floating)]
-    small = name in COPIES or all(aval.size <= LARGEST_ARRAY for aval in computed)
-    return small and name not in REFUSED
+    return name in COPIES or all(aval.size <= LARGEST_ARRAY for aval in computed)

@@ -23,6 +23,8 @@ SMALL_BATCH = 64
 """Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
 LARGEST_ARRAY = 1 << 13
 """Entries of the largest array that is computed inside: XLA shares larger ones out over threads, which it cannot do there."""
+LARGEST_REDUCED = (1 << 12) - 1
+"""Entries of the largest array that is summed up or searched inside: from 4,096 on XLA refuses it there, in either type."""
 LONG_EVALUATION = 2500
 """Operations of one evaluation of the closed loop from which it is a machine function of its own, called from a loop of XLA's: LLVM's
 time grows faster than a function.  Two joints take some 700, three 1,500, an arm of seven 10,000."""
