@@ -43,8 +43,11 @@ def machine() -> dict[str, str]:
     """What the numbers were measured with (no host names)."""
     import os
 
+    told = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    models = {line.partition(":")[2].strip() for line in told if line.startswith("model name")}
     return {
-        "processor": platform.processor() or platform.machine(),
+        "date": time.strftime("%Y-%m-%d"),
+        "processor": ", ".join(models) or platform.processor() or platform.machine(),
         "cores": str(os.cpu_count()),
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -49,6 +49,7 @@ def assemble() -> None:
     import barriers
     import flags
     import gallery
+    import measured
     import reference
 
     import iblf_jax as ij
@@ -80,7 +81,8 @@ def assemble() -> None:
     reference.write(SOURCE / "reference")
     flags.write(SOURCE / "how_to")
     barriers.write(SOURCE / "theory")
-    shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "benchmarks.md")
+    measured.write(SOURCE / "benchmarks.md")
+    shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
     shutil.copy(ROOT / "CONTRIBUTING.md", SOURCE / "contributing.md")
 
 

@@ -1,0 +1,87 @@
+"""The page of benchmarks: a table and a plot of each result that `benchmarks/*.py --json benchmarks/results/NAME.json` has written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gallery import ROOT
+
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+class Plot(NamedTuple):
+    """Bars of one result."""
+
+    names: tuple[str, ...]
+    """Columns whose words name a bar."""
+    values: str
+    """The column that is as long as the bar."""
+    words: str
+    """What stands above the table: what was measured, and which way is better."""
+    only: dict[str, Any] = {}  # noqa: RUF012 - a constant
+    """Column -> what it has in the rows that are drawn; all rows if nothing is said."""
+
+
+PLOTS = {
+    "latency": Plot(("row",), "ms", "One run alone, as a notebook calls it; shorter is better."),
+    "throughput": Plot(
+        ("row", "type"), "steps/s a core", "Many runs of the paper's loop at once; longer is better.", {"loop": "paper", "runs": 4096}
+    ),
+    "arm": Plot(("row", "type"), "steps/s a core", "Seven joints, beside what a user would take instead; longer is better."),
+    "export": Plot(("law", "type"), "cycles", "One call of a law in C, as `ij.export` writes it; shorter is better."),
+    "constraints": Plot(("law",), "us a step", "What keeps which constraints, and the processor time of a step; shorter is better."),
+    "tuning": Plot(
+        ("search",),
+        "rollouts to 0.5 %",
+        "Two gains under a torque limit and a margin: rollouts until 0.5 % above the best; shorter is better.",
+    ),
+}
+
+
+def write(page: Path) -> None:
+    """Writes the page, and its pictures beside it."""
+    parts = [
+        "# Benchmarks\n\nA table is one run of a program in `benchmarks/`, made from what it wrote; `python benchmarks/NAME.py` makes it "
+        "again. Rows are compared within one run, on a machine that others use too; where it says *a core*, processor time is counted. "
+        "What was tried, and what was learnt, is in the [lab notes](lab_notes.md).\n"
+    ]
+    for name, plot in PLOTS.items():
+        result = json.loads((RESULTS / f"{name}.json").read_text())
+        draw(plot, result["rows"], page.with_name(f"benchmark_{name}.png"))
+        machine = result["machine"]
+        where = f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, jax {machine['jax']}, {machine['date']}"
+        parts.append(
+            f"## {result['title']}\n\n{plot.words} `python benchmarks/{name}.py`; {where}.\n\n"
+            f"![{result['title']}](benchmark_{name}.png)\n\n{table(result['rows'])}\n"
+        )
+    page.write_text("\n".join(parts))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Rows as Markdown."""
+    lines = [
+        list(rows[0]),
+        ["---"] * len(rows[0]),
+        *([f"{x:.3g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows),
+    ]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def draw(plot: Plot, rows: list[dict[str, Any]], path: Path) -> None:
+    """Bars on a logarithmic axis, in the order of the table."""
+    from iblf_jax.plotting._style import new_figure, styled
+
+    asked = [row for row in rows if all(row[name] == value for name, value in plot.only.items())]
+    drawn = [row for row in asked if isinstance(row[plot.values], (int, float))]
+    with styled():
+        figure = new_figure(7.5, 0.8 + 0.26 * len(drawn))
+        axes = figure.subplots()
+        bars = axes.barh([", ".join(str(row[name]) for name in plot.names) for row in drawn], [row[plot.values] for row in drawn])
+        axes.bar_label(bars, [f"{row[plot.values]:.3g}" for row in drawn], padding=3)
+        axes.set_xscale("log")
+        axes.margins(x=0.12)
+        axes.invert_yaxis()
+        axes.set_xlabel(plot.values)
+        figure.savefig(path, dpi=110)
