@@ -97,8 +97,8 @@ def index() -> str:
     """The page that shows all of them, by their first picture."""
     words = "Each picture is a script of `examples/gallery`; the tests run them."
     others = (
-        "Published examples of other authors, each a scenario file of `examples/reproductions`: what is printed and what is not, what comes "
-        "out here, and what could not be reproduced."
+        "Published examples of other authors, each a scenario file of `examples/reproductions`: what is printed and what is not, what "
+        "comes out here, and what could not be reproduced."
     )
     toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(script.stem for script in PAGES) + "\n```"
     parts = ["# Gallery", words, _cards(SCRIPTS), "(reproductions)=\n## Reproductions", others, _cards(REPRODUCTIONS), toctree]
