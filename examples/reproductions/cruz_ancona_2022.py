@@ -15,6 +15,8 @@ script of its case of study, whose author says that he "could not achieve the sa
 | surface | w = B^T P x, P of the Riccati equation with Q = 2 I, R = 0.503 I | varrho, P |
 | the barrier's width | epsilon = 0.05 | epsilon |
 
+**What it shows**, by the script's own plots: |x| and |w| over time, the latter to come below epsilon and to stay.
+
 **Not printed there:** how the load enters gravity and the Coriolis forces. In the script it changes the inertia alone; here it is a
 heavier second link in all of them. The script's first program has eta as above, its time loop a tenth of it; here it is whole.
 

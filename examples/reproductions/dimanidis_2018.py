@@ -18,6 +18,9 @@ G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099, whom the th
 | gain, limit of the torque | k = 1, 30 N m | table of the control |
 | high-gain observer | mu = 1e-4, eta = 10, 25 | the same |
 
+**What it shows:** errors that rise to 3.71 and 0.89 rad, shrink, and stay inside of what is prescribed; sigma inside its funnel. The
+figures' numbers are in the sources of the text, and 34 points of them beside the scenario.
+
 **Not printed:** the start. The first points of its figures have it: e1 = (0.8 pi, -pi/6) rad, q' = (2.793, 1.047) rad/s. The speed of
 joint 0 is outside of the set of starts that the text prints.
 

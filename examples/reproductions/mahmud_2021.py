@@ -12,6 +12,8 @@ uncertainties, Frontiers in Robotics and AI 8 (2021) 733104, section 7.2. The au
 | start | q = (-5, -5) rad, q' = (5, 5) rad/s | x0 in main.m |
 | task | to the origin | the same |
 
+**What it shows:** states that stay in the box and go to the origin. Read for this page: the program, not the article.
+
 **Not printed:** masses and lengths, which p1 ... p3 do without; those of the scenario are chosen to give them. There is no gravity.
 
 **Their law is not in the package:** they stretch each state by b(x) = ln[A (a - x)/(a (A - x))], which is infinite at the walls, and learn

@@ -13,6 +13,9 @@ Z. Zhang, Disturbance estimation for robotic systems using continuous integral s
 | push | (0.15, 0.18, 0.12) N m: a square from 6 to 7 s; half a sine, a triangle to 8 s | disturbance_sqrt.m and others |
 | steps | Euler, 1e-4 s, 10 s | main.m |
 
+**What it shows:** estimates of the push that lie on it in figures whose axes are named below. Read for this page: the program, not the
+article.
+
 **Not printed:** links. Masses and lengths enter by six sums, and any chain with these sums moves alike; the scenario's are chosen.
 
 **Printed, and not an arm's:** 0.0519 cos q3 in M_22, where 2 x 0.02809 = 0.05618 must stand (M_11 and M_12 have 0.0561, C has 0.0561 and
