@@ -71,6 +71,9 @@ def page(script: Path) -> list[Path]:
                 lines += ["```text", printed.getvalue().rstrip(), "```", ""]
     finally:
         os.chdir(before)
+    beside = script.with_suffix(".toml")
+    if beside.exists():
+        lines += [f"The scenario file, `{beside.relative_to(ROOT).as_posix()}`:", "", "```toml", beside.read_text().rstrip(), "```", ""]
     (MADE / f"{script.stem}.md").write_text("\n".join(lines), encoding="utf-8")
     return pictures
 

@@ -108,9 +108,8 @@ LAWS = {
     "pd_gravity": controllers.PDGravity(Kp=60.0, Kd=[20.0, 10.0]),
     "reference_governor": controllers.ReferenceGovernor(law=controllers.PDGravity(Kp=60.0, Kd=[20.0, 15.0])),
     "reference_governor_computed": controllers.ReferenceGovernor(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), margin=[0.01, 0.03]),
-    "safety_filter": controllers.SafetyFilter(law=controllers.PDGravity(Kp=60.0, Kd=20.0), a1=[8.0, 9.0], nearest="acceleration"),
-    "safety_filter_shaped": controllers.SafetyFilter(
-        law=controllers.PDGravity(Kp=60.0, Kd=20.0), nearest="acceleration", shape1="atan", shape2="cubic", margin=[0.1, 0.2]
+    "safety_filter": controllers.SafetyFilter(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0), a1=[8.0, 9.0], nearest="acceleration", shape1="atan", shape2="cubic", margin=[0.1, 0.2]
     ),
     "safety_filter_limited": controllers.SafetyFilter(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[20.0, 10.0]),
     "saturated": controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]),

@@ -25,7 +25,7 @@ figures' numbers are in the sources of the text, and 34 points of them beside th
 joint 0 is outside of the set of starts that the text prints.
 
 **Printed twice, and not alike:** the figures are of the reference pi/2 + pi/6 sin t, pi/2 - pi/6 cos t (only so is sigma(0) = 7.295 rad/s,
-as the figure of the surfaces begins), and of k = 6 (only so is the torque at 0.066 s 0.287 N m, as the figure of the torques has it; the
+as the figure of the surfaces begins), and of k = 6 (only so is the torque at 0.066 s -0.287 N m, as the figure of the torques has it; the
 program has k = 12 for the same law without its 2). The scenario takes the figures' word.
 
 The law is the package's `SurfaceBarrier`: -2 k T(xi)/((1 - xi^2) rho) is -4 k times the slope of its barrier.
