@@ -20,9 +20,9 @@ script of its case of study, whose author says that he "could not achieve the sa
 **Not printed there:** how the load enters gravity and the Coriolis forces. In the script it changes the inertia alone; here it is a
 heavier second link in all of them. The script's first program has eta as above, its time loop a tenth of it; here it is whole.
 
-**Their law is not in the package:** its gain grows until |w| < epsilon/2 and is |w|/(epsilon - |w|) from then on. This is their arm, load,
-reference, disturbance and surface under the package's `SurfaceBarrier`, which needs no model either, in a funnel that ends where
-|w| < epsilon. Gain and funnel are ours. The three phases of eta are run each from the start.
+**Their law is not in the package:** in the script its gain grows until |w| < epsilon/2 and is |w|/(epsilon - |w|) from then on. This is
+their arm, load, reference, disturbance and surface under the package's `SurfaceBarrier`, which needs no model either, in a funnel that ends
+where |w| < epsilon. Gain and funnel are ours. The three phases of eta are run each from the start.
 """
 
 from pathlib import Path
@@ -57,5 +57,5 @@ for panel in axes:
 print(f"P12 = {p12:.6f}, P22 = {p22:.6f}; P12/P22 = {p12 / p22:.6f} 1/s and {np.ravel(scenario.controller.a)[0]:.6f} in the scenario")
 print(f"epsilon/(P22 sqrt 2) = {EPSILON / p22 / np.sqrt(2):.6f} rad/s and {np.ravel(scenario.controller.surface.upper.final)[0]:.6f}")
 
-# %% **Not reproduced:** the law and so its curves, which the paper shows and the script's author did not meet either; eta's three phases in
-# one run, as no disturbance of the package changes its amplitude; how the load enters, as above.
+# %% **Not reproduced:** the law and so its results, those of the paper, which the script's author did not meet either; eta's three phases
+# in one run, as no disturbance of the package changes its amplitude; how the load enters, as above.

@@ -12,7 +12,8 @@ uncertainties, Frontiers in Robotics and AI 8 (2021) 733104, section 7.2. The au
 | start | q = (-5, -5) rad, q' = (5, 5) rad/s | x0 in main.m |
 | task | to the origin | the same |
 
-**What it shows:** states that stay in the box and go to the origin. Read for this page: the program, not the article.
+**What it shows**, by its plotting script: the states and their walls over time, the stretched states beside those of an optimal control
+(GPOPS II), the law's weights, and its estimates of the friction. Read for this page: the program, not the article.
 
 **Not printed:** masses and lengths, which p1 ... p3 do without; those of the scenario are chosen to give them. There is no gravity.
 
@@ -36,7 +37,7 @@ figure = plotting.velocity_portrait(run, joint=0)
 # %% The whole run.
 overview = run.plot()
 
-# %% What the paper claims of its law, that the states stay in the box and go to the origin, is what this one does too.
+# %% What their law is made for: states that stay in the box and go to the origin. Under this one:
 M = np.asarray(scenario.plant.mass_matrix(np.zeros(2)))
 print(f"M(0) = {M.round(3).tolist()} kg m^2, p1 + 2 p3 = {3.473 + 2 * 0.242:.3f}, p2 + p3 = {0.196 + 0.242:.3f}")
 print(f"status: {ij.Status(int(run.status))!r}")
@@ -53,5 +54,5 @@ states = np.stack([np.asarray(run.q), np.asarray(run.dq)], axis=-1)
 stretched = np.log(high * (low - states) / (low * (high - states)))
 print(f"at the start b(q) = {stretched[0, 0, 0]:.3f}, b(q') = {stretched[0, 0, 1]:.3f}; largest |b| {np.abs(stretched).max():.3f}")
 
-# %% **Not reproduced:** the law, its weights, its estimates of the friction, and the optimal control (GPOPS II) that the paper compares it
-# with; their curves are not kept as numbers, so none is beside these.
+# %% **Not reproduced:** the law, its weights, its estimates of the friction, and the optimal control (GPOPS II) that is plotted
+# beside it; their curves are not kept as numbers, so none is beside these.
