@@ -69,7 +69,7 @@ def assemble() -> None:
     words = "The notebooks of the repository, in order, as the tests have run them."
     (SOURCE / "tutorials" / "index.md").write_text(f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n")
 
-    for script in gallery.SCRIPTS:
+    for script in gallery.PAGES:
         if not gallery.is_made(script):
             gallery.page(script)
     shutil.copytree(gallery.MADE, SOURCE / "gallery")

@@ -75,7 +75,8 @@ CASES: dict[str, Case] = {
     "INFEASIBLE_REFERENCE": Case(
         _meeting,
         "The reference touches or leaves a bound: no law can follow it and stay inside (Assumption 2). A single run raises an "
-        "error that names joint and time; in a batch or a study it is this flag.",
+        "error that names joint and time; in a batch or a study it is this flag. A safety filter keeps its bounds wherever the reference "
+        "goes, so its runs do not raise it.",
         "Move the reference, or widen the bounds. `ij.plotting.tube(scenario)` shows both before anything is run.",
         lambda scenario: plotting.tube(scenario, duration=4.0),
     ),

@@ -1,4 +1,8 @@
-"""The gallery: every script of examples/gallery is run once, and becomes a page with its text, its figures and what it printed.
+"""The gallery: every script of examples/gallery and examples/reproductions is run once, and becomes a page with its text, its figures and
+what it printed.
+
+A script begins with its page's words, "Title: words"; a block of it begins with "# %%" and more words, which may go on in the comment
+below.  A reproduction has its scenario beside it, a file of the same name, and may have published numbers there.
 
 The tests run the scripts with `page`, which keeps what they made in `out/site/gallery`; `docs/build.py` takes it from there, and runs what
 is missing or older than its script.
@@ -10,20 +14,26 @@ import ast
 import contextlib
 import hashlib
 import io
+import itertools
 import os
 import warnings
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
+REPRODUCTIONS = sorted((ROOT / "examples" / "reproductions").glob("*.py"))
+PAGES = [*SCRIPTS, *REPRODUCTIONS]
 MADE = ROOT / "out" / "site" / "gallery"
 DPI = 110
 
 
 def digest(source: Path) -> str:
-    """What a page says of the script, or of the notebook, that it was made from."""
-    return hashlib.sha256(source.read_bytes()).hexdigest()[:16]
+    """What a page says of the script, or of the notebook, that it was made from, and of what lies beside it under the same name."""
+    files = [source, *(source.with_suffix(suffix) for suffix in (".toml", ".csv"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files if file.exists())).hexdigest()[:16]
 
 
 def is_made(script: Path) -> bool:
@@ -40,19 +50,19 @@ def page(script: Path) -> list[Path]:
     code = text.split('"""', 2)[2].strip()
     blocks = [block.strip() for block in f"\n{code}".split("\n# %%")]
     lines = [f"<!-- {digest(script)} -->", f"# {title}", "", f"{rest[0].upper()}{rest[1:]}", ""]
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names: dict[str, Any] = {"__name__": "__main__", "__file__": str(script)}
     pictures: list[Path] = []
     before = Path.cwd()
     os.chdir(MADE)
     try:
         for k, block in enumerate(blocks):
-            words, _, source = block.partition("\n") if k else ("", "", block)
+            words, source = _words(block) if k else ("", block)
             printed, seen = io.StringIO(), {id(x) for x in names.values()}
             with contextlib.redirect_stdout(printed), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 exec(compile(source, str(script), "exec"), names)
             lines += [words.strip(), ""] if words else []
-            lines += ["```python", source.strip(), "```", ""]
+            lines += ["```python", source.strip(), "```", ""] if source.strip() else []
             for name, value in list(names.items()):
                 if id(value) not in seen and (found := _picture(value, f"{script.stem}_{name}")):
                     pictures.append(found)
@@ -61,15 +71,25 @@ def page(script: Path) -> list[Path]:
                 lines += ["```text", printed.getvalue().rstrip(), "```", ""]
     finally:
         os.chdir(before)
+    beside = script.with_suffix(".toml")
+    if beside.exists():
+        lines += [f"The scenario file, `{beside.relative_to(ROOT).as_posix()}`:", "", "```toml", beside.read_text().rstrip(), "```", ""]
     (MADE / f"{script.stem}.md").write_text("\n".join(lines), encoding="utf-8")
     return pictures
+
+
+def _words(block: str) -> tuple[str, str]:
+    """What a block says, its first line and the comment below it, and its code."""
+    words, *rest = block.split("\n")
+    said = list(itertools.takewhile(lambda line: line.startswith("#"), rest))
+    return "\n".join([words.strip(), *(line[1:].strip() for line in said)]), "\n".join(rest[len(said) :])
 
 
 def _picture(value: Any, stem: str) -> Path | None:
     """The file of a figure or a film; None of anything else."""
     if isinstance(value, Path) and value.suffix == ".gif":
         return MADE / value.name
-    if not hasattr(value, "savefig"):
+    if not isinstance(value, Figure):
         return None
     path = MADE / f"{stem}.png"
     value.savefig(path, dpi=DPI)
@@ -78,12 +98,21 @@ def _picture(value: Any, stem: str) -> Path | None:
 
 def index() -> str:
     """The page that shows all of them, by their first picture."""
-    cards = []
-    for script in SCRIPTS:
-        text = (MADE / f"{script.stem}.md").read_text()
-        title, picture = text.split("\n# ", 1)[1].split("\n", 1)[0], text.split("](", 1)[1].split(")", 1)[0]
-        cards.append(f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n:img-top: {picture}\n:::")
-    pages, body = "\n".join(script.stem for script in SCRIPTS), "\n".join(cards)
     words = "Each picture is a script of `examples/gallery`; the tests run them."
-    toctree = f"```{{toctree}}\n:hidden:\n\n{pages}\n```"
-    return f"# Gallery\n\n{words}\n\n::::{{grid}} 1 2 3 3\n:gutter: 2\n\n{body}\n\n::::\n\n{toctree}\n"
+    others = (
+        "Published examples of other authors, each a scenario file of `examples/reproductions`: what is printed and what is not, what "
+        "comes out here, and what could not be reproduced."
+    )
+    toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(script.stem for script in PAGES) + "\n```"
+    parts = ["# Gallery", words, _cards(SCRIPTS), "(reproductions)=\n## Reproductions", others, _cards(REPRODUCTIONS), toctree]
+    return "\n\n".join(parts) + "\n"
+
+
+def _cards(scripts: list[Path]) -> str:
+    """A grid of pages."""
+    cards = []
+    for script in scripts:
+        text = (MADE / f"{script.stem}.md").read_text()
+        title, picture = text.split("\n# ", 1)[1].split("\n", 1)[0], text.split("![", 1)[1].split("](", 1)[1].split(")", 1)[0]
+        cards.append(f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n:img-top: {picture}\n:::")
+    return "::::{grid} 1 2 3 3\n:gutter: 2\n\n" + "\n".join(cards) + "\n\n::::"

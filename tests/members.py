@@ -92,6 +92,8 @@ ACTUATORS = {
     "motor": actuators.Motor(bandwidth=300.0, limit=[40.0, 20.0], rate_limit=500.0, stall=[40.0, 20.0], no_load_speed=[6.0, 8.0]),
 }
 
+SURFACE = bounds.Bounds(lower=bounds.Funnel(initial=-9.0, final=-0.5, rate=1.5), upper=bounds.Constant([8.0, 6.0]))
+
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
     "backstepping_corrected_log": controllers.Backstepping(k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"),
@@ -101,11 +103,14 @@ LAWS = {
     ),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
+    "surface_barrier": controllers.SurfaceBarrier(a=2.0, K=[4.0, 3.0], surface=SURFACE),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=[10.0, 12.0]),
     "pd_gravity": controllers.PDGravity(Kp=60.0, Kd=[20.0, 10.0]),
     "reference_governor": controllers.ReferenceGovernor(law=controllers.PDGravity(Kp=60.0, Kd=[20.0, 15.0])),
     "reference_governor_computed": controllers.ReferenceGovernor(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), margin=[0.01, 0.03]),
-    "safety_filter": controllers.SafetyFilter(law=controllers.PDGravity(Kp=60.0, Kd=20.0), a1=[8.0, 9.0], nearest="acceleration"),
+    "safety_filter": controllers.SafetyFilter(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0), a1=[8.0, 9.0], nearest="acceleration", shape1="atan", shape2="cubic", margin=[0.1, 0.2]
+    ),
     "safety_filter_limited": controllers.SafetyFilter(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[20.0, 10.0]),
     "saturated": controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]),
     "saturated_smooth": controllers.Saturated(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"),

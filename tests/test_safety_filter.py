@@ -219,3 +219,38 @@ def test_theorem_2_claims_nothing_while_it_works():
 def test_bad_ones_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
         controllers.SafetyFilter(**{"law": controllers.PDGravity(Kp=1.0, Kd=1.0)} | options)
+
+
+@pytest.mark.parametrize("shape1", ["linear", "atan"])
+@pytest.mark.parametrize("shape2", ["linear", "cubic"])
+def test_the_box_of_shaped_conditions(shape1, shape2, rng):
+    scenario, eta = falling(), np.array([0.3, 0.7])
+    law = controllers.SafetyFilter(law=scenario.controller, a1=2.0, a2=3.0, shape1=shape1, shape2=shape2, margin=eta)
+    A = {"linear": lambda h: h, "atan": np.arctan}[shape1]
+    B = {"linear": lambda z: z, "cubic": lambda z: z**3}[shape2]
+    for t, q, dq in zip(*random_places(rng, 5), strict=True):
+        low, high = law.box(jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), scenario.setting)
+        for ddq, sign, side in ((low, 1, 0), (high, -1, 1)):
+            # h and z along a motion with this acceleration; z' by differences.
+            def z_at(s, q=q, dq=dq, t=t, ddq=ddq, sign=sign, side=side):
+                wall = walls_at(t + s)[side]
+                h, dh = sign * (q + s * dq + s**2 / 2 * ddq - wall[0]), sign * (dq + s * ddq - wall[1])
+                return dh + 2.0 * A(h)
+
+            rate = (z_at(1e-6) - z_at(-1e-6)) / 2e-6
+            np.testing.assert_allclose(rate + 3.0 * B(z_at(0.0)), eta, rtol=1e-6, atol=1e-6)
+
+
+def test_shapes_have_names():
+    with pytest.raises(ValueError, match=r"SafetyFilter\.shape1: got 'cubic', expected"):
+        controllers.SafetyFilter(law=controllers.PDGravity(Kp=1.0, Kd=1.0), shape1="cubic")
+    with pytest.raises(ValueError, match=r"SafetyFilter\.margin.*-1"):
+        controllers.SafetyFilter(law=controllers.PDGravity(Kp=1.0, Kd=1.0), margin=-1.0)
+
+
+def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law():
+    parts = {"reference": ij.references.Quintic(start=[0.5, 0.5], end=[1.2, 0.5], duration=0.1)}
+    run = ij.simulate(filtered(falling(**parts), nearest="acceleration"), duration=0.3, dt=1e-3)
+    assert int(run.status) == 0 and float(jnp.max(run.q_d - run.upper)) > 0.2
+    with pytest.raises(ValueError, match="Assumption 2"):
+        ij.simulate(falling(**parts), duration=0.3, dt=1e-3)

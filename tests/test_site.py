@@ -29,10 +29,11 @@ LONG = pytest.mark.release
 
 def test_there_are_examples():
     assert len(gallery.SCRIPTS) >= 15
+    assert len(gallery.REPRODUCTIONS) >= 5
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", gallery.SCRIPTS, ids=lambda script: script.stem)
+@pytest.mark.parametrize("script", gallery.PAGES, ids=lambda script: script.stem)
 def test_a_script_of_the_gallery_makes_its_page(script):
     pictures = gallery.page(script)
     assert pictures and all(path.stat().st_size > 1000 for path in pictures)

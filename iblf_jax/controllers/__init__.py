@@ -13,6 +13,7 @@ from iblf_jax.controllers.reference_governor import ReferenceGovernor as Referen
 from iblf_jax.controllers.safety_filter import SafetyFilter as SafetyFilter
 from iblf_jax.controllers.saturated import Saturated as Saturated
 from iblf_jax.controllers.saturated import within_effort as within_effort
+from iblf_jax.controllers.surface_barrier import SurfaceBarrier as SurfaceBarrier
 from iblf_jax.controllers.systems import KEEPERS as KEEPERS
 from iblf_jax.controllers.systems import LAWS as LAWS
 from iblf_jax.controllers.systems import law_by_name as law_by_name
@@ -22,6 +23,7 @@ MEMBERS = {
     "full_state": FullState,
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
+    "surface_barrier": SurfaceBarrier,
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
     "saturated": Saturated,
@@ -46,6 +48,7 @@ __all__ = [
     "SafetyFilter",
     "Saturated",
     "Setting",
+    "SurfaceBarrier",
     "law_by_name",
     "within_effort",
 ]

@@ -11,6 +11,9 @@ or a joint's origin (`Scenario.regions`) are of relative degree 2 in their level
 
     h" + (b1 + b2) h' + b1 b2 h >= 0,    h' = dh/dq q',    h" = dh/dq q" + c.
 
+The conditions on positions may be of other shapes, and with a margin eta: with z = h' + a1 A(h), z' + a2 B(z) >= eta, A(h) = h or atan h,
+B(z) = z or z^3.  An arc tangent bounds the speed towards a bound by pi a1/2 wherever the joint is; a cube is softer the nearer z is to 0.
+
 The model and the observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 - f_hat.  Inside what the conditions keep
 (h >= 0 and h' + a2 h >= 0 at the start) they keep it for as long as they have a common torque, and f_hat is f.
 
@@ -33,6 +36,8 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.qp import Solution, quadratic_program
 
 NEAREST = ("torque", "acceleration")
+SHAPES1 = ("linear", "atan")
+SHAPES2 = ("linear", "cubic")
 
 
 @component
@@ -45,16 +50,20 @@ class SafetyFilter:
 
     Args:
       law: whose torque is filtered, any `Controller`.
-      a1: first rate of the position's conditions, () or (n,) [1/s], > 0; 10 if not given.
-      a2: second rate of these, () or (n,) [1/s], > 0; 10 if not given.
+      a1: first rate of the position's conditions, () or (n,) [1/s] ([rad/s] for "atan"), > 0; 10 if not given.
+      a2: second rate of these, () or (n,) [1/s] ([s/rad^2] for "cubic"), > 0; 10 if not given.
       a3: rate of the velocity's conditions, where the scenario has `velocity_bounds`, () or (n,) [1/s], > 0; 20 if not given.
       b1: first rate of the regions' conditions, where the scenario has `regions`, () [1/s], > 0; 10 if not given.
       b2: second rate of these, () [1/s], > 0; 10 if not given.
       limit: largest torque of each joint, () or (n,) [N m], > 0; none if not given.
       nearest: "torque" or "acceleration"; "torque" if not given.
+      shape1: A of the position's conditions, "linear" or "atan"; "linear" if not given.
+      shape2: B of these, "linear" or "cubic"; "linear" if not given.
+      margin: eta of these, () or (n,) [rad/s^2], >= 0; none if not given.
 
     Source: A. D. Ames, X. Xu, J. W. Grizzle, P. Tabuada, IEEE Trans. Automatic Control 62 (2017) 3861-3876; relative degree 2 as Q. Nguyen,
-    K. Sreenath, American Control Conference 2016, 322-328.
+    K. Sreenath, American Control Conference 2016, 322-328; shapes and margin as W. Shaw Cortez, D. V. Dimarogonas, Automatica 2022,
+    110620.
     """
 
     law: Controller
@@ -65,6 +74,9 @@ class SafetyFilter:
     b2: Leaf = leaf("1/s", sign="positive", shape="scalar", default=10.0)
     limit: Leaf = leaf("N m", sign="positive", default=None)
     nearest: str = static(default="torque")
+    shape1: str = static(default="linear")
+    shape2: str = static(default="linear")
+    margin: Leaf = leaf("rad/s^2", sign="nonnegative", default=None)
     wraps: ClassVar[str] = "law"
     filters: ClassVar[bool] = True
 
@@ -72,6 +84,8 @@ class SafetyFilter:
         """Raises ValueError for something that is not a law, or an unknown measure."""
         checks.conforms("SafetyFilter.law", self.law, Controller, "iblf_jax.controllers has them.")
         checks.one_of("SafetyFilter.nearest", self.nearest, NEAREST)
+        checks.one_of("SafetyFilter.shape1", self.shape1, SHAPES1)
+        checks.one_of("SafetyFilter.shape2", self.shape2, SHAPES2)
 
     def advice(self) -> list[str]:
         """The wrapped law's."""
@@ -83,15 +97,22 @@ class SafetyFilter:
 
     def box(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[jax.Array, jax.Array]:
         """The accelerations that the conditions allow, lowest and highest, (n,) each [rad/s^2]."""
-        lowest, highest = (
-            ddside + (self.a1 + self.a2) * (dside - dq) + self.a1 * self.a2 * (side - q)
-            for side, dside, ddside in _moving_bounds(t, setting)
-        )
+        lowest, highest = (ddside + self._room(side - q, dside - dq) for side, dside, ddside in _moving_bounds(t, setting))
+        if self.margin is not None:
+            lowest, highest = lowest + self.margin, highest - self.margin
         if setting.velocity_bounds is not None:
             (slow, fast), (dslow, dfast) = jax.jvp(setting.speed_limits, (t,), (jnp.ones_like(t),))
             lowest = jnp.maximum(lowest, dslow + self.a3 * (slow - dq))
             highest = jnp.minimum(highest, dfast + self.a3 * (fast - dq))
         return lowest, highest
+
+    def _room(self, h: jax.Array, dh: jax.Array) -> jax.Array:
+        """How much faster than its bound a joint may accelerate towards it, (n,) [rad/s^2]; odd in (h, h'), so for either side."""
+        if self.shape1 == self.shape2 == "linear":
+            return (self.a1 + self.a2) * dh + self.a1 * self.a2 * h
+        A, dA = (h, 1.0) if self.shape1 == "linear" else (jnp.arctan(h), 1.0 / (1.0 + h * h))
+        z = dh + self.a1 * A
+        return self.a1 * dA * dh + self.a2 * (z if self.shape2 == "linear" else z**3)
 
     def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
         """The wrapped law's command with its torque filtered, and the slack."""

@@ -85,16 +85,17 @@ class Outcome(NamedTuple):
 
 def sample_status(sample: Sample) -> jax.Array:
     """The flags that one sample raises, () int32."""
-    narrowest = jnp.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
     found = (
         flag(jnp.any(~(margin > 0)), Status.BOUND_VIOLATED)
-        | flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
         | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
         | flag(jnp.any(sample.guard_active) & (sample.t > 0), Status.GUARD_STAYED)
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
         | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
     )
+    if not has(sample, "slack"):  # a filter keeps its bounds wherever the reference goes
+        narrowest = jnp.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
+        found |= flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
     for slack in ("slack", "region_slack"):
         if has(sample, slack):
             found |= flag(jnp.any(getattr(sample, slack) > 0), Status.FILTER_INFEASIBLE)
