@@ -21,6 +21,7 @@ from iblf_jax.identification import statistics
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z
 from iblf_jax.identification.log import read
 from iblf_jax.identification.shooting import Replay, Torque, windows
+from iblf_jax.identification.standstill import by_the_law
 
 MASS, VISCOUS, COULOMB, WIDTH = np.array([2.0, 0.85]), np.array([0.15, 0.08]), np.array([0.2, 0.1]), 0.05
 LENGTH, CENTRE, INERTIA = (0.35, 0.31), (0.175, 0.155), (0.06125, 0.02042125)
@@ -28,7 +29,7 @@ PATHS = ["robot.mass", "disturbance.viscous", "disturbance.coulomb"]
 COUNT = 2.0 * np.pi / 2**14
 
 
-def acceleration(q, dq, tau):
+def acceleration(q, dq, tau, rubbing):
     """Of the arm that is logged, from the five numbers of section 1 of the literature."""
     (m1, m2), (l1, _), (c1, c2), (I1, I2) = MASS, LENGTH, CENTRE, INERTIA
     p1, p2, p3, p4, p5 = m1 * c1**2 + m2 * l1**2 + I1, m2 * c2**2 + I2, m2 * l1 * c2, m1 * c1 + m2 * l1, m2 * c2
@@ -37,10 +38,21 @@ def acceleration(q, dq, tau):
     coriolis = p3 * sine * np.array([-dq[1] * (2 * dq[0] + dq[1]), dq[0] ** 2])
     outer = p5 * 9.81 * np.cos(q[0] + q[1])
     gravity = np.array([p4 * 9.81 * np.cos(q[0]) + outer, outer])
-    return np.linalg.solve(M, tau - coriolis - gravity - VISCOUS * dq - COULOMB * np.tanh(dq / WIDTH))
+    return np.linalg.solve(M, tau - coriolis - gravity - VISCOUS * dq - rubbing)
 
 
-def independent_log(duration=8.0, step=4e-3, seed=0):
+def smooth(dq, bristle):
+    """Coulomb friction over a width; no bristle."""
+    return COULOMB * np.tanh(dq / WIDTH), np.zeros(2)
+
+
+def sticking(dq, bristle):
+    """Friction of a bristle, which gives way by 1 mrad and breaks away at 1.3 times what it needs to go on (LuGre)."""
+    stiffness, most = COULOMB / 1e-3, COULOMB * (1.0 + 0.3 * np.exp(-((dq / 0.01) ** 2)))
+    return stiffness * bristle, dq - np.abs(dq) * stiffness * bristle / most
+
+
+def independent_log(duration=8.0, step=4e-3, seed=0, friction=smooth, substeps=2):
     """t, q in counts, tau: PD about a sum of sinusoids, from the counts."""
     rng = np.random.default_rng(seed)
     A, W, P = rng.uniform(0.2, 0.4, (3, 2)), np.array([[1.0, 1.4], [2.3, 3.1], [4.1, 5.3]]), rng.uniform(0, 6.28, (3, 2))
@@ -48,20 +60,29 @@ def independent_log(duration=8.0, step=4e-3, seed=0):
     def reference(t):
         return np.array([0.6, 0.5]) + np.sum(A * np.sin(W * t + P), axis=0), np.sum(A * W * np.cos(W * t + P), axis=0)
 
-    q, dq = reference(0.0)
+    def rate(q, dq, bristle):
+        rubbing, change = friction(dq, bristle)
+        return dq, acceleration(q, dq, tau, rubbing), change
+
+    (q, dq), bristle = reference(0.0), np.zeros(2)
     before, speed, rows = q, dq, []
     for k in range(round(duration / step)):
         y = COUNT * np.round(q / COUNT)
         speed, before = 0.6 * speed + 0.4 * (y - before) / step if k else speed, y
-        wanted, rate = reference(k * step)
-        tau = np.array([8.0, 2.0]) * np.cos(np.cumsum(y)) + np.array([40.0, 8.0]) * (wanted - y) + np.array([4.0, 0.6]) * (rate - speed)
+        wanted, wanted_rate = reference(k * step)
+        tau = (
+            np.array([8.0, 2.0]) * np.cos(np.cumsum(y))
+            + np.array([40.0, 8.0]) * (wanted - y)
+            + np.array([4.0, 0.6]) * (wanted_rate - speed)
+        )
         rows.append((k * step, y, tau))
-        for _ in range(2):
-            h, (k1, a1) = 0.5 * step, (dq, acceleration(q, dq, tau))
-            k2, a2 = dq + h / 2 * a1, acceleration(q + h / 2 * k1, dq + h / 2 * a1, tau)
-            k3, a3 = dq + h / 2 * a2, acceleration(q + h / 2 * k2, dq + h / 2 * a2, tau)
-            k4, a4 = dq + h * a3, acceleration(q + h * k3, dq + h * a3, tau)
-            q, dq = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), dq + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        for _ in range(substeps):
+            x, h = (q, dq, bristle), step / substeps
+            k1 = rate(*x)
+            k2 = rate(*(a + h / 2 * b for a, b in zip(x, k1, strict=True)))
+            k3 = rate(*(a + h / 2 * b for a, b in zip(x, k2, strict=True)))
+            k4 = rate(*(a + h * b for a, b in zip(x, k3, strict=True)))
+            q, dq, bristle = (a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True))
     t, y, tau = map(np.array, zip(*rows, strict=True))
     return {"t": t, "q": y, "tau": tau}
 
@@ -122,6 +143,19 @@ def test_the_fit_is_as_good_as_the_encoder_also_on_what_was_held_back(known):
             assert 0.9 < left / (COUNT / np.sqrt(12)) < 1.15
         assert one.before > 30 * one.after and one.explained > 0.99
     assert 0 < np.sum(~known.kept) < np.sum(known.kept)
+
+
+def test_friction_that_sticks_is_left_to_the_log(scenario):
+    """A bristle's friction is no tanh: about standstill torques are free, what the rest tells is not spoilt, and the report says so."""
+    known = ij.identify(scenario, independent_log(seed=1, friction=sticking, substeps=10), PATHS)
+    assert {number.verdict for number in known.numbers[6:]} == {"left free"} and {number.verdict for number in known.numbers[:6]} == {
+        "told"
+    }
+    assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
+    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3 > np.max(known.standard_errors["robot.mass"])
+    assert all(one.lacking < 1.1 for one in known.fit) and np.all(np.isnan(known.values["disturbance.width"]))
+    assert "6 of 6 numbers told" in repr(known) and "the friction of joint 0, joint 1 is not coulomb tanh" in repr(known)
+    np.testing.assert_array_equal(known.scenario.disturbance.width, scenario.disturbance.width)
 
 
 def test_the_scenario_has_the_new_numbers_in_plant_and_model(known, scenario):
@@ -451,7 +485,7 @@ def test_the_tangents_of_a_replay_are_those_of_finite_differences(scenario, log)
     replayed_, c = coordinates(scenario, ["plant.mass[1]", "disturbance.viscous[0]"], {})
     (one,) = read({name: x[:200] for name, x in log.items()}, 2)
     cut = windows([one], 0.25, [0.0], held=True)
-    replay = Replay(replayed_, c, cut, [one], True, "squares", 1)
+    replay = Replay(replayed_, c, cut, [one], True, "squares", 1, by_the_law(cut.y.shape, len(c.x)))
     z, starts = np.append(c.x, 5e-4), np.concatenate([cut.q, cut.dq], axis=1)
     stretches, q, dq = replay.moved(z, starts)
     J, along = replay._slopes(z, stretches, q, dq)
