@@ -7,6 +7,7 @@ encoders of 14 bits; it shares nothing with the package.
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -154,7 +155,7 @@ def test_friction_that_sticks_is_left_to_the_log(scenario):
     assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3 > np.max(known.standard_errors["robot.mass"])
     assert all(one.lacking < 1.1 for one in known.fit) and np.all(np.isnan(known.values["disturbance.width"]))
-    assert "6 of 6 numbers told" in repr(known) and "the friction of joint 0, joint 1 is not coulomb tanh" in repr(known)
+    assert "6 of 6 numbers told" in repr(known) and "in place of the friction of joint 0, joint 1: coulomb tanh" in repr(known)
     np.testing.assert_array_equal(known.scenario.disturbance.width, scenario.disturbance.width)
 
 
@@ -252,13 +253,20 @@ def test_outliers_are_borne_by_huber(scenario, log):
 
 def test_priors_and_limits(scenario, log):
     """What was known before is believed for what it is worth; what is at a limit is said to be."""
-    options = {"widths": False, "priors": {"robot.mass": (MASS, 1e-7)}, "limits": {"disturbance.coulomb": (0.0, [0.199, 0.15])}}
-    held = ij.identify(scenario, log, PATHS, **options)
+    held = ij.identify(scenario, log, PATHS, widths=False, priors={"robot.mass": (MASS, 1e-7)})
     np.testing.assert_allclose(held.values["robot.mass"], MASS, atol=5e-7)
     assert np.max(held.standard_errors["robot.mass"]) < 5e-7
-    at_limit = held.numbers[held.names.index("disturbance.coulomb[0]")]
-    assert (at_limit.verdict, at_limit.value) == ("at its limit", 0.199)
-    assert any("disturbance.coulomb[0] is at its limit" in note for note in held.notes)
+    for limits, name, at in (
+        ({"disturbance.coulomb": (0.0, [0.199, 0.15])}, "disturbance.coulomb[0]", 0.199),
+        ({"robot.mass": (None, [1.8, 1.2])}, "robot.mass[0]", 1.8),  # the others' misfit is so large that nothing is told
+    ):
+        bound = ij.identify(scenario, log, PATHS, widths=False, limits=limits)
+        number = bound.numbers[bound.names.index(name)]
+        assert (number.verdict, number.value) == ("at its limit", at) and name not in "".join(bound.perturbations)
+        (words,) = (note for note in bound.notes if name in note)
+        path, truth = next(iter(limits)), TRUTH[next(iter(limits))][0]
+        assert f"{at:g} " in words and f"The upper end of limits['{path}']" in words
+        assert abs(float(re.search(r"asks for about ([\d.]+\d)", words)[1]) / truth - 1.0) < 0.02
     with pytest.raises(ValueError, match=r"priors: got 'plant.g', expected one of the paths"):
         ij.identify(scenario, log, PATHS, priors={"plant.g": (9.81, 0.1)})
     with pytest.raises(ValueError, match=r"limits\['robot.mass'\].*a start between"):

@@ -392,7 +392,7 @@ def judged(
         w.t,
         w.kept,
         np.array([one.correlations for one in white]),
-        (*notes, *_notes(found, numbers, fit), *_limited(c, numbers, beyond, ends), *_freed(start, end, worse)),
+        (*notes, *_limited(c, numbers, beyond, ends), *_notes(found, numbers, fit), *_freed(start, end, worse)),
         logs,
         end.steps,
         seconds,
@@ -446,11 +446,12 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
     if not all(one.is_white for one in fit) and widest > CLEARLY:
         notes.append(f"What is left is coloured: standard errors are up to {widest:.2g} times those of white noise.")
     worst = max(fit, key=lambda one: one.lacking)
+    bound = any(number.verdict == LIMITED for number in numbers)
+    likely = f"{'what a limit excludes, ' if bound else ''}dry friction that is not looked for, play, a torque in between samples"
     if worst.lacking > LACKS:
         notes.append(
             f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its positions: the model lacks something "
-            "(dry friction that is not looked for, a column of the other sign, play, a torque in between samples), and all standard "
-            "errors are that much larger for it"
+            f"({likely}), and all standard errors are that much larger for it"
             + ("; a model that fits tells more." if any(number.value is None for number in numbers) else ".")
         )
     return notes
@@ -479,8 +480,8 @@ def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
     names = [name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part]
     parts = f"{100 * share[share > 0].min():.2g} to {100 * share.max():.2g} %"
     return [
-        f"About standstill (slower than {SLOW:g} rad/s: {parts} of the time) the friction of {', '.join(names)} is not coulomb "
-        f"tanh(q' / width), which leaves {worse:.2g} times as much: there torques were free, and the widths are the scenario's."
+        f"About standstill (slower than {SLOW:g} rad/s: {parts} of the time) torques were free in place of the friction of "
+        f"{', '.join(names)}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."
     ]
 
 
