@@ -17,10 +17,10 @@ from iblf_jax.engine.replay import slopes_under
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import Log, Said, read
 from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
-from iblf_jax.identification.result import Identification, judged
+from iblf_jax.identification.result import FINEST, LACKS, Identification, judged
 from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
 from iblf_jax.identification.smoothing import Smoothed, smoothed
-from iblf_jax.identification.standstill import HOPELESS, NONE, WORSE, by_the_law, free_about_standstill
+from iblf_jax.identification.standstill import BETTER, HOPELESS, NONE, SLOW, WORSE, by_the_law, free_about_standstill
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 
@@ -103,7 +103,7 @@ def identify(
         prior = _prior(c, priors)
         guess = started(replayed, c, seen, "log", delay)
 
-        law, free = by_the_law(w.y.shape, len(c.x)), free_about_standstill(replayed, c, w, logs, np.std(seen.tau, axis=0))
+        law = by_the_law(w.y.shape, len(c.x))
 
         def replay(x, friction):
             return Replay(replayed, c, w, logs, held, loss, _substeps(replayed, c, x, seen, min(one.step for one in logs)), friction)
@@ -115,16 +115,22 @@ def identify(
         before = replay(c.x, law).best_starts(first, noise)[1]
         scale = np.append(coordinate_scales(c, guess.scale), OFFSET)
         z, loose, worse = np.append(guess.z, guess.delay), None, 0.0
-        if free.held.any():  # found from any start; then the law of friction from there
-            x = np.where(free.held, NONE, to_x(c, guess.z)[0])
-            loose = replay(x, free).refined(z, ends, scale, noise, prior, iterations)
-            z = loose.z
+        for slow in SLOW:  # found from any start; then the law of friction from there
+            free = free_about_standstill(replayed, c, w, logs, np.std(seen.tau, axis=0), slow)
+            if not free.held.any():
+                break
+            found = replay(np.where(free.held, NONE, to_x(c, z[:-1])[0]), free).refined(z, ends, scale, noise, prior, iterations)
+            if loose is not None and not np.max(found.left / noise) < BETTER * np.max(loose.left / noise):
+                break
+            loose, z = found, found.z
+            if np.max(loose.left / np.maximum(noise, FINEST)) < LACKS:
+                break
         hopeless = np.inf if loose is None else HOPELESS * loose.left
         end = replay(to_x(c, z[:-1])[0], law).refined(z, ends, scale, noise, prior, iterations, hopeless)
         if loose is not None:
             worse = float(np.max(end.left / loose.left))
             end = loose._replace(steps=loose.steps + end.steps) if worse > WORSE else end._replace(steps=loose.steps + end.steps)
-        found = judged(
+        result = judged(
             start,
             c,
             w,
@@ -139,7 +145,7 @@ def identify(
             tuple(x.name for x in logs),
             time.monotonic() - begin,
         )
-    return dataclasses.replace(found, scenario=astype(found.scenario, given.initial.q.dtype), start=given)
+    return dataclasses.replace(result, scenario=astype(result.scenario, given.initial.q.dtype), start=given)
 
 
 def _is_continuous(log: Any) -> bool:

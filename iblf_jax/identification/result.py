@@ -15,7 +15,6 @@ from iblf_jax.core import checks, tables
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, to_x
 from iblf_jax.identification.regression import Start
 from iblf_jax.identification.shooting import Prior, Refined, Windows
-from iblf_jax.identification.standstill import SLOW
 from iblf_jax.identification.statistics import UNKNOWN, Known, Whiteness, in_words, known, whiteness
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
@@ -480,7 +479,7 @@ def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
     names = [name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part]
     parts = f"{100 * share[share > 0].min():.2g} to {100 * share.max():.2g} %"
     return [
-        f"About standstill (slower than {SLOW:g} rad/s: {parts} of the time) torques were free in place of the friction of "
+        f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were free in place of the friction of "
         f"{', '.join(names)}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."
     ]
 

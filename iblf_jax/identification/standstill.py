@@ -21,8 +21,10 @@ from iblf_jax.identification.log import Log
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 
-SLOW, AROUND, PIECE = 0.05, 0.01, 0.01
-"""[rad/s], [s] and [s]."""
+SLOW, AROUND, PIECE = (0.05, 0.1, 0.2), 0.01, 0.01
+"""[rad/s], the next where the one before leaves more than noise; [s] and [s]."""
+BETTER = 0.9
+"""Part of what is left from which a larger SLOW is worth what it leaves open."""
 HALF = 0.02
 """Half of the time over which a speed is looked at [s]: at 500 Hz it is then known to 20 1/s times the noise of a position."""
 WORSE, HOPELESS = 1.02, 1.3
@@ -42,6 +44,8 @@ class Free(NamedTuple):
     """How many of these are of each joint, (W, n)."""
     held: np.ndarray
     """Which numbers are not looked for: the widths, (p,) bool."""
+    slow: float = 0.0
+    """Speed below which joints are about standstill [rad/s]."""
 
     @property
     def share(self) -> np.ndarray:
@@ -55,7 +59,7 @@ def by_the_law(shape: tuple[int, ...], p: int) -> Free:
     return Free(np.zeros((W, K, n, p)), np.zeros((W, K, n, 0)), np.zeros((W, n)), np.zeros(p, bool))
 
 
-def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list[Log], size: np.ndarray) -> Free:
+def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list[Log], size: np.ndarray, slow: float) -> Free:
     """What is free of the joints whose Coulomb friction and its width are looked for.
 
     Args:
@@ -64,17 +68,18 @@ def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list
       w: the windows.
       logs: all.
       size: s, (n,) [N m].
+      slow: speed below which a joint is about standstill [rad/s].
     """
     found, joints = by_the_law(w.y.shape, len(c.x)), list(_joints(scenario, c))
     W, K, n = found.torque.shape[:3]
     direction = np.empty((W, K, n))
     for i, log in enumerate(logs):
         own = w.log == i
-        direction[own] = _direction(log)[np.searchsorted(log.t, w.t[own][:, :-1])]
+        direction[own] = _direction(log, slow)[np.searchsorted(log.t, w.t[own][:, :-1])]
     length = max(2, round(PIECE / float(np.mean(np.diff(w.t)))))
     free = sorted({j for *_, j in joints})
     parts = [[(j, part) for j in free for part in _parts(direction[i, :, j] == 0.0, length)] for i in range(W)]
-    found = found._replace(torque=np.zeros((W, K, n, max(map(len, parts), default=0))))
+    found = found._replace(torque=np.zeros((W, K, n, max(map(len, parts), default=0))), slow=slow)
     for i, own in enumerate(parts):
         for a, (j, part) in enumerate(own):
             found.torque[i, part, j, a] = size[j]
@@ -95,15 +100,15 @@ def _joints(scenario: Scenario, c: Coordinates) -> Iterator[tuple[int, int, int]
                 yield place.start + k, width.start + k, entry if isinstance(entry, int) else k
 
 
-def _direction(log: Log) -> np.ndarray:
+def _direction(log: Log, slow: float) -> np.ndarray:
     """In which direction each joint moves, 1 or -1, and 0 about standstill, (N, n)."""
     found = np.zeros(log.q.shape)
     for stretch in log.stretches:
         t = log.t[stretch]
         speed = _speed(t, log.q[stretch], log.step)
-        slow = _before(np.abs(speed) < SLOW)
+        still = _before(np.abs(speed) < slow)
         first, last = np.searchsorted(t, t - AROUND), np.searchsorted(t, t + AROUND, side="right")
-        found[stretch] = np.where(slow[last] > slow[first], 0.0, np.sign(speed))
+        found[stretch] = np.where(still[last] > still[first], 0.0, np.sign(speed))
     return found
 
 
