@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tomli_w
@@ -17,12 +19,15 @@ from conftest import ROOT
 
 import iblf_jax as ij
 from iblf_jax import cli
+from iblf_jax.core.pytree import astype
+from iblf_jax.engine.replay import slopes
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z
 from iblf_jax.identification.log import read
 from iblf_jax.identification.shooting import Replay, Torque, windows
-from iblf_jax.identification.standstill import by_the_law
+from iblf_jax.identification.standstill import by_the_law, free_about_standstill
+from iblf_jax.simulation.scenario import canonical
 
 MASS, VISCOUS, COULOMB, WIDTH = np.array([2.0, 0.85]), np.array([0.15, 0.08]), np.array([0.2, 0.1]), 0.05
 LENGTH, CENTRE, INERTIA = (0.35, 0.31), (0.175, 0.155), (0.06125, 0.02042125)
@@ -488,18 +493,57 @@ def test_a_wrong_file_is_told(change, words, tmp_path):
         load_identification_file(tmp_path / "identify.toml")
 
 
-def test_the_tangents_of_a_replay_are_those_of_finite_differences(scenario, log):
-    """By the start, a mass, friction and the torque's offset in time; and e is the inverse of the acceleration."""
-    replayed_, c = coordinates(scenario, ["plant.mass[1]", "disturbance.viscous[0]"], {})
+@pytest.mark.parametrize("left_free", [False, True])
+def test_the_tangents_of_a_replay_are_those_of_finite_differences(left_free, scenario, log):
+    """By the start, free torques, a mass, friction and the torque's offset in time; and e is the inverse of the acceleration."""
+    paths = ["plant.mass[1]", "disturbance.coulomb", "disturbance.width"] if left_free else ["plant.mass[1]", "disturbance.viscous[0]"]
+    replayed_, c = coordinates(scenario, paths, {})
     (one,) = read({name: x[:200] for name, x in log.items()}, 2)
     cut = windows([one], 0.25, [0.0], held=True)
-    replay = Replay(replayed_, c, cut, [one], True, "squares", 1, by_the_law(cut.y.shape, len(c.x)))
-    z, starts = np.append(c.x, 5e-4), np.concatenate([cut.q, cut.dq], axis=1)
+    free = free_about_standstill(replayed_, c, cut, [one], np.ones(2), 0.1) if left_free else by_the_law(cut.y.shape, len(c.x))
+    replay = Replay(replayed_, c, cut, [one], True, "squares", 1, free)
+    z, m = np.append(c.x, 5e-4), free.torque.shape[-1]
+    assert (m > 3) == left_free
+    starts = np.concatenate([cut.q, cut.dq, np.full((len(cut.q), m), 0.05)], axis=1)
     stretches, q, dq = replay.moved(z, starts)
     J, along = replay._slopes(z, stretches, q, dq)
-    for i in range(7):
-        step = 1e-4 * (np.arange(7) == i)
-        after, before = (replay.moved(z + s * step[4:], starts + s * step[:4])[1] for s in (1.0, -1.0))
-        share = 2e-3 if i < 6 else 0.05  # the offset's is taken over a sample, as a held torque is a staircase
+    s = starts.shape[1]
+    for i in [*range(4), *range(s - min(m, 3), J.shape[-1])]:
+        step = 1e-4 * (np.arange(J.shape[-1]) == i)
+        after, before = (replay.moved(z + sign * step[s:], starts + sign * step[:s])[1] for sign in (1.0, -1.0))
+        share = 2e-3 if i < J.shape[-1] - 1 else 0.05  # the offset's is taken over a sample, as a held torque is a staircase
         np.testing.assert_allclose(J[..., i], (after - before) / 2e-4, atol=share * np.max(np.abs(J[..., i])))
     np.testing.assert_allclose(along.torque, np.asarray(stretches.tau).reshape(-1, 2), atol=1e-9)
+
+
+def test_friction_is_free_where_a_joint_turns_round_and_nowhere_else(scenario, log):
+    """Coulomb friction has the direction of the motion, and 0 with torques in its place about standstill; of one joint, if it is asked."""
+    replayed_, c = coordinates(scenario, ["disturbance.coulomb[1]", "disturbance.width[1]"], {})
+    (one,) = read(log, 2)
+    cut = windows([one], 0.5, [0.0], held=True)
+    free = free_about_standstill(replayed_, c, cut, [one], np.array([3.0, 2.0]), 0.1)
+    at = np.rint(cut.t[:, 2:-2] / 4e-3).astype(int)
+    speed = (log["q"][at + 2, 1] - log["q"][at - 2, 1]) / 16e-3
+    fast, slow = np.abs(speed) > 0.25, np.abs(speed) < 0.05
+    assert np.mean(fast) > 0.5 and 0 < np.sum(slow) < 0.1 * slow.size
+    along, pieces = free.by_x[:, 2:-1, 1, 0], np.sum(free.torque[:, 2:-1, 1], axis=-1)
+    np.testing.assert_array_equal(along[fast], -np.sign(speed[fast]))
+    np.testing.assert_array_equal(pieces[fast], 0.0)
+    np.testing.assert_array_equal(along[slow], 0.0)
+    np.testing.assert_array_equal(pieces[slow], 2.0)
+    assert not free.by_x[:, :, 0].any() and not free.torque[:, :, 0].any() and free.held.tolist() == [False, True]
+
+
+def test_one_joint_of_seven_that_is_mounted_the_other_way_is_named():
+    """The last joint of an arm has a small part of the torques: its sign is told all the same."""
+    scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=ij.disturbances.Nothing())
+    t, rng = np.arange(200) * 0.01, np.random.default_rng(0)
+    w, A, P = rng.uniform(2.0, 6.0, 7), rng.uniform(0.2, 0.4, 7), rng.uniform(0.0, 6.28, 7)
+    q, dq, ddq = (A * w**k * np.sin(np.outer(t, w) + P + k * np.pi / 2) for k in range(3))
+    q = q + np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
+    with jax.enable_x64(True):
+        arm = canonical(astype(canonical(scenario), "float64"))
+        tau = np.asarray(slopes(arm, *map(jnp.asarray, (np.zeros(0), t, q, dq, ddq)), places=()).torque)
+    log = {"t": t, "q": q * np.where(np.arange(7) == 6, -1.0, 1.0), "tau": tau}
+    with pytest.raises(ValueError, match=r"with q\[6\] of the other sign, they would explain 100%"):
+        ij.identify(scenario, log, ["robot.mass"], torque="interpolated")
