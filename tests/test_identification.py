@@ -160,7 +160,7 @@ def test_friction_that_sticks_is_left_to_the_log(scenario):
     assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3 > np.max(known.standard_errors["robot.mass"])
     assert all(one.lacking < 1.1 for one in known.fit) and np.all(np.isnan(known.values["disturbance.width"]))
-    assert "6 of 6 numbers told" in repr(known) and "in place of the friction of joint 0, joint 1: coulomb tanh" in repr(known)
+    assert "6 of 6 numbers told" in repr(known) and "in place of the friction of all joints: coulomb tanh" in repr(known)
     np.testing.assert_array_equal(known.scenario.disturbance.width, scenario.disturbance.width)
 
 

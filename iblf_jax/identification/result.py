@@ -477,10 +477,11 @@ def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
     if not np.any(share):
         return []
     names = [name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part]
+    whose = "all joints" if len(names) == start.n else ", ".join(names)
     parts = f"{100 * share[share > 0].min():.2g} to {100 * share.max():.2g} %"
     return [
         f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were free in place of the friction of "
-        f"{', '.join(names)}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."
+        f"{whose}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."
     ]
 
 
