@@ -7,7 +7,10 @@ encoders of 14 bits; it shares nothing with the package.
 from __future__ import annotations
 
 import json
+import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tomli_w
@@ -16,11 +19,15 @@ from conftest import ROOT
 
 import iblf_jax as ij
 from iblf_jax import cli
+from iblf_jax.core.pytree import astype
+from iblf_jax.engine.replay import slopes
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z
 from iblf_jax.identification.log import read
 from iblf_jax.identification.shooting import Replay, Torque, windows
+from iblf_jax.identification.standstill import by_the_law, free_about_standstill
+from iblf_jax.simulation.scenario import canonical
 
 MASS, VISCOUS, COULOMB, WIDTH = np.array([2.0, 0.85]), np.array([0.15, 0.08]), np.array([0.2, 0.1]), 0.05
 LENGTH, CENTRE, INERTIA = (0.35, 0.31), (0.175, 0.155), (0.06125, 0.02042125)
@@ -28,7 +35,7 @@ PATHS = ["robot.mass", "disturbance.viscous", "disturbance.coulomb"]
 COUNT = 2.0 * np.pi / 2**14
 
 
-def acceleration(q, dq, tau):
+def acceleration(q, dq, tau, rubbing):
     """Of the arm that is logged, from the five numbers of section 1 of the literature."""
     (m1, m2), (l1, _), (c1, c2), (I1, I2) = MASS, LENGTH, CENTRE, INERTIA
     p1, p2, p3, p4, p5 = m1 * c1**2 + m2 * l1**2 + I1, m2 * c2**2 + I2, m2 * l1 * c2, m1 * c1 + m2 * l1, m2 * c2
@@ -37,10 +44,21 @@ def acceleration(q, dq, tau):
     coriolis = p3 * sine * np.array([-dq[1] * (2 * dq[0] + dq[1]), dq[0] ** 2])
     outer = p5 * 9.81 * np.cos(q[0] + q[1])
     gravity = np.array([p4 * 9.81 * np.cos(q[0]) + outer, outer])
-    return np.linalg.solve(M, tau - coriolis - gravity - VISCOUS * dq - COULOMB * np.tanh(dq / WIDTH))
+    return np.linalg.solve(M, tau - coriolis - gravity - VISCOUS * dq - rubbing)
 
 
-def independent_log(duration=8.0, step=4e-3, seed=0):
+def smooth(dq, bristle):
+    """Coulomb friction over a width; no bristle."""
+    return COULOMB * np.tanh(dq / WIDTH), np.zeros(2)
+
+
+def sticking(dq, bristle):
+    """Friction of a bristle, which gives way by 1 mrad and breaks away at 1.3 times what it needs to go on (LuGre)."""
+    stiffness, most = COULOMB / 1e-3, COULOMB * (1.0 + 0.3 * np.exp(-((dq / 0.01) ** 2)))
+    return stiffness * bristle, dq - np.abs(dq) * stiffness * bristle / most
+
+
+def independent_log(duration=8.0, step=4e-3, seed=0, friction=smooth, substeps=2):
     """t, q in counts, tau: PD about a sum of sinusoids, from the counts."""
     rng = np.random.default_rng(seed)
     A, W, P = rng.uniform(0.2, 0.4, (3, 2)), np.array([[1.0, 1.4], [2.3, 3.1], [4.1, 5.3]]), rng.uniform(0, 6.28, (3, 2))
@@ -48,20 +66,29 @@ def independent_log(duration=8.0, step=4e-3, seed=0):
     def reference(t):
         return np.array([0.6, 0.5]) + np.sum(A * np.sin(W * t + P), axis=0), np.sum(A * W * np.cos(W * t + P), axis=0)
 
-    q, dq = reference(0.0)
+    def rate(q, dq, bristle):
+        rubbing, change = friction(dq, bristle)
+        return dq, acceleration(q, dq, tau, rubbing), change
+
+    (q, dq), bristle = reference(0.0), np.zeros(2)
     before, speed, rows = q, dq, []
     for k in range(round(duration / step)):
         y = COUNT * np.round(q / COUNT)
         speed, before = 0.6 * speed + 0.4 * (y - before) / step if k else speed, y
-        wanted, rate = reference(k * step)
-        tau = np.array([8.0, 2.0]) * np.cos(np.cumsum(y)) + np.array([40.0, 8.0]) * (wanted - y) + np.array([4.0, 0.6]) * (rate - speed)
+        wanted, wanted_rate = reference(k * step)
+        tau = (
+            np.array([8.0, 2.0]) * np.cos(np.cumsum(y))
+            + np.array([40.0, 8.0]) * (wanted - y)
+            + np.array([4.0, 0.6]) * (wanted_rate - speed)
+        )
         rows.append((k * step, y, tau))
-        for _ in range(2):
-            h, (k1, a1) = 0.5 * step, (dq, acceleration(q, dq, tau))
-            k2, a2 = dq + h / 2 * a1, acceleration(q + h / 2 * k1, dq + h / 2 * a1, tau)
-            k3, a3 = dq + h / 2 * a2, acceleration(q + h / 2 * k2, dq + h / 2 * a2, tau)
-            k4, a4 = dq + h * a3, acceleration(q + h * k3, dq + h * a3, tau)
-            q, dq = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), dq + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        for _ in range(substeps):
+            x, h = (q, dq, bristle), step / substeps
+            k1 = rate(*x)
+            k2 = rate(*(a + h / 2 * b for a, b in zip(x, k1, strict=True)))
+            k3 = rate(*(a + h / 2 * b for a, b in zip(x, k2, strict=True)))
+            k4 = rate(*(a + h * b for a, b in zip(x, k3, strict=True)))
+            q, dq, bristle = (a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True))
     t, y, tau = map(np.array, zip(*rows, strict=True))
     return {"t": t, "q": y, "tau": tau}
 
@@ -122,6 +149,19 @@ def test_the_fit_is_as_good_as_the_encoder_also_on_what_was_held_back(known):
             assert 0.9 < left / (COUNT / np.sqrt(12)) < 1.15
         assert one.before > 30 * one.after and one.explained > 0.99
     assert 0 < np.sum(~known.kept) < np.sum(known.kept)
+
+
+def test_friction_that_sticks_is_left_to_the_log(scenario):
+    """A bristle's friction is no tanh: about standstill torques are free, what the rest tells is not spoilt, and the report says so."""
+    known = ij.identify(scenario, independent_log(seed=1, friction=sticking, substeps=10), PATHS)
+    assert {number.verdict for number in known.numbers[6:]} == {"left free"} and {number.verdict for number in known.numbers[:6]} == {
+        "told"
+    }
+    assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
+    assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3 > np.max(known.standard_errors["robot.mass"])
+    assert all(one.lacking < 1.1 for one in known.fit) and np.all(np.isnan(known.values["disturbance.width"]))
+    assert "6 of 6 numbers told" in repr(known) and "in place of the friction of all joints: coulomb tanh" in repr(known)
+    np.testing.assert_array_equal(known.scenario.disturbance.width, scenario.disturbance.width)
 
 
 def test_the_scenario_has_the_new_numbers_in_plant_and_model(known, scenario):
@@ -218,13 +258,20 @@ def test_outliers_are_borne_by_huber(scenario, log):
 
 def test_priors_and_limits(scenario, log):
     """What was known before is believed for what it is worth; what is at a limit is said to be."""
-    options = {"widths": False, "priors": {"robot.mass": (MASS, 1e-7)}, "limits": {"disturbance.coulomb": (0.0, [0.199, 0.15])}}
-    held = ij.identify(scenario, log, PATHS, **options)
+    held = ij.identify(scenario, log, PATHS, widths=False, priors={"robot.mass": (MASS, 1e-7)})
     np.testing.assert_allclose(held.values["robot.mass"], MASS, atol=5e-7)
     assert np.max(held.standard_errors["robot.mass"]) < 5e-7
-    at_limit = held.numbers[held.names.index("disturbance.coulomb[0]")]
-    assert (at_limit.verdict, at_limit.value) == ("at its limit", 0.199)
-    assert any("disturbance.coulomb[0] is at its limit" in note for note in held.notes)
+    for limits, name, at in (
+        ({"disturbance.coulomb": (0.0, [0.199, 0.15])}, "disturbance.coulomb[0]", 0.199),
+        ({"robot.mass": (None, [1.8, 1.2])}, "robot.mass[0]", 1.8),  # the others' misfit is so large that nothing is told
+    ):
+        bound = ij.identify(scenario, log, PATHS, widths=False, limits=limits)
+        number = bound.numbers[bound.names.index(name)]
+        assert (number.verdict, number.value) == ("at its limit", at) and name not in "".join(bound.perturbations)
+        (words,) = (note for note in bound.notes if name in note)
+        path, truth = next(iter(limits)), TRUTH[next(iter(limits))][0]
+        assert f"{at:g} " in words and f"The upper end of limits['{path}']" in words
+        assert abs(float(re.search(r"asks for about ([\d.]+\d)", words)[1]) / truth - 1.0) < 0.02
     with pytest.raises(ValueError, match=r"priors: got 'plant.g', expected one of the paths"):
         ij.identify(scenario, log, PATHS, priors={"plant.g": (9.81, 0.1)})
     with pytest.raises(ValueError, match=r"limits\['robot.mass'\].*a start between"):
@@ -446,18 +493,57 @@ def test_a_wrong_file_is_told(change, words, tmp_path):
         load_identification_file(tmp_path / "identify.toml")
 
 
-def test_the_tangents_of_a_replay_are_those_of_finite_differences(scenario, log):
-    """By the start, a mass, friction and the torque's offset in time; and e is the inverse of the acceleration."""
-    replayed_, c = coordinates(scenario, ["plant.mass[1]", "disturbance.viscous[0]"], {})
+@pytest.mark.parametrize("left_free", [False, True])
+def test_the_tangents_of_a_replay_are_those_of_finite_differences(left_free, scenario, log):
+    """By the start, free torques, a mass, friction and the torque's offset in time; and e is the inverse of the acceleration."""
+    paths = ["plant.mass[1]", "disturbance.coulomb", "disturbance.width"] if left_free else ["plant.mass[1]", "disturbance.viscous[0]"]
+    replayed_, c = coordinates(scenario, paths, {})
     (one,) = read({name: x[:200] for name, x in log.items()}, 2)
     cut = windows([one], 0.25, [0.0], held=True)
-    replay = Replay(replayed_, c, cut, [one], True, "squares", 1)
-    z, starts = np.append(c.x, 5e-4), np.concatenate([cut.q, cut.dq], axis=1)
+    free = free_about_standstill(replayed_, c, cut, [one], np.ones(2), 0.1) if left_free else by_the_law(cut.y.shape, len(c.x))
+    replay = Replay(replayed_, c, cut, [one], True, "squares", 1, free)
+    z, m = np.append(c.x, 5e-4), free.torque.shape[-1]
+    assert (m > 3) == left_free
+    starts = np.concatenate([cut.q, cut.dq, np.full((len(cut.q), m), 0.05)], axis=1)
     stretches, q, dq = replay.moved(z, starts)
     J, along = replay._slopes(z, stretches, q, dq)
-    for i in range(7):
-        step = 1e-4 * (np.arange(7) == i)
-        after, before = (replay.moved(z + s * step[4:], starts + s * step[:4])[1] for s in (1.0, -1.0))
-        share = 2e-3 if i < 6 else 0.05  # the offset's is taken over a sample, as a held torque is a staircase
+    s = starts.shape[1]
+    for i in [*range(4), *range(s - min(m, 3), J.shape[-1])]:
+        step = 1e-4 * (np.arange(J.shape[-1]) == i)
+        after, before = (replay.moved(z + sign * step[s:], starts + sign * step[:s])[1] for sign in (1.0, -1.0))
+        share = 2e-3 if i < J.shape[-1] - 1 else 0.05  # the offset's is taken over a sample, as a held torque is a staircase
         np.testing.assert_allclose(J[..., i], (after - before) / 2e-4, atol=share * np.max(np.abs(J[..., i])))
     np.testing.assert_allclose(along.torque, np.asarray(stretches.tau).reshape(-1, 2), atol=1e-9)
+
+
+def test_friction_is_free_where_a_joint_turns_round_and_nowhere_else(scenario, log):
+    """Coulomb friction has the direction of the motion, and 0 with torques in its place about standstill; of one joint, if it is asked."""
+    replayed_, c = coordinates(scenario, ["disturbance.coulomb[1]", "disturbance.width[1]"], {})
+    (one,) = read(log, 2)
+    cut = windows([one], 0.5, [0.0], held=True)
+    free = free_about_standstill(replayed_, c, cut, [one], np.array([3.0, 2.0]), 0.1)
+    at = np.rint(cut.t[:, 2:-2] / 4e-3).astype(int)
+    speed = (log["q"][at + 2, 1] - log["q"][at - 2, 1]) / 16e-3
+    fast, slow = np.abs(speed) > 0.25, np.abs(speed) < 0.05
+    assert np.mean(fast) > 0.5 and 0 < np.sum(slow) < 0.1 * slow.size
+    along, pieces = free.by_x[:, 2:-1, 1, 0], np.sum(free.torque[:, 2:-1, 1], axis=-1)
+    np.testing.assert_array_equal(along[fast], -np.sign(speed[fast]))
+    np.testing.assert_array_equal(pieces[fast], 0.0)
+    np.testing.assert_array_equal(along[slow], 0.0)
+    np.testing.assert_array_equal(pieces[slow], 2.0)
+    assert not free.by_x[:, :, 0].any() and not free.torque[:, :, 0].any() and free.held.tolist() == [False, True]
+
+
+def test_one_joint_of_seven_that_is_mounted_the_other_way_is_named():
+    """The last joint of an arm has a small part of the torques: its sign is told all the same."""
+    scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=ij.disturbances.Nothing())
+    t, rng = np.arange(200) * 0.01, np.random.default_rng(0)
+    w, A, P = rng.uniform(2.0, 6.0, 7), rng.uniform(0.2, 0.4, 7), rng.uniform(0.0, 6.28, 7)
+    q, dq, ddq = (A * w**k * np.sin(np.outer(t, w) + P + k * np.pi / 2) for k in range(3))
+    q = q + np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
+    with jax.enable_x64(True):
+        arm = canonical(astype(canonical(scenario), "float64"))
+        tau = np.asarray(slopes(arm, *map(jnp.asarray, (np.zeros(0), t, q, dq, ddq)), places=()).torque)
+    log = {"t": t, "q": q * np.where(np.arange(7) == 6, -1.0, 1.0), "tau": tau}
+    with pytest.raises(ValueError, match=r"with q\[6\] of the other sign, they would explain 100%"):
+        ij.identify(scenario, log, ["robot.mass"], torque="interpolated")

@@ -10,12 +10,14 @@ from iblf_jax import disturbances
 
 COUNT = 2.0 * np.pi / 2**14
 DAMPING, ARMATURE = np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2]), np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+DRY = np.array([2.0, 2.0, 1.5, 1.5, 0.6, 0.6, 0.3])
+"""Dry friction, which MuJoCo solves for as a soft constraint: a joint sticks, and gives way slowly [N m]."""
 FACTOR = np.array([1.0, 1.1, 0.9, 1.08, 0.93, 1.05, 1.4])
 """True masses by those of the file."""
 MIDDLE = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
 
 
-def described(arm, mass):
+def described(arm, mass, dry):
     """The arm as an MJCF."""
 
     def words(x):
@@ -24,12 +26,13 @@ def described(arm, mass):
     text = '<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="RK4" gravity="0 0 -9.81"/><worldbody>'
     for i in range(arm.n):
         text += f'<body pos="{words(arm.position[i])}" quat="{words(arm.rotation[i])}"><joint axis="{words(arm.axis[i])}" '
-        text += f'damping="{DAMPING[i]}" armature="{ARMATURE[i]}"/><inertial pos="{words(arm.centre[i])}" mass="{mass[i]:.17g}" '
+        text += f'damping="{DAMPING[i]}" armature="{ARMATURE[i]}" frictionloss="{dry[i]}"/>'
+        text += f'<inertial pos="{words(arm.centre[i])}" mass="{mass[i]:.17g}" '
         text += f'fullinertia="{words(arm.inertia[i])}"/>'
     return text + "</body>" * arm.n + "</worldbody></mujoco>"
 
 
-def logged(arm, duration, seed=0, step=2e-3):
+def logged(arm, duration, dry, seed=0, step=2e-3):
     """t, q in counts and the held torque."""
     import mujoco
 
@@ -37,7 +40,7 @@ def logged(arm, duration, seed=0, step=2e-3):
     A, P = rng.uniform(0.1, 0.3, (3, 7)), rng.uniform(0, 6.28, (3, 7))
     W = np.array([[1.0], [2.2], [4.0]]) * rng.uniform(0.8, 1.2, (3, 7))
     nominal = np.asarray(arm.mass)
-    true, known = (mujoco.MjModel.from_xml_string(described(arm, mass)) for mass in (nominal * FACTOR, nominal))
+    true, known = (mujoco.MjModel.from_xml_string(described(arm, *x)) for x in ((nominal * FACTOR, dry), (nominal, 0 * dry)))
     moving, thinking = mujoco.MjData(true), mujoco.MjData(known)
     moving.qpos[:], moving.qvel[:] = MIDDLE + np.sum(A * np.sin(P), axis=0), np.sum(A * W * np.cos(P), axis=0)
     before, speed, M, rows = None, moving.qvel.copy(), np.zeros((7, 7)), []
@@ -57,15 +60,18 @@ def logged(arm, duration, seed=0, step=2e-3):
 
 
 @pytest.mark.release
-def test_seven_joints_of_mujoco():
-    """Masses, damping and armature within their errors, masses within a percent; the first link's mass and armature are one number."""
+@pytest.mark.parametrize("dry", [0.0 * DRY, DRY], ids=["viscous", "dry"])
+def test_seven_joints_of_mujoco(dry):
+    """All numbers within their errors, masses within a percent, also with dry friction; the first link's mass and armature are one."""
     pytest.importorskip("mujoco")
     scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=disturbances.Nothing())
     start = ij.with_parameters(scenario, {"robot.damping": 0.5, "robot.armature": 0.05})
-    known = ij.identify(start, logged(scenario.plant, 12.0), ["robot.mass", "robot.damping", "robot.armature"])
     truth = {"robot.mass": np.asarray(scenario.plant.mass) * FACTOR, "robot.damping": DAMPING, "robot.armature": ARMATURE}
+    truth |= {"robot.friction": dry} if dry.any() else {}
+    known = ij.identify(start, logged(scenario.plant, 12.0, dry), list(truth))
     z = np.concatenate([(known.values[path] - x) / known.standard_errors[path] for path, x in truth.items()])
-    untold = {number.name for number in known.numbers if number.value is None}
+    untold = {number.name for number in known.numbers if number.verdict == "cannot be told"}
+    assert {number.name for number in known.numbers if number.verdict == "left free"} == set(known.names[21 + np.sum(dry > 0) :])
     assert untold == {"robot.mass[0]", "robot.armature[0]"}
     assert np.nanmax(np.abs(z)) < 4.0 and np.mean(np.abs(z[np.isfinite(z)]) < 3.0) > 0.9
     assert np.nanmax(np.abs(known.values["robot.mass"] / truth["robot.mass"] - 1.0)) < 0.01

@@ -122,27 +122,26 @@ def _slope(scenario: Scenario, places: tuple[Place, ...], x, t, q, dq, ddq) -> S
     return Slopes(torque, mass, by_q, by_dq, by_x)
 
 
-def tangents(stretches: Stretches, along: Slopes, by_offset: np.ndarray) -> np.ndarray:
-    """How q of the samples depends on start, x and the torque's offset in time, by the implicit midpoint rule.
+def tangents(stretches: Stretches, along: Slopes, by_input: np.ndarray) -> np.ndarray:
+    """How q of the samples depends on start, x and what moves the torque, by the implicit midpoint rule.
 
         X_{k+1} = (1 - h/2 F)^-1 ((1 + h/2 F) X_k + h G),     F = -M^-1 [de/dq de/dq'],  G = -M^-1 de/dx
 
     Args:
       stretches: W of K steps.
       along: at the middle of each step, P = W K points.
-      by_offset: derivative of each step's torque by the offset, (W, K, n).
+      by_input: derivative of each step's torque by what else moves it, (W, K, n, m).
 
     Returns:
-      dq/d(q(0), q'(0), x, offset), (W, K + 1, n, 2 n + p + 1).
+      dq/d(q(0), q'(0), x, inputs), (W, K + 1, n, 2 n + p + m).
     """
-    W, K, n = by_offset.shape
-    p = along.by_x.shape[-1]
-    forces = np.concatenate([-along.by_q, -along.by_dq, -along.by_x, by_offset.reshape(W * K, n, 1)], axis=-1)
+    W, K, n, _ = by_input.shape
+    forces = np.concatenate([-along.by_q, -along.by_dq, -along.by_x, by_input.reshape(W * K, n, -1)], axis=-1)
     rates = np.linalg.solve(along.mass, forces).reshape(W, K, n, -1)
     half = 0.5 * np.diff(np.asarray(stretches.t))
-    X = np.zeros((W, 2 * n, 2 * n + p + 1))
+    X = np.zeros((W, 2 * n, rates.shape[-1]))
     X[:, np.arange(2 * n), np.arange(2 * n)] = 1.0
-    found = np.empty((W, K + 1, n, 2 * n + p + 1))
+    found = np.empty((W, K + 1, n, rates.shape[-1]))
     found[:, 0] = X[:, :n]
     one = np.eye(2 * n)
     for k in range(K):

@@ -17,9 +17,10 @@ from iblf_jax.engine.replay import slopes_under
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import Log, Said, read
 from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
-from iblf_jax.identification.result import Identification, judged
+from iblf_jax.identification.result import FINEST, LACKS, Identification, judged
 from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
 from iblf_jax.identification.smoothing import Smoothed, smoothed
+from iblf_jax.identification.standstill import BETTER, HOPELESS, NONE, SLOW, WORSE, by_the_law, free_about_standstill
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 
@@ -60,8 +61,9 @@ def identify(
         interpolated for a `Rollout` of a continuous loop, else held.
       delay: how late the logged torque acts [s]; found too if not given.
       loss: "squares", or "huber" for logs with outliers.
-      widths: whether the width of a Coulomb friction is looked for with it: that of dry friction is nearly 0, and a width that is wrong
-        spoils all numbers (7 joints with dry friction: by up to 34 %, where the width is found by less than 1 %).
+      widths: whether what Coulomb friction does about standstill is looked for with it: whether it is tanh(q' / width), and with which
+        width, or another law (sticking, a bristle, an impulse), which the log then decides by free torques.  If not, the scenario's widths
+        are believed: one that is wrong spoils all numbers (7 joints with dry friction: by up to 34 %).
       limits: path -> (low, high) in the leaf's unit, None for the default: masses are above 0, friction and damping not below.
       priors: path -> (mean, standard deviation) of what is known from elsewhere, in the leaf's unit.
       iterations: Gauss-Newton steps, at most.
@@ -100,15 +102,35 @@ def identify(
         seen = smoothed([fitted for x, share in zip(logs, back, strict=True) for fitted in _front(x, 1.0 - share)], held)
         prior = _prior(c, priors)
         guess = started(replayed, c, seen, "log", delay)
-        replay = Replay(replayed, c, w, logs, held, loss, _substeps(replayed, c, guess.z, seen, min(x.step for x in logs)))
+
+        law = by_the_law(w.y.shape, len(c.x))
+
+        def replay(x, friction):
+            return Replay(replayed, c, w, logs, held, loss, _substeps(replayed, c, x, seen, min(one.step for one in logs)), friction)
+
         noise = np.maximum(seen.noise, 1e-9)
         fixed = None if delay is None else float(delay)
         ends = tuple(np.append(x, side * LARGEST_DELAY if fixed is None else fixed) for x, side in ((c.low, -1.0), (c.high, 1.0)))
         first = np.append(to_z(c, c.x), guess.delay)
-        before = replay.best_starts(first, noise)[1]
+        before = replay(c.x, law).best_starts(first, noise)[1]
         scale = np.append(coordinate_scales(c, guess.scale), OFFSET)
-        end = replay.refined(np.append(guess.z, guess.delay), ends, scale, noise, prior, iterations)
-        found = judged(
+        z, loose, worse = np.append(guess.z, guess.delay), None, 0.0
+        for slow in SLOW:  # found from any start; then the law of friction from there
+            free = free_about_standstill(replayed, c, w, logs, np.std(seen.tau, axis=0), slow)
+            if not free.held.any():
+                break
+            found = replay(np.where(free.held, NONE, to_x(c, z[:-1])[0]), free).refined(z, ends, scale, noise, prior, iterations)
+            if loose is not None and not np.max(found.left / noise) < BETTER * np.max(loose.left / noise):
+                break
+            loose, z = found, found.z
+            if np.max(loose.left / np.maximum(noise, FINEST)) < LACKS:
+                break
+        hopeless = np.inf if loose is None else HOPELESS * loose.left
+        end = replay(to_x(c, z[:-1])[0], law).refined(z, ends, scale, noise, prior, iterations, hopeless)
+        if loose is not None:
+            worse = float(np.max(end.left / loose.left))
+            end = loose._replace(steps=loose.steps + end.steps) if worse > WORSE else end._replace(steps=loose.steps + end.steps)
+        result = judged(
             start,
             c,
             w,
@@ -119,10 +141,11 @@ def identify(
             len([path for path in paths if path != DELAY]),
             ends,
             fixed is None,
+            worse,
             tuple(x.name for x in logs),
             time.monotonic() - begin,
         )
-    return dataclasses.replace(found, scenario=astype(found.scenario, given.initial.q.dtype), start=given)
+    return dataclasses.replace(result, scenario=astype(result.scenario, given.initial.q.dtype), start=given)
 
 
 def _is_continuous(log: Any) -> bool:
@@ -183,7 +206,7 @@ def _prior(c: Coordinates, priors: Mapping[str, Any]) -> Prior:
     return Prior(mean, precision)
 
 
-def _substeps(scenario: Scenario, c: Coordinates, z: np.ndarray, seen: Smoothed, step: float) -> int:
+def _substeps(scenario: Scenario, c: Coordinates, x: np.ndarray, seen: Smoothed, step: float) -> int:
     """Steps of the integrator from sample to sample."""
-    points = (jnp.asarray(x) for x in (seen.t, seen.q, seen.dq, seen.tau))
-    return substeps_for(slopes_under(scenario, jnp.asarray(to_x(c, z)[0]), *points, places=c.places), step)
+    points = (jnp.asarray(a) for a in (seen.t, seen.q, seen.dq, seen.tau))
+    return substeps_for(slopes_under(scenario, jnp.asarray(x), *points, places=c.places), step)

@@ -85,14 +85,19 @@ def with_widths(scenario: Scenario, given: Any) -> Any:
         return given
     found = list(given)
     for path in given:
-        place = re.fullmatch(r"(.*\.)(friction|coulomb)((?:\[\d+\])?)", path)
-        width = f"{place[1]}{WIDTHS[place[2]]}{place[3]}" if place else ""
+        width = width_of(path)
         try:
-            new = bool(width) and not any(same_place(scenario, width, other) for other in found)
+            new = width is not None and not any(same_place(scenario, width, other) for other in found)
         except ValueError:  # a path of something else
             new = False
         found += [width] if new else []
     return found
+
+
+def width_of(path: str) -> str | None:
+    """The path of the width of a Coulomb friction; None for another path."""
+    place = re.fullmatch(r"(.*\.)(friction|coulomb)((?:\[\d+\])?)", path)
+    return f"{place[1]}{WIDTHS[place[2]]}{place[3]}" if place else None
 
 
 def coordinates(scenario: Scenario, given: Any, limits: Mapping[str, Any]) -> tuple[Scenario, Coordinates]:

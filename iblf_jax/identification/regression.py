@@ -29,8 +29,8 @@ from iblf_jax.robots import joint_names
 ROUNDS = 3
 LITTLE = 0.3
 """Share of the torques' variation below which the model explains nothing: the log does not belong to it."""
-POOR = 0.8
-"""Share below which it is looked whether units or columns are wrong."""
+POOR = 0.9
+"""Share of any joint's below which it is looked whether units or columns are wrong."""
 WRONG_SIZE = 30.0
 """Torques that are so many times what the scenario's numbers ask for are in another unit."""
 OTHER_ROBOT = 5.0
@@ -112,7 +112,7 @@ def started(scenario: Any, c: Coordinates, seen: Smoothed, what: str, delay: flo
         rest = residual(_slopes(scenario, c, to_x(c, z[:-1])[0], seen).torque, z[-1])
         sigma = np.sqrt(np.mean(rest**2, axis=0)) + 1e-3 * sigma
     explained = _explained(rest, seen.tau)
-    if _left(rest, seen.tau) > 1 - POOR or np.sum(rest**2) > (1 - POOR) * np.sum((seen.tau - seen.tau.mean(axis=0)) ** 2):
+    if np.min(explained) < POOR:
         _say_what_is_wrong(scenario, c, seen, rest, what)
     _same_size(c, to_x(c, z[:-1])[0], what)
     return Start(z[:p], float(z[-1]), scale, explained, seen.noise)

@@ -28,6 +28,8 @@ LACKS, FINEST = 1.5, 1e-5
 """Times the positions' noise from which what is left is not noise, and the least noise that counts [rad]."""
 CLEARLY = 1.1
 """Times that standard errors are widened from which it is told."""
+SEEN = 1e-8
+"""Part of the best known combination's information from which one counts in what the log would do without limits."""
 AT_END = 1e-6
 """Distance from a limit, in scales, within which a number is at it."""
 
@@ -43,7 +45,7 @@ class Number(NamedTuple):
     error: float | None
     """Standard error."""
     verdict: str
-    """"told", "cannot be told" or "at its limit"."""
+    """"told", "cannot be told", "at its limit", or "left free": the width of a friction that is not of this law."""
 
     @property
     def digits(self) -> str:
@@ -165,7 +167,7 @@ class Identification:
 
         x = value + L w,   L L^T = covariance,   w standard normal, the same for all paths
         """
-        told = [i for i, number in enumerate(self.wanted) if number.error is not None and number.verdict == "told"]
+        told = [i for i, number in enumerate(self.wanted) if number.error is not None and number.verdict == TOLD]
         size, axes = np.linalg.eigh(self.covariance[np.ix_(told, told)])
         factor = np.zeros((len(self.numbers), len(told)))
         factor[told] = axes * np.sqrt(np.maximum(size, 0.0))
@@ -200,20 +202,21 @@ class Identification:
 
     def tables_html(self) -> dict[str, str]:
         """Its tables as HTML, numbers that the log cannot tell in bold."""
-        bold = [i for i, number in enumerate(self.numbers) if number.value is None]
+        bold = [i for i, number in enumerate(self.numbers) if number.verdict == UNTOLD]
         return {"Numbers": tables.as_html(HEADING, self._rows(), bold), "Fit": tables.as_html(FIT, self._fits())}
 
     def _heading(self) -> str:
         W, back = int(np.sum(self.kept)), int(np.sum(~self.kept))
         length = float(np.mean(self.times[:, -1] - self.times[:, 0]))
-        told = sum(number.value is not None for number in self.numbers)
+        looked = [number for number in self.numbers if number.verdict != FREE]
+        told = sum(number.value is not None for number in looked)
         windows = f"{W} windows of {length:.3g} s fitted, {back} held back"
-        return f"Identification: {told} of {len(self.numbers)} numbers told; {windows}; {self.steps} steps, {self.seconds:.3g} s"
+        return f"Identification: {told} of {len(looked)} numbers told; {windows}; {self.steps} steps, {self.seconds:.3g} s"
 
     def _rows(self) -> list[tuple[str, ...]]:
         rows: list[tuple[str, ...]] = []
         for x in self.numbers:
-            found = (x.digits, f"{x.error:.2g}", _share(x.error, x.value)) if x.value is not None and x.error is not None else ("", "", "")
+            found = (x.digits, *(("", "") if x.error is None or x.value is None else (f"{x.error:.2g}", _share(x.error, x.value))))
             rows.append((x.name, x.unit, f"{x.start:.5g}", *found, x.verdict))
         return rows
 
@@ -284,6 +287,8 @@ class Identification:
         return plotting.identification(self, **options)
 
 
+TOLD, UNTOLD, LIMITED, FREE = "told", "cannot be told", "at its limit", "left free"
+"""Verdicts."""
 GROUP = "identified"
 """Name of the draws that all identified numbers share."""
 HEADING = ("number", "unit", "start", "value", "standard error", "relative", "verdict")
@@ -319,6 +324,7 @@ def judged(
     asked: int,
     ends: tuple[np.ndarray, ...],
     delay_found: bool,
+    worse: float,
     logs: tuple[str, ...],
     seconds: float,
 ) -> Identification:
@@ -334,6 +340,7 @@ def judged(
       asked: how many of the paths the user wrote.
       ends: limits of z.
       delay_found: whether the delay was looked for.
+      worse: how many times as much the law of friction leaves as free torques about standstill; 0 without such.
       logs: their names.
       seconds: what it took.
     """
@@ -341,22 +348,30 @@ def judged(
     p = len(x)
     by_x = np.eye(p + 1)
     by_x[:p, :p] = np.linalg.inv(slope)
-    free = p + 1 if delay_found else p
-    information = (by_x.T @ end.told.information[w.kept] @ by_x)[:, :free, :free]
-    scores = (end.told.scores[w.kept] @ by_x)[:, :free]
+    looked = np.append(~end.free.held, delay_found)
+    both = np.ix_(looked, looked)
+    information = (by_x.T @ end.told.information[w.kept] @ by_x)[:, looked][:, :, looked]
+    scores = (end.told.scores[w.kept] @ by_x)[:, looked]
     precision = np.zeros((p + 1, p + 1))
     precision[:p, :p] = prior.precision
     scale = np.append(guess.scale, OFFSET)
     white = [whiteness(end.told.residuals[w.kept][:, :, j]) for j in range(w.y.shape[-1])]
     fit = _fits(start, w, end, before, white, guess)
     lacking = max(one.lacking for one in fit)
-    found = known(information, scores, precision[:free, :free], scale[:free], lacking if lacking > LACKS else 1.0)
-    names = (*c.names, "the torque's delay")
-    numbers = tuple(_number(c, i, float(x[i]), found, end, ends, scale) for i in range(p))
-    untold = tuple(in_words(found.directions[:, i], names) for i in range(free) if not found.singular[i] > 1.0 / UNKNOWN)
-    delay_error = float(found.errors[p]) if delay_found else None
+    found = known(information, scores, precision[both], scale[looked], lacking if lacking > LACKS else 1.0)
+    names = np.array([*c.names, "the torque's delay"])[looked]
+    errors, covariance = np.full(p + 1, np.inf), np.zeros((p + 1, p + 1))
+    errors[looked], covariance[both] = found.errors, found.covariance
+    asked_for = _without_limits(information, scores + (precision @ np.append(x - prior.mean, 0.0))[looked] / len(scores), scale[looked])
+    beyond = np.zeros(p + 1)
+    beyond[looked] = asked_for
+    x = np.where(end.free.held, c.x, x)
+    numbers = tuple(_number(c, i, float(x[i]), float(errors[i]), beyond[i], end, ends, scale) for i in range(p))
+    combinations = tuple(in_words(direction, tuple(names)) for direction in found.directions.T)
+    untold = tuple(words for words, size in zip(combinations, found.singular, strict=True) if not size > 1.0 / UNKNOWN)
+    delay_error = float(errors[p]) if delay_found else None
     scenario, notes = _with_numbers(start, c, x, end.z[-1])
-    if c.delay and end.z[-1] < -3.0 * found.errors[p]:
+    if c.delay and end.z[-1] < -3.0 * errors[p]:
         notes.append("The logged torque acts before its time: it is not the command, and the scenario's delay is 0.")
     return Identification(
         scenario,
@@ -364,11 +379,11 @@ def judged(
         c.paths,
         asked,
         numbers,
-        found.covariance[:p, :p],
+        covariance[:p, :p],
         float(end.z[-1]),
         delay_error,
         found.singular,
-        tuple(in_words(found.directions[:, i], names) for i in range(free)),
+        combinations,
         untold,
         scale[:p],
         fit,
@@ -376,19 +391,32 @@ def judged(
         w.t,
         w.kept,
         np.array([one.correlations for one in white]),
-        (*notes, *_notes(found, numbers, fit)),
+        (*notes, *_limited(c, numbers, beyond, ends), *_notes(found, numbers, fit), *_freed(start, end, worse)),
         logs,
         end.steps,
         seconds,
     )
 
 
-def _number(c: Coordinates, i: int, x: float, found: Known, end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray) -> Number:
-    error = float(found.errors[i])
+def _without_limits(information: np.ndarray, scores: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """How far the log would move each number if there were no limits: one Gauss-Newton step."""
+    A, g = np.sum(information, axis=0) * scale[:, None] * scale, np.sum(scores, axis=0) * scale
+    return -scale * np.linalg.lstsq(A, g, rcond=SEEN)[0]
+
+
+def _number(
+    c: Coordinates, i: int, x: float, error: float, beyond: float, end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray
+) -> Number:
+    def number(value, error, verdict):
+        return Number(c.names[i], c.units[i], float(c.x[i]), value, error, verdict)
+
+    if end.free.held[i]:
+        return number(None, None, FREE)
+    at_low, at_high = (abs(end.z[i] - side[i]) < AT_END * scale[i] for side in ends)
     if not np.isfinite(error):
-        return Number(c.names[i], c.units[i], float(c.x[i]), None, None, "cannot be told")
-    at_end = min(abs(end.z[i] - ends[0][i]), abs(end.z[i] - ends[1][i])) < AT_END * scale[i]
-    return Number(c.names[i], c.units[i], float(c.x[i]), x, error, "at its limit" if at_end else "told")
+        pushed = (at_low and beyond < -AT_END * scale[i]) or (at_high and beyond > AT_END * scale[i])
+        return number(x, None, LIMITED) if pushed else number(None, None, UNTOLD)
+    return number(x, error, LIMITED if at_low or at_high else TOLD)
 
 
 def _fits(start: Scenario, w: Windows, end: Refined, before: np.ndarray, white: list[Whiteness], guess: Start) -> tuple[Fit, ...]:
@@ -417,17 +445,44 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
     if not all(one.is_white for one in fit) and widest > CLEARLY:
         notes.append(f"What is left is coloured: standard errors are up to {widest:.2g} times those of white noise.")
     worst = max(fit, key=lambda one: one.lacking)
+    bound = any(number.verdict == LIMITED for number in numbers)
+    likely = f"{'what a limit excludes, ' if bound else ''}dry friction that is not looked for, play, a torque in between samples"
     if worst.lacking > LACKS:
         notes.append(
             f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its positions: the model lacks something "
-            "(dry friction that is not looked for, a column of the other sign, play, a torque in between samples), and all standard "
-            "errors are that much larger for it"
+            f"({likely}), and all standard errors are that much larger for it"
             + ("; a model that fits tells more." if any(number.value is None for number in numbers) else ".")
         )
-    for number in numbers:
-        if number.verdict == "at its limit":
-            notes.append(f"{number.name} is at its limit, {number.value:.4g} {number.unit}: its standard error says nothing.")
     return notes
+
+
+def _limited(c: Coordinates, numbers: tuple[Number, ...], beyond: np.ndarray, ends: tuple[np.ndarray, ...]) -> list[str]:
+    """Which limits bind, and what the log asks for."""
+    notes = []
+    for place, path in zip(c.places, c.paths, strict=True):
+        for i in range(place.start, place.start + place.size):
+            x = numbers[i]
+            if x.verdict == LIMITED and x.value is not None:
+                side = "lower" if abs(x.value - ends[0][i]) < abs(x.value - ends[1][i]) else "upper"
+                notes.append(
+                    f"{x.name} is at its limit, {x.value:.4g} {x.unit}, and the log asks for about {x.value + beyond[i]:.4g}: its standard "
+                    f"error says nothing, and other numbers make up for it.  The {side} end of limits[{path!r}] moves it."
+                )
+    return notes
+
+
+def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
+    """What was left to the log, and why."""
+    share = end.free.share
+    if not np.any(share):
+        return []
+    names = [name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part]
+    whose = "all joints" if len(names) == start.n else ", ".join(names)
+    parts = f"{100 * share[share > 0].min():.2g} to {100 * share.max():.2g} %"
+    return [
+        f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were free in place of the friction of "
+        f"{whose}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."
+    ]
 
 
 def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) -> tuple[Scenario, list[str]]:

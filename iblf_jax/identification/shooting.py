@@ -10,8 +10,10 @@ eliminated: with C = J_s^T W J_s, B = J_s^T W J_z of a window,
 are what it says of z, and sum over windows.  As noise is in y alone, not in q", nothing biases the end; and what two windows say is
 independent but for z, so that the spread of the g_w says how well z is known, whatever the noise is like within a window.
 
+About the standstill of joints whose friction is looked for, torques may be free (`standstill`): they are eliminated with the starts.
+
 sigma_i is estimated in turn: what is left of joint i in a usual window (the median); in a window with more than STRANGE times that, what is
-left there.  So windows in which the model lacks something (dry friction at a reversal, a contact) count for little where others do without.
+left there.  So windows in which the model lacks something (a contact, play) count for little where others do without.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from iblf_jax.identification.coordinates import Coordinates, to_x
 from iblf_jax.identification.log import Log, Said
 from iblf_jax.identification.search import WEAK, Around, search
 from iblf_jax.identification.smoothing import around
+from iblf_jax.identification.standstill import NONE, Free
 
 HUBER = 1.345
 """Standard deviations beyond which a residual counts by its size, not its square ("huber"): 95 % as good where noise is normal."""
@@ -137,14 +140,20 @@ class Refined(NamedTuple):
     z: np.ndarray
     """(p + 1,), the delay last."""
     told: Told
+    left: np.ndarray
+    """What is left of each joint over the windows that were fitted, had they no numbers of their own, (n,) [rad]."""
+    free: Free
+    """What was free in place of the law of friction."""
     steps: int
 
 
 class Replay:
     """The problem of the head of this module, with its starts."""
 
-    def __init__(self, scenario: Any, c: Coordinates, w: Windows, logs: list[Log], held: bool, loss: str, substeps: int) -> None:
-        self.scenario, self.c, self.w, self.loss, self.substeps = scenario, c, w, loss, substeps
+    def __init__(
+        self, scenario: Any, c: Coordinates, w: Windows, logs: list[Log], held: bool, loss: str, substeps: int, free: Free
+    ) -> None:
+        self.scenario, self.c, self.w, self.loss, self.substeps, self.free = scenario, c, w, loss, substeps, free
         self.torques = [Torque(log, held) for log in logs]
         self.step = min(log.step for log in logs)
 
@@ -156,11 +165,16 @@ class Replay:
             found[own] = torque.means(self.w.t[own], delay)
         return found
 
+    def _numbers(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """x, with which the plant is replayed, and dx/dz; what is held does not depend on z."""
+        x, slope = to_x(self.c, z[:-1])
+        return np.where(self.free.held, NONE, x), np.where(self.free.held[:, None], 0.0, slope)
+
     def moved(self, z: np.ndarray, starts: np.ndarray) -> tuple[Stretches, np.ndarray, np.ndarray]:
         """The windows' motion: stretches, q and q' (W, K + 1, n)."""
-        n = self.w.y.shape[-1]
-        x, _ = to_x(self.c, z[:-1])
-        stretches = Stretches(*(jnp.asarray(a) for a in (self.w.t, starts[:, :n], starts[:, n:], self.torque(z[-1]))))
+        n, (x, _) = self.w.y.shape[-1], self._numbers(z)
+        tau = self.torque(z[-1]) + self.free.by_x @ x + np.einsum("wknm,wm->wkn", self.free.torque, starts[:, 2 * n :])
+        stretches = Stretches(*(jnp.asarray(a) for a in (self.w.t, starts[:, :n], starts[:, n : 2 * n], tau)))
         q, dq = replayed(self.scenario, jnp.asarray(x), stretches, places=self.c.places, substeps=self.substeps)
         return stretches, np.asarray(q), np.asarray(dq)
 
@@ -171,13 +185,15 @@ class Replay:
         size = np.abs(r) / sigma
         return np.where(size > HUBER, HUBER / np.maximum(size, 1e-300), 1.0) / sigma**2
 
-    def cost(self, r: np.ndarray, sigma: np.ndarray) -> float:
-        """The sum of rho over the windows that are fitted."""
+    def cost(self, r: np.ndarray, starts: np.ndarray, sigma: np.ndarray) -> float:
+        """The sum of rho over the windows that are fitted, and of what their free torques cost."""
         size = (np.abs(r) / sigma)[self.w.kept]
         rho = 0.5 * size**2 if self.loss == "squares" else np.where(size > HUBER, HUBER * (size - 0.5 * HUBER), 0.5 * size**2)
-        return float(np.sum(rho))
+        return float(np.sum(rho) + 0.5 * np.sum(starts[self.w.kept, 2 * self.w.y.shape[-1] :] ** 2))
 
-    def refined(self, z: np.ndarray, ends: Any, scale: np.ndarray, sigma: np.ndarray, prior: Prior, most: int) -> Refined:
+    def refined(
+        self, z: np.ndarray, ends: Any, scale: np.ndarray, sigma: np.ndarray, prior: Prior, most: int, hopeless: Any = np.inf
+    ) -> Refined:
         """The minimum.
 
         Args:
@@ -187,31 +203,32 @@ class Replay:
           sigma: of the joints, to begin with, (n,) [rad].
           prior: what was known of x before.
           most: Gauss-Newton steps for each sigma.
+          hopeless: what is left of a joint from which the search is given up, once it settled for the first sigma, (n,) [rad].
 
         Raises:
           ValueError: from the start on, the replay runs away from the log.
         """
-        weak, z0, n = 1.0 / (WEAK * scale) ** 2, z.copy(), self.w.y.shape[-1]
+        weak, z0 = 1.0 / (WEAK * scale) ** 2, z.copy()
         total = 0
 
         def full(z, found, sigma, known=None):
             _, stretches, q, dq = found
             r, (J, along) = self.w.y - q, known or self._slopes(z, stretches, q, dq)
-            told, own, by_z = self._eliminated(r, J, sigma, n)
+            told, own, by_z = self._eliminated(r, J, sigma, found[0])
             x, slope = to_x(self.c, z[:-1])
             g, A = np.sum(told.scores[self.w.kept], axis=0) + weak * (z - z0), np.sum(told.information[self.w.kept], axis=0) + np.diag(weak)
             g[:-1] += slope.T @ prior.precision @ (x - prior.mean)
             A[:-1, :-1] += slope.T @ prior.precision @ slope
-            return Around(cost(z, r, sigma), g, A, {"own": own, "by_z": by_z, "told": told, "known": (J, along), "found": found})
+            return Around(cost(z, r, found[0], sigma), g, A, {"own": own, "by_z": by_z, "told": told, "known": (J, along), "found": found})
 
-        def cost(z, r, sigma):
+        def cost(z, r, starts, sigma):
             away = to_x(self.c, z[:-1])[0] - prior.mean
-            return self.cost(r, sigma) + 0.5 * float(np.sum(weak * (z - z0) ** 2) + away @ prior.precision @ away)
+            return self.cost(r, starts, sigma) + 0.5 * float(np.sum(weak * (z - z0) ** 2) + away @ prior.precision @ away)
 
         def attempt(here, z, step, sigma):
             after = here.carried["found"][0] + here.carried["by_z"] @ step + here.carried["own"]
             found = self.moved(z + step, after)
-            return cost(z + step, self.w.y - found[1], sigma), (after, *found)
+            return cost(z + step, self.w.y - found[1], after, sigma), (after, *found)
 
         starts, rest = self.best_starts(z, sigma)
         if not np.all(np.isfinite(rest)):
@@ -224,31 +241,38 @@ class Replay:
             z, here, steps = search(here, z, ends, scale, partial(attempt, sigma=sigma), partial(full, sigma=sigma), most)
             found, known, told = here.carried["found"], here.carried["known"], here.carried["told"]  # the same at another sigma
             before, sigma, total = sigma, self._spread(told.residuals), total + steps
+            left = np.sqrt(np.mean((self._alone() * np.mean(told.residuals**2, axis=1))[self.w.kept], axis=0))
+            if np.any(left > hopeless):
+                break
             finer, change = substeps_for(known[1], self.step), np.abs(sigma / before - 1.0)
             if finer > self.substeps:  # friction has become sharper
                 self.substeps, found, known = finer, (found[0], *self.moved(z, found[0])), None
             elif max(np.median(change), np.mean(change)) < MOVED:
                 break
-        return Refined(z, told, total)
+        return Refined(z, told, left, self.free, total)
 
     def best_starts(self, z: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The starts that fit best with these numbers, (W, 2 n), and what is left with them, (W, K + 1, n)."""
-        starts, n = np.concatenate([self.w.q, self.w.dq], axis=1), self.w.y.shape[-1]
+        """The starts that fit best with these numbers, (W, s), and what is left with them, (W, K + 1, n)."""
+        starts = np.concatenate([self.w.q, self.w.dq, np.zeros((len(self.w.q), self.free.torque.shape[-1]))], axis=1)
         for _ in range(2):
             stretches, q, dq = self.moved(z, starts)
-            starts = starts + self._eliminated(self.w.y - q, self._slopes(z, stretches, q, dq)[0], sigma, n)[1]
+            starts = starts + self._eliminated(self.w.y - q, self._slopes(z, stretches, q, dq)[0], sigma, starts)[1]
         return starts, self.w.y - self.moved(z, starts)[1]
 
     def _spread(self, r: np.ndarray) -> np.ndarray:
         """What is left of each joint, window by window, (W, 1, n) [rad] (head of this module)."""
-        free = r.shape[1] / (r.shape[1] - 2.0)  # each window and joint has two numbers of its own
-        own = np.sqrt(free * np.mean(r**2, axis=1)) if self.loss == "squares" else 1.4826 * np.median(np.abs(r), axis=1)
+        own = np.sqrt(self._alone() * np.mean(r**2, axis=1)) if self.loss == "squares" else 1.4826 * np.median(np.abs(r), axis=1)
         usual = np.median(own[self.w.kept], axis=0) + 1e-12
         return np.where(own > STRANGE * usual, own, usual)[:, None]
 
+    def _alone(self) -> np.ndarray:
+        """Mean square noise by what is left of it, (W, n): each window and joint has two numbers of its own, and its free torques."""
+        K = self.w.y.shape[1]
+        return K / np.maximum(K - 2.0 - self.free.pieces, 1.0)
+
     def _slopes(self, z: np.ndarray, stretches: Stretches, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, Slopes]:
-        """dq/d(start, z), (W, K + 1, n, 2 n + p + 1), and what it is made of."""
-        n, (x, slope) = q.shape[-1], to_x(self.c, z[:-1])
+        """dq/d(start, z), (W, K + 1, n, s + p + 1), and what it is made of."""
+        n, (x, slope) = q.shape[-1], self._numbers(z)
         h = np.diff(self.w.t)[..., None]
         tau = np.asarray(stretches.tau)
         middle = 0.5 * (q[:, 1:] + q[:, :-1]) - 0.125 * h * np.diff(dq, axis=1)
@@ -256,24 +280,28 @@ class Replay:
         flat = [jnp.asarray(a.reshape(-1, *a.shape[2:])) for a in points]
         along = slopes_under(self.scenario, jnp.asarray(x), *flat, places=self.c.places)
         along = along._replace(**{name: np.asarray(a) for name, a in along._asdict().items()})
+        along = along._replace(by_x=along.by_x - self.free.by_x.reshape(along.by_x.shape))
         by_delay = (self.torque(z[-1] + 0.5 * self.step) - self.torque(z[-1] - 0.5 * self.step)) / self.step
-        J = tangents(stretches, along, by_delay)
-        J[..., 2 * n : -1] = J[..., 2 * n : -1] @ slope
-        return J, along
+        J = tangents(stretches, along, np.concatenate([self.free.torque, by_delay[..., None]], axis=-1))
+        start, by_x, free, by_delay = np.split(J, [2 * n, 2 * n + len(x), J.shape[-1] - 1], axis=-1)
+        return np.concatenate([start, free, by_x @ slope, by_delay], axis=-1), along
 
-    def _eliminated(self, r: np.ndarray, J: np.ndarray, sigma: np.ndarray, n: int) -> tuple[Told, np.ndarray, np.ndarray]:
-        """What the windows say of z, the starts' own step (W, 2 n), and how it follows z (W, 2 n, p + 1)."""
-        W = len(r)
+    def _eliminated(self, r: np.ndarray, J: np.ndarray, sigma: np.ndarray, starts: np.ndarray) -> tuple[Told, np.ndarray, np.ndarray]:
+        """What the windows say of z, the starts' own step (W, s), and how it follows z (W, s, p + 1)."""
+        W, s, m = len(r), starts.shape[1], self.free.torque.shape[-1]
         w = np.sqrt(self.weights(r, sigma))
         wJ, wr = (w[..., None] * J).reshape(W, -1, J.shape[-1]), (w * r).reshape(W, -1)
         N = np.swapaxes(wJ, 1, 2) @ wJ
         g = -np.einsum("wma,wm->wa", wJ, wr)
-        C, B, A = N[:, : 2 * n, : 2 * n], N[:, : 2 * n, 2 * n :], N[:, 2 * n :, 2 * n :]
-        solved = np.linalg.solve(C, np.concatenate([B, g[:, : 2 * n, None]], axis=-1))
+        free = np.arange(s - m, s)
+        N[:, free, free] += 1.0
+        g[:, free] += starts[:, free]
+        C, B, A = N[:, :s, :s], N[:, :s, s:], N[:, s:, s:]
+        solved = np.linalg.solve(C, np.concatenate([B, g[:, :s, None]], axis=-1))
         by_z, own = -solved[..., :-1], -solved[..., -1]
         across = np.swapaxes(B, 1, 2)
         information = A + across @ by_z
-        scores = g[:, 2 * n :] + np.einsum("wab,wb->wa", across, own)
+        scores = g[:, s:] + np.einsum("wab,wb->wa", across, own)
         return Told(r, information, scores), own, by_z
 
 

@@ -40,7 +40,7 @@ def identification(known: Identification) -> Figure:
     _joints(figure.add_subplot(middle[1]), known)
     _left(figure.add_subplot(last[0]), known)
     _correlations(figure.add_subplot(last[1]), known)
-    untold = sum(number.value is None for number in known.numbers)
+    untold = sum(number.verdict == "cannot be told" for number in known.numbers)
     _style.head(figure, ["Parameters from a log", *([f"{untold} numbers cannot be told"] if untold else [])])
     return figure
 
@@ -51,8 +51,9 @@ def _numbers(axes: Axes, known: Identification) -> None:
     beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": _style.size(7)}
     for i, (number, scale) in enumerate(zip(chosen, known.scales, strict=False)):
         if number.value is None or number.error is None:
-            axes.plot(0.0, i, marker="x", color=_style.alarm(), linestyle="none")
-            axes.text(1.01, i, "cannot be told", color=_style.alarm(), **beside)
+            colour = _style.bound() if number.verdict == "left free" else _style.alarm()
+            axes.plot(0.0, i, marker="x", color=colour, linestyle="none")
+            axes.text(1.01, i, number.verdict, color=colour, **beside)
             continue
         change, error = (number.value - number.start) / scale, 3.0 * number.error / scale
         axes.errorbar(change, i, xerr=error, fmt="o", markersize=3.5, capsize=2, color=_style.colour(0))
