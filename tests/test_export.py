@@ -46,7 +46,7 @@ def walk(scenario, dtype, seed=0):
     t = jnp.asarray(np.arange(SAMPLES) * 1e-3, dtype)
     tube = jax.vmap(scenario.setting.tube)(t)
     share = 0.5 + 0.6 * np.cumsum(rng.normal(size=(SAMPLES, scenario.n)), axis=0) / np.sqrt(SAMPLES)
-    q = jnp.asarray(tube.lower + share * (tube.upper - tube.lower), dtype)
+    q = tube.lower + share.astype(dtype) * (tube.upper - tube.lower)
     return Told(t, q, jnp.asarray(0.3 * rng.normal(size=q.shape), dtype)), tube
 
 
@@ -160,7 +160,7 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
 
         def command(self, t, q, dq, f_hat, setting, state):
             no = jnp.zeros(q.shape, bool)
-            return ij.controllers.Command(self.gain * jnp.abs((9.0 * q).astype(jnp.int32)), dq, 0 * q, no, no), ()
+            return ij.controllers.Command(self.gain * jnp.abs((9.0 * q).astype(jnp.int32)).astype(q.dtype), dq, 0 * q, no, no), ()
 
     with pytest.raises(ValueError, match="no fixed length"):
         ij.export(ij.with_parts(base, controller=Endless(1.0)), tmp_path)
