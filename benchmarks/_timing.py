@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import platform
+import shlex
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -64,4 +66,7 @@ def report(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], js
         print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
     if json_path:
         table = [dict(zip(columns, row, strict=True)) for row in rows]
-        Path(json_path).write_text(json.dumps({"title": title, "machine": machine(), "rows": table}, indent=1))
+        words = [word for word in sys.argv[1:] if word not in ("--json", json_path, f"--json={json_path}")]
+        command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])
+        found = {"title": title, "command": command, "machine": machine(), "rows": table}
+        Path(json_path).write_text(json.dumps(found, indent=1) + "\n")

@@ -2,7 +2,7 @@
 
 Pages are put together in out/site/source: what stands in this folder, the notebooks and the gallery as the tests have executed them (what
 is missing or older than its source is executed here), and pages that are made of docstrings, of the status flags, of the barriers, of
-CONTRIBUTING and of the benchmarks' results.  Any warning of Sphinx is an error.
+CONTRIBUTING and of the benchmarks' results.  Any warning of Sphinx is an error, and any dead link (`links.py`).
 """
 
 from __future__ import annotations
@@ -89,11 +89,15 @@ def assemble() -> None:
 def main() -> int:
     """Assembles and builds; Sphinx's exit code."""
     import jax
+    import links
 
     jax.config.update("jax_enable_x64", True)
     assemble()
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", str(SOURCE), str(SITE / "html")]
     code = subprocess.run(command, check=False).returncode
+    wrong = links.faults(SITE / "html")
+    print("\n".join(wrong))
+    code = code or int(bool(wrong))
     print(f"written to {SITE.relative_to(ROOT) / 'html' / 'index.html'}" if code == 0 else "the site was not built")
     return code
 

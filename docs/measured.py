@@ -12,12 +12,12 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 
 class Plot(NamedTuple):
-    """Bars of one result."""
+    """What is drawn of one result."""
 
     names: tuple[str, ...]
-    """Columns whose words name a bar."""
+    """Columns whose words name a row."""
     values: str
-    """The column that is as long as the bar."""
+    """The column that is drawn."""
     words: str
     """What stands above the table: what was measured, and which way is better."""
     only: dict[str, Any] = {}  # noqa: RUF012 - a constant
@@ -25,17 +25,17 @@ class Plot(NamedTuple):
 
 
 PLOTS = {
-    "latency": Plot(("row",), "ms", "One run alone, as a notebook calls it; shorter is better."),
+    "latency": Plot(("row",), "ms", "One run alone, as a notebook calls it; less is better."),
     "throughput": Plot(
-        ("row", "type"), "steps/s a core", "Many runs of the paper's loop at once; longer is better.", {"loop": "paper", "runs": 4096}
+        ("row", "type"), "steps/s a core", "Many runs of the paper's loop at once; more is better.", {"loop": "paper", "runs": 4096}
     ),
-    "arm": Plot(("row", "type"), "steps/s a core", "Seven joints, beside what a user would take instead; longer is better."),
-    "export": Plot(("law", "type"), "cycles", "One call of a law in C, as `ij.export` writes it; shorter is better."),
-    "constraints": Plot(("law",), "us a step", "What keeps which constraints, and the processor time of a step; shorter is better."),
+    "arm": Plot(("row", "type"), "steps/s a core", "Seven joints, beside what a user would take instead; more is better."),
+    "export": Plot(("law", "type"), "cycles", "One call of a law in C, as `ij.export` writes it; less is better."),
+    "constraints": Plot(("law",), "us a step", "What keeps which constraints, and the processor time of a step; less is better."),
     "tuning": Plot(
         ("search",),
         "rollouts to 0.5 %",
-        "Two gains under a torque limit and a margin: rollouts until 0.5 % above the best; shorter is better.",
+        "Two gains under a torque limit and a margin: rollouts until 0.5 % above the best; less is better.",
     ),
 }
 
@@ -53,7 +53,7 @@ def write(page: Path) -> None:
         machine = result["machine"]
         where = f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, jax {machine['jax']}, {machine['date']}"
         parts.append(
-            f"## {result['title']}\n\n{plot.words} `python benchmarks/{name}.py`; {where}.\n\n"
+            f"## {result['title']}\n\n{plot.words} `{result['command']}`; {where}.\n\n"
             f"![{result['title']}](benchmark_{name}.png)\n\n{table(result['rows'])}\n"
         )
     page.write_text("\n".join(parts))
@@ -70,7 +70,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(plot: Plot, rows: list[dict[str, Any]], path: Path) -> None:
-    """Bars on a logarithmic axis, in the order of the table."""
+    """Points on a logarithmic axis, in the order of the table."""
     from iblf_jax.plotting._style import new_figure, styled
 
     asked = [row for row in rows if all(row[name] == value for name, value in plot.only.items())]
@@ -78,10 +78,13 @@ def draw(plot: Plot, rows: list[dict[str, Any]], path: Path) -> None:
     with styled():
         figure = new_figure(7.5, 0.8 + 0.26 * len(drawn))
         axes = figure.subplots()
-        bars = axes.barh([", ".join(str(row[name]) for name in plot.names) for row in drawn], [row[plot.values] for row in drawn])
-        axes.bar_label(bars, [f"{row[plot.values]:.3g}" for row in drawn], padding=3)
+        names = [", ".join(str(row[name]) for name in plot.names) for row in drawn]
+        values = [float(f"{row[plot.values]:.3g}") for row in drawn]
+        axes.plot(values, names, "o")
+        for name, value in zip(names, values, strict=True):
+            axes.annotate(f"{value:,g}", (value, name), xytext=(6, -3), textcoords="offset points")
         axes.set_xscale("log")
-        axes.margins(x=0.12)
+        axes.margins(x=0.15)
         axes.invert_yaxis()
         axes.set_xlabel(plot.values)
         figure.savefig(path, dpi=110)

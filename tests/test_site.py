@@ -13,6 +13,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 import equations
 import flags
 import gallery
+import links
 import reference
 
 import iblf_jax as ij
@@ -86,3 +87,17 @@ def test_every_equation_of_the_reference_is_shown_as_one():
     shown = [text for page in pages for text in re.findall(r"\$\$\n(.*?)\n\$\$", page, re.DOTALL)]
     assert len(shown) > len(members) / 2
     assert all(text.count("{") == text.count("}") for text in (shown_text.replace(r"\{", "").replace(r"\}", "") for shown_text in shown))
+
+
+def test_dead_links_and_pages_out_of_reach_are_named(tmp_path):
+    (tmp_path / "deep").mkdir()
+    chain = {"index": "a.html", "a": "deep/b.html#here", "deep/b": "../c.html", "c": "d.html", "d": "#nowhere"}
+    for name, to in chain.items():
+        (tmp_path / f"{name}.html").write_text(f'<h1 id="here">x</h1><a href="{to}">y</a><a href="https://example.org/z">z</a>')
+    (tmp_path / "a.html").write_text('<a href="deep/b.html#here">y</a><img src="gone.png"><a href="#here">z</a>')
+    assert set(links.faults(tmp_path)) == {
+        "a.html: #here has no such place",
+        "a.html: there is no gone.png",
+        "d.html: #nowhere has no such place",
+        "d.html is more than 3 clicks away",
+    }
