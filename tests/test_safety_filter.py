@@ -254,3 +254,6 @@ def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law
     assert int(run.status) == 0 and float(jnp.max(run.q_d - run.upper)) > 0.2
     with pytest.raises(ValueError, match="Assumption 2"):
         ij.simulate(falling(**parts), duration=0.3, dt=1e-3)
+    law = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1)
+    certificate = ij.certify(filtered(falling(controller=law, **parts), nearest="acceleration"), duration=0.3, dt=1e-3)
+    assert certificate["reference inside"].verdict == certificate.verdict == "fails"

@@ -47,3 +47,7 @@ def test_what_it_refuses():
         controllers.SurfaceBarrier(a=2.0, K=4.0, surface=barriers.Log())
     with pytest.raises(ValueError, match=r"SurfaceBarrier\.barrier"):
         controllers.SurfaceBarrier(a=2.0, K=4.0, surface=FUNNEL, barrier=FUNNEL)
+    for lower, upper in ((2.0, -2.0), (1.0, [2.0, 3.0]), (-1.0, [2.0, 0.0])):
+        law = controllers.SurfaceBarrier(a=2.0, K=4.0, surface=bounds.Bounds(bounds.Constant(lower), bounds.Constant(upper)))
+        with pytest.raises(ValueError, match=r"SurfaceBarrier\.surface: .*expected lower < 0 < upper at t = 0"):
+            ij.simulate(scenario(controller=controllers.SafetyFilter(law=law)), duration=0.1, dt=1e-3)

@@ -15,7 +15,7 @@ The conditions on positions may be of other shapes, and with a margin eta: with 
 B(z) = z or z^3.  An arc tangent bounds the speed towards a bound by pi a1/2 wherever the joint is; a cube is softer the nearer z is to 0.
 
 The model and the observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 - f_hat.  Inside what the conditions keep
-(h >= 0 and h' + a2 h >= 0 at the start) they keep it for as long as they have a common torque, and f_hat is f.
+(h >= 0 and z >= 0 at the start) they keep it for as long as they have a common torque, and f_hat is f.
 
 Where they have none (within the torque limits, or as a bound runs into another), the torque breaks them by the least slack, the sum of
 squares of the distances to what they allow, in torque or in acceleration as `nearest` says: it is in the command, is recorded, and raises

@@ -34,7 +34,8 @@ class SurfaceBarrier:
     Args:
       a: rate of the surface, () or (n,) [1/s], > 0.
       K: gain, () or (n,) [N m rad/s], > 0 (N m s/rad for a barrier whose V1 is in rad^2/s^2).
-      surface: bounds of sigma [rad/s]; its reference is 0, so a `Funnel` on either side shrinks onto 0.
+      surface: bounds of sigma [rad/s]; its reference is 0, so a `Funnel` on either side shrinks onto 0.  Where a run starts
+        outside, the barrier's guard is at work, `Status.GUARD_ACTIVE`.
       barrier: on sigma, any `Barrier`; `PrescribedPerformance()` if not given.
 
     Source: C. P. Bechlioulis, A. Theodorakopoulos, G. A. Rovithakis, 52nd IEEE CDC (2013); with the slope in it, I. Dimanidis, diploma
@@ -54,6 +55,13 @@ class SurfaceBarrier:
         checks.conforms("SurfaceBarrier.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.PrescribedPerformance().", CLAIMS)
         if not isinstance(self.surface, Bounds):
             raise checks.fail("SurfaceBarrier.surface", self.surface, "an iblf_jax.bounds.Bounds", "Such as Bounds(lower=..., upper=...).")
+
+    def check_start(self, setting: Setting) -> None:
+        """Raises ValueError for bounds of the surface that do not have 0 between them at t = 0."""
+        zero = jnp.zeros(setting.model.n)
+        lower, upper = (side.at(jnp.zeros(()), zero) for side in (self.surface.lower, self.surface.upper))
+        if not (jnp.all(lower < 0) and jnp.all(upper > 0)):
+            raise checks.fail("SurfaceBarrier.surface", (lower, upper), "lower < 0 < upper at t = 0", "Exchange or widen them.")
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
         """No state."""

@@ -23,7 +23,7 @@ from iblf_jax.bounds import Bounds, speed_limits_at, tube_at
 from iblf_jax.controllers import Controller, Setting
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
-from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, leaf, unwrapped
+from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
@@ -264,6 +264,8 @@ def canonical(scenario: Scenario) -> Scenario:
     scenario = _typed(scenario, dtype)
     if checks.is_concrete(scenario):
         _check_start(scenario)
+        for law in layers(scenario.controller):
+            getattr(law, "check_start", lambda setting: None)(scenario.setting)
         advice = [text for part in (scenario.controller, scenario.observer) for text in getattr(part, "advice", list)()]
         if scenario.sampling is not None:
             advice += getattr(scenario.sensor, "advice", lambda period: [])(scenario.sampling.period)
