@@ -108,7 +108,7 @@ def identify(
         def replay(x, friction):
             return Replay(replayed, c, w, logs, held, loss, _substeps(replayed, c, x, seen, min(one.step for one in logs)), friction)
 
-        noise = np.maximum(seen.noise, 1e-9)
+        noise, counts = np.maximum(seen.noise, 1e-9), np.maximum(seen.noise, FINEST)
         fixed = None if delay is None else float(delay)
         ends = tuple(np.append(x, side * LARGEST_DELAY if fixed is None else fixed) for x, side in ((c.low, -1.0), (c.high, 1.0)))
         first = np.append(to_z(c, c.x), guess.delay)
@@ -120,15 +120,16 @@ def identify(
             if not free.held.any():
                 break
             found = replay(np.where(free.held, NONE, to_x(c, z[:-1])[0]), free).refined(z, ends, scale, noise, prior, iterations)
-            if loose is not None and not np.max(found.left / noise) < BETTER * np.max(loose.left / noise):
+            if loose is not None and not np.max(found.left / counts) < BETTER * np.max(loose.left / counts):
                 break
             loose, z = found, found.z
-            if np.max(loose.left / np.maximum(noise, FINEST)) < LACKS:
+            if np.max(loose.left / counts) < LACKS:
                 break
-        hopeless = np.inf if loose is None else HOPELESS * loose.left
+        least = np.inf if loose is None else np.maximum(loose.left, FINEST)  # a log of a simulation has no noise: less is not better
+        hopeless = HOPELESS * least
         end = replay(to_x(c, z[:-1])[0], law).refined(z, ends, scale, noise, prior, iterations, hopeless)
         if loose is not None:
-            worse = float(np.max(end.left / loose.left))
+            worse = float(np.max(end.left / least))
             end = loose._replace(steps=loose.steps + end.steps) if worse > WORSE else end._replace(steps=loose.steps + end.steps)
         result = judged(
             start,

@@ -84,20 +84,21 @@ def with_widths(scenario: Scenario, given: Any) -> Any:
     if not isinstance(given, list | tuple) or not all(isinstance(path, str) for path in given):
         return given
     found = list(given)
-    for path in given:
-        width = width_of(path)
+
+    def new(path):
         try:
-            new = width is not None and not any(same_place(scenario, width, other) for other in found)
+            return not any(same_place(scenario, path, other) for other in found)
         except ValueError:  # a path of something else
-            new = False
-        found += [width] if new else []
+            return False
+
+    for path in given:
+        place = re.fullmatch(r"(.*\.)(friction|coulomb)((?:\[\d+\])?)", path)
+        if place is None:
+            continue
+        width = f"{place[1]}{WIDTHS[place[2]]}{place[3]}"
+        entries = () if place[3] else (f"{width}[{j}]" for j in range(scenario.n))  # some of them may have been asked for
+        found += [width] if new(width) else [entry for entry in entries if new(entry)]
     return found
-
-
-def width_of(path: str) -> str | None:
-    """The path of the width of a Coulomb friction; None for another path."""
-    place = re.fullmatch(r"(.*\.)(friction|coulomb)((?:\[\d+\])?)", path)
-    return f"{place[1]}{WIDTHS[place[2]]}{place[3]}" if place else None
 
 
 def coordinates(scenario: Scenario, given: Any, limits: Mapping[str, Any]) -> tuple[Scenario, Coordinates]:

@@ -478,7 +478,8 @@ def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
         return []
     names = [name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part]
     whose = "all joints" if len(names) == start.n else ", ".join(names)
-    parts = f"{100 * share[share > 0].min():.2g} to {100 * share.max():.2g} %"
+    least, most = (f"{100 * part:.{0 if part > 0.1 else 1}f}" for part in (share[share > 0].min(), share.max()))
+    parts = f"{least} %" if least == most else f"{least} to {most} %"
     return [
         f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were free in place of the friction of "
         f"{whose}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."

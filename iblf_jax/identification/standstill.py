@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.identification.coordinates import Coordinates, width_of
+from iblf_jax.identification.coordinates import WIDTHS, Coordinates
 from iblf_jax.identification.log import Log
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
@@ -91,19 +91,23 @@ def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list
 
 def _joints(scenario: Scenario, c: Coordinates) -> Iterator[tuple[int, int, int]]:
     """The numbers of Coulomb friction and of its width, and the joint, where both are looked for."""
-    of_path = {place.path: place for place in c.places}
+    at = {}
     for place in c.places:
-        width = of_path.get(width_of(place.path) or "")
+        for k, index in enumerate(np.ndindex(place.shape)):
+            (tokens,) = paths.places(scenario, place.path + "".join(f"[{i}]" for i in index))
+            at[tuple(tokens)] = place.start + k
+    for (*owner, name, j), coulomb in at.items():
+        width = at.get((*owner, WIDTHS.get(str(name)), j))
         if width is not None:
-            ((*_, entry),) = paths.places(scenario, place.path)
-            for k in range(place.size):
-                yield place.start + k, width.start + k, entry if isinstance(entry, int) else k
+            yield coulomb, width, int(j)
 
 
 def _direction(log: Log, slow: float) -> np.ndarray:
     """In which direction each joint moves, 1 or -1, and 0 about standstill, (N, n)."""
     found = np.zeros(log.q.shape)
     for stretch in log.stretches:
+        if stretch.stop - stretch.start < 2:  # a row by itself has no speed
+            continue
         t = log.t[stretch]
         speed = _speed(t, log.q[stretch], log.step)
         still = _before(np.abs(speed) < slow)
@@ -115,7 +119,9 @@ def _direction(log: Log, slow: float) -> np.ndarray:
 def _speed(t: np.ndarray, q: np.ndarray, step: float) -> np.ndarray:
     """Slope of the line through the positions around each time, (N, n)."""
     half = max(HALF, 2.5 * step)
-    first, last = np.searchsorted(t, t - half), np.searchsorted(t, t + half, side="right")
+    k = np.arange(len(t))  # the neighbours, however far away they are
+    first = np.minimum(np.searchsorted(t, t - half), np.maximum(k - 1, 0))
+    last = np.maximum(np.searchsorted(t, t + half, side="right"), np.minimum(k + 2, len(t)))
     t, q = (t - t[0])[:, None], q - q[0]
     count = (last - first)[:, None]
     st, sq, stt, stq = (x[last] - x[first] for x in map(_before, (t, q, t * t, t * q)))
