@@ -23,10 +23,10 @@ from iblf_jax.core.pytree import astype
 from iblf_jax.engine.replay import slopes
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
-from iblf_jax.identification.coordinates import coordinates, to_x, to_z
+from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
 from iblf_jax.identification.shooting import Replay, Torque, windows
-from iblf_jax.identification.standstill import by_the_law, free_about_standstill
+from iblf_jax.identification.standstill import _joints, by_the_law, free_about_standstill
 from iblf_jax.simulation.scenario import canonical
 
 MASS, VISCOUS, COULOMB, WIDTH = np.array([2.0, 0.85]), np.array([0.15, 0.08]), np.array([0.2, 0.1]), 0.05
@@ -547,3 +547,24 @@ def test_one_joint_of_seven_that_is_mounted_the_other_way_is_named():
     log = {"t": t, "q": q * np.where(np.arange(7) == 6, -1.0, 1.0), "tau": tau}
     with pytest.raises(ValueError, match=r"with q\[6\] of the other sign, they would explain 100%"):
         ij.identify(scenario, log, ["robot.mass"], torque="interpolated")
+
+
+@pytest.mark.parametrize(
+    ("asked", "looked_for", "pairs"),
+    [
+        (["disturbance.coulomb"], ["disturbance.coulomb", "disturbance.width"], [(0, 2, 0), (1, 3, 1)]),
+        (["disturbance.coulomb[1]"], ["disturbance.coulomb[1]", "disturbance.width[1]"], [(0, 1, 1)]),
+        (
+            ["disturbance.coulomb", "disturbance.width[0]"],
+            ["disturbance.coulomb", "disturbance.width[0]", "disturbance.width[1]"],
+            [(0, 2, 0), (1, 3, 1)],
+        ),
+        (["disturbance.viscous"], ["disturbance.viscous"], []),
+    ],
+)
+def test_the_width_of_each_friction_is_looked_for_beside_it(asked, looked_for, pairs):
+    """Also where one of the widths was asked for by itself."""
+    rubbing = ij.disturbances.Friction(viscous=0.05, coulomb=0.05)
+    believed = canonical(ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=rubbing))
+    assert with_widths(believed, asked) == looked_for
+    assert list(_joints(*coordinates(believed, looked_for, {}))) == pairs

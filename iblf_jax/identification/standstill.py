@@ -97,7 +97,7 @@ def _joints(scenario: Scenario, c: Coordinates) -> Iterator[tuple[int, int, int]
             (tokens,) = paths.places(scenario, place.path + "".join(f"[{i}]" for i in index))
             at[tuple(tokens)] = place.start + k
     for (*owner, name, j), coulomb in at.items():
-        width = at.get((*owner, WIDTHS.get(str(name)), j))
+        width = at.get((*owner, WIDTHS.get(str(name), ""), j))
         if width is not None:
             yield coulomb, width, int(j)
 
