@@ -40,6 +40,7 @@ SPECIAL = {
     "funnel": lambda cls: cls(initial=0.4, final=0.2, rate=1.0),
     "constant": lambda cls: cls(0.95),
     "reference_governor": lambda cls: cls(ij.controllers.PDGravity(Kp=60.0, Kd=20.0)),
+    "surface_barrier": lambda cls: cls(a=2.0, K=5.0, surface=ij.Bounds(ij.bounds.Funnel(-9.0, -0.5, 1.5), ij.bounds.Constant([8.0, 6.0]))),
     "safety_filter": lambda cls: cls(PRESET.controller, nearest="acceleration"),
     "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
     "extended_state": lambda cls: cls(bandwidth=40.0),
