@@ -45,8 +45,9 @@ def machine() -> dict[str, str]:
     """What the numbers were measured with (no host names)."""
     import os
 
-    told = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    models = {line.partition(":")[2].strip() for line in told if line.startswith("model name")}
+    from iblf_jax.core.cache import processor
+
+    models = {line.partition(":")[2].strip() for line in processor().splitlines() if line.startswith("model name")}
     return {
         "date": time.strftime("%Y-%m-%d"),
         "processor": ", ".join(models) or platform.processor() or platform.machine(),

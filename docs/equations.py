@@ -36,7 +36,7 @@ def tex(text: str) -> str:
         elif found["tag"]:
             parts.append(("sign", rf"\quad\text{{{token}}}"))
         elif found["gap"]:
-            parts.append(("sign", "" if text[found.end() :].startswith("(") and TAG.match(text, found.end()) else " \\\\\n"))
+            parts.append(("sign", "" if TAG.match(text, found.end()) else " \\\\\n"))
         elif found["space"]:
             parts.append(("space", " "))
         elif found["power"]:

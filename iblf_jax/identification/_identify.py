@@ -130,7 +130,7 @@ def identify(
         end = replay(to_x(c, z[:-1])[0], law).refined(z, ends, scale, noise, prior, iterations, hopeless)
         if loose is not None:
             worse = float(np.max(end.left / least))
-            end = loose._replace(steps=loose.steps + end.steps) if worse > WORSE else end._replace(steps=loose.steps + end.steps)
+            end = (loose if worse > WORSE else end)._replace(steps=loose.steps + end.steps)
         result = judged(
             start,
             c,

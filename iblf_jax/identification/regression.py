@@ -282,11 +282,9 @@ def _otherwise(seen: Smoothed) -> Any:
     for j in range(n if n > 1 else 0):
         sign = np.where(np.arange(n) == j, -1.0, 1.0)
         yield f"with tau[{j}] of the other sign", seen._replace(tau=sign * seen.tau)
-        yield f"with q[{j}] of the other sign", seen._replace(q=sign * seen.q, dq=sign * seen.dq, ddq=sign * seen.ddq)
-        yield (
-            f"with q[{j}] and tau[{j}] of the other sign",
-            seen._replace(q=sign * seen.q, dq=sign * seen.dq, ddq=sign * seen.ddq, tau=sign * seen.tau),
-        )
+        turned = seen._replace(q=sign * seen.q, dq=sign * seen.dq, ddq=sign * seen.ddq)
+        yield f"with q[{j}] of the other sign", turned
+        yield f"with q[{j}] and tau[{j}] of the other sign", turned._replace(tau=sign * seen.tau)
     for i, j in itertools.combinations(range(n), 2):
         order = list(range(n))
         order[i], order[j] = j, i
