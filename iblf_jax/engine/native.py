@@ -33,9 +33,9 @@ def unavailable() -> str | None:
 
 
 @lru_cache(maxsize=8)
-def _text(program: Program, shared: int, lane: int, narrow: bool, once: bool) -> tuple[str, tuple[str, ...]]:
+def _text(program: Program, shared: int, lane: int, narrow: bool) -> tuple[str, tuple[str, ...]]:
     """The C of a program's kernel, and the compiler's flags for it."""
-    segment, flags = plan.native_build(program.size, once, narrow)
+    segment, flags = plan.native_build(program.size, narrow)
     return source(program, shared, lane, segment=segment), flags
 
 
@@ -44,25 +44,24 @@ def _is_narrow(program: Program, runs: int) -> bool:
 
 
 def ahead(program: Program, shared: int, lane: int, runs: int) -> None:
-    """Starts to build the kernel of a program that `run` will be asked to step more than once."""
-    build_ahead(*_text(program, shared, lane, _is_narrow(program, runs), once=False))
+    """Starts to build the kernel of a program that `run` will be asked for."""
+    build_ahead(*_text(program, shared, lane, _is_narrow(program, runs)))
 
 
 @lru_cache(maxsize=64)
-def kernel(program: Program, shared: int, lane: int, narrow: bool, once: bool) -> str:
+def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
     """The name under which the kernel of a program is registered; builds it if need be.
 
     Args:
       program: what a step does.
       shared, lane: how many numbers of each kind of leaf go in.
       narrow: for one or two runs, in short vectors.
-      once: it makes one step.
 
     Raises:
       ToolchainError: no compiler, or an error from it.
       UnsupportedError: an operation that C has no word for.
     """
-    library, key = built(*_text(program, shared, lane, narrow, once))
+    library, key = built(*_text(program, shared, lane, narrow))
     return _register(f"iblf_jax_{key}", library, "iblf_jax_kernel")
 
 
@@ -113,7 +112,7 @@ def run(
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every `every`-th step.
     """
     runs = carry.floats.shape[1]
-    name = kernel(program, shared.size, lane.shape[0], _is_narrow(program, runs), steps == 1)
+    name = kernel(program, shared.size, lane.shape[0], _is_narrow(program, runs))
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(program, runs, steps, every)
     settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
     floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, jnp.asarray(settings))

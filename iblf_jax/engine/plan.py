@@ -55,11 +55,11 @@ XLA_STRETCH = 4096
 """Steps whose signals are tabulated at once, at most."""
 XLA_SEGMENT = 2000
 """Nodes in one XLA computation on CPU: its passes take more than linear time."""
-NATIVE_LONG, NATIVE_SEGMENT, NATIVE_FLAGS = 10_000, 2000, ("-O1", "-fexpensive-optimizations")
-"""Nodes above which the C of a step is cut into functions, of how many each, and how it is built then: one of `presets.ur5` builds in 6 s
-instead of 27 and runs as fast (cut it takes 5 % longer, with less optimisation 20 % shorter).  A short step would take 1.6 times as long,
-one of 8,000 nodes 1.1 times.  The second flag makes products with sums one operation, as -O3 does: -O1 alone does not, and a large angle's
-sine would lose digits."""
+NATIVE_LONG, NATIVE_SEGMENT = 4000, 500
+"""Nodes above which the C of a step is cut into functions, and of how many each.  A step of `presets.iiwa14`, 15,000 nodes, takes 12.2 us a
+block of runs and builds in 3.3 s; in one function 14.3 us and 6 s, in pieces of 125, 250, 1000 and 4000 3, 1, 5 and 12 % more.  Chains of
+three, five and six joints (4,600 to 7,800 nodes) gain 6, 1 and 17 %; the paper's loop (1,800) would lose 4 %, a chain of four (3,800)
+7 %."""
 NATIVE_STRETCH, NATIVE_GROUP = 128, 32
 """Steps and blocks of runs that a thread goes through together, so that states and the table of signals stay in its cache: 32 to
 512 steps and 8 to 128 blocks take the same time within 5 % (the paper's loop)."""
@@ -189,17 +189,15 @@ def xla_stretch(steps: int, every: int) -> int:
     return exact if exact > most // 16 else most
 
 
-def native_build(nodes: int, once: bool, narrow: bool) -> tuple[int | None, tuple[str, ...]]:
+def native_build(nodes: int, narrow: bool) -> tuple[int | None, tuple[str, ...]]:
     """Nodes of a function of the generated C, None for one function, and how the compiler is told to take it.
 
     Args:
       nodes: of the step.
-      once: it makes one step, and takes longer to build than to run.
       narrow: for so few runs that they fill a short vector.
     """
-    long = nodes > NATIVE_LONG
     sizes = (f"-DSTRETCH={NATIVE_STRETCH}", f"-DGROUP={NATIVE_GROUP}", *((f"-DVECTOR_BYTES={NATIVE_NARROW}",) if narrow else ()))
-    return NATIVE_SEGMENT if long else None, (*sizes, *(NATIVE_FLAGS if long or once else ()))
+    return NATIVE_SEGMENT if nodes > NATIVE_LONG else None, sizes
 
 
 def gpu_threads(runs: int, processors: int) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
+from types import MappingProxyType
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def _conversion(source: str, target: str, arg: str) -> str:
     return f"to_float({arg})" if target == "f" else f"to_int({arg})"
 
 
-SEEN_BY_FUNCTION = ("const word *constants", "const F *once", "const F *p", "const I *q")
+SEEN_BY_FUNCTION = ("const word *constants", "const F *once", "const F *p", "const I *q", "F *RESTRICT r", "I *RESTRICT s")
 SEEN_BY_ADVANCE = (
     "const word *constants",
     "const F *leaves",
@@ -80,8 +81,8 @@ class _Emitter:
         """The nodes without a name that `wanted` needs, in order."""
         return needed(self.program.nodes, wanted, names)
 
-    def statements(self, names: dict[int, str], wanted: Iterable[int]) -> None:
-        """Adds statements for `wanted` and what it needs."""
+    def statements(self, names: dict[int, str], wanted: Iterable[int], stored: Mapping[int, str] = MappingProxyType({})) -> None:
+        """Adds statements for `wanted` and what it needs; `stored` has places in memory of some of them."""
         nodes = self.program.nodes
         for i in self.needed(names, wanted):
             node = nodes[i]
@@ -102,6 +103,8 @@ class _Emitter:
                 text = expression(node, args, [nodes[a].kind for a in node.args])
             self.lines.append(f"  {'F' if node.kind == 'f' else 'I'} v{i} = {text};")
             names[i] = f"v{i}"
+            if i in stored:  # at once: a compiler then needs no place of its own for it
+                self.lines.append(f"  {stored[i]} = v{i};")
 
     def function(self, head: str) -> str:
         """The C function of the statements so far."""
@@ -182,16 +185,16 @@ def _functions(calls: Calls, tables: dict[str, str], segment: int | None) -> lis
     for k, (function, given) in enumerate(zip(calls.functions, calls.given, strict=True)):
         e = _Emitter(function, tables, calls)
         names = {i: given[node.value] for i, node in enumerate(function.nodes) if node.op == "argument"}
+        results = list(zip(function.samples, places([function.nodes[i] for i in function.samples], "r", "s")[0], strict=True))
         if segment:
             segments = _Segments(e, names, segment, f"part_{k}", SEEN_BY_FUNCTION)
-            parts = segments.add(sorted(set(function.samples)), kept=False)
+            parts = segments.add(sorted(set(function.samples)), kept=False, own=dict(results))
             texts += segments.functions
             e.lines += [segments.room, *(f"  {part}" for part in parts)]
         else:
             e.statements(names, function.samples)
-        for i, place in zip(function.samples, places([function.nodes[i] for i in function.samples], "r", "s")[0], strict=True):
-            e.lines.append(f"  {place} = {names[i]};")
-        texts.append(e.function(f"SEPARATE void function_{k}({', '.join([*SEEN_BY_FUNCTION, 'F *r', 'I *s'])})"))
+        e.lines += [f"  {place} = {names[i]};" for i, place in results if names[i] != place]
+        texts.append(e.function(f"SEPARATE void function_{k}({', '.join(SEEN_BY_FUNCTION)})"))
     return texts
 
 
@@ -213,9 +216,7 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
     names |= {i: "index" for i, n in enumerate(nodes) if n.op == "index"}
     e.lines.append("  I index = from(first);")
     e.statements(names, columns)
-    e.lines += [
-        f"  for (int l = 0; l < W; l++) table[l * COLUMNS + {k}].{_part(nodes[i])} = AT({names[i]}, l);" for k, i in enumerate(columns)
-    ]
+    e.lines += [f"  write_column(table + {k}, COLUMNS, {names[i]});" for k, i in enumerate(columns)]
     return e.function("FUNCTION void shared_signals(const word *constants, integer first, word *table)")
 
 
@@ -263,8 +264,14 @@ class _Segments:
         self.free: dict[str, list[str]] = {"x": [], "y": []}
         self.sizes = {"x": 0, "y": 0}
 
-    def add(self, wanted: list[int], kept: bool) -> list[str]:
-        """Cuts `wanted` and what it needs; returns the calls.  `kept`: their places are never given to other numbers."""
+    def add(self, wanted: list[int], kept: bool, own: Mapping[int, str] = MappingProxyType({})) -> list[str]:
+        """Cuts `wanted` and what it needs; returns the calls.
+
+        Args:
+          wanted: nodes.
+          kept: their places are never given to other numbers.
+          own: places, in other arrays, that some of `wanted` have already.
+        """
         nodes, needed = self.e.program.nodes, self.e.needed(self.names, wanted)
         computed = [i for i in needed if nodes[i].op not in ("const", "result")]
         part = {i: k // self.size for k, i in enumerate(computed)}
@@ -276,7 +283,7 @@ class _Segments:
         calls = []
         for k in range(0, len(computed), self.size):
             here = computed[k : k + self.size]
-            calls.append(self._one(here, {i: last[i] for i in here if last[i] > part[i] and nodes[i].op != "call"}))
+            calls.append(self._one(here, [i for i in here if last[i] > part[i] and nodes[i].op != "call"], own))
             if not kept:
                 for i in (i for i in computed if i in self.names and last[i] == k // self.size and nodes[i].op != "call"):
                     self.free[self.names[i][0]].append(self.names[i])
@@ -288,17 +295,16 @@ class _Segments:
         """The places."""
         return f"  F x[{max(1, self.sizes['x'])}]; I y[{max(1, self.sizes['y'])}];"
 
-    def _one(self, here: list[int], outlive: dict[int, int]) -> str:
-        inner = dict(self.names)
-        self.e.statements(inner, here)
+    def _one(self, here: list[int], outlive: list[int], own: Mapping[int, str]) -> str:
+        inner, stored = dict(self.names), dict[int, str]()
         for i in outlive:
             array = "x" if self.e.program.nodes[i].kind == "f" else "y"
-            if not self.free[array]:
+            if i not in own and not self.free[array]:
                 self.free[array].append(f"{array}[{self.sizes[array]}]")
                 self.sizes[array] += 1
-            self.names[i] = self.free[array].pop()
-            self.e.lines.append(f"  {self.names[i]} = {inner[i]};")
-        self.names |= {i: inner[i] for i in here if self.e.program.nodes[i].op == "call"}
+            stored[i] = own[i] if i in own else self.free[array].pop()
+        self.e.statements(inner, here, stored)
+        self.names |= stored | {i: inner[i] for i in here if self.e.program.nodes[i].op == "call"}
         name = f"{self.name}_{len(self.functions)}"
         self.functions.append(self.e.function(self.head.format(name)))
         return f"{name}{self.arguments};"

@@ -113,11 +113,15 @@ class Calls:
             self.put.append([k for k, name in enumerate(known) if name is None])
             own = iter(places([nodes[arguments[k][0]] for k in self.put[-1]], "p", "q")[0])
             self.given.append([name or next(own) for name in known])
-        found = {}
+        found, begin = {}, (0, 0)
         for i in calls:
-            function = nodes[i].value
-            self.begins[i] = self.used
-            found[i], self.used = places([function.nodes[s] for s in function.samples], "r", "s", self.used)
+            made = [nodes[i].value.nodes[s] for s in nodes[i].value.samples]
+            read = max((node.value for node in nodes if node.op == "result" and node.args[0] == i), default=-1)
+            self.begins[i] = begin
+            found[i], end = places(made, "r", "s", begin)
+            self.used = (max(self.used[0], end[0]), max(self.used[1], end[1]))
+            # What nobody reads of a call may be written over by the next one.
+            begin = places(made[: read + 1], "r", "s", begin)[1]
         self.results = {i: found[node.args[0]][node.value] for i, node in enumerate(nodes) if node.op == "result"}
 
     @property

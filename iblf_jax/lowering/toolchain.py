@@ -34,10 +34,16 @@ from iblf_jax.core.drafts import draft, remove_abandoned
 from iblf_jax.core.progress import told
 
 COMPILER_FLAGS = (
-    "-x", "c++", "-std=gnu++17", "-nostdinc++", "-O3", "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno",
-    "-fno-trapping-math", "-ffp-contract=fast", "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden", "-w",
+    "-x", "c++", "-std=gnu++17", "-nostdinc++", "-O1", "-fexpensive-optimizations", "-fcaller-saves", "-ftree-loop-vectorize",
+    "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fno-exceptions",
+    "-fno-rtti", "-fvisibility=hidden", "-w",
 )  # fmt: skip
-"""NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  The headers are C's: C++ makes of `math.h` a tenth of a
+"""Of -O3 what the generated text gains by: the paper's loop runs as fast (1 % either way, one run 3 % slower) and builds in 0.6 s instead
+of 2.7.  Products and sums are one operation by the second flag, and a large angle's sine would lose digits without; numbers stay in
+registers across what is called rarely by the third (a step of seven joints takes 5 to 25 % longer without); the fourth makes one
+instruction of a root of many runs.
+
+NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  The headers are C's: C++ makes of `math.h` a tenth of a
 second more to read."""
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""

@@ -42,6 +42,8 @@ typedef union { real f; integer i; } word;
 #define to_float(x) ((F)(x))
 #define to_int(x) ((I)(x))
 INLINE int any_run(I x) { return x != 0; }
+INLINE void write_column(word *place, int columns, F x) { place->f = x; }
+INLINE void write_column(word *place, int columns, I x) { place->i = x; }
 INLINE F f_lookup(const integer *table, integer size, I i) { return from_bits(table[i < 0 ? 0 : i < size ? i : size - 1]); }
 struct all_runs {};
 struct one_run {};

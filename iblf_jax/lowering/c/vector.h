@@ -49,6 +49,9 @@ struct one_run {};
 INLINE void store_some(real *p, F x, all_runs) { store(p, x); }
 INLINE void store_some(real *p, F x, one_run) { *p = x[0]; }
 INLINE void store_some(real *p, F x, int count) { for (int l = 0; l < count; l++) p[l] = x[l]; }
+/* Into a column of a table, one row a run: there may be hundreds of columns, each written once in W steps, so the loop is not repeated. */
+SEPARATE void write_column(word *place, int columns, F x) { for (int l = 0; l < W; l++) place[l * columns].f = x[l]; }
+SEPARATE void write_column(word *place, int columns, I x) { for (int l = 0; l < W; l++) place[l * columns].i = x[l]; }
 INLINE I from(integer first) { I x; for (int l = 0; l < W; l++) x[l] = first + l; return x; }
 INLINE I bits(F x) { return (I)x; }
 INLINE F from_bits(I x) { return (F)x; }
