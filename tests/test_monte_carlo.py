@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 import zlib
 
 import jax
@@ -14,7 +15,7 @@ from scipy import stats
 
 import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
-from iblf_jax.engine import execute
+from iblf_jax.engine import execute, plan
 from iblf_jax.studies import blocks, statistics
 
 SCENARIO = ij.presets.zhang_yan_2024()
@@ -36,6 +37,26 @@ def results(study):
 @pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
 def test_chunk_changes_nothing(study, chunk):
     assert cases.same(results(study), results(cases.study(chunk=chunk)))
+
+
+@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, plan.STUDY_IN_FLIGHT)])
+def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(study, chunk, together, monkeypatch):
+    made, now, most, execute_block = threading.Barrier(together, timeout=60), [], [], blocks._execute
+
+    def counted(*args, **more):
+        now.append(None)
+        most.append(len(now))
+        if threading.current_thread() is not threading.main_thread():
+            made.wait()  # until as many others are here
+        try:
+            return execute_block(*args, **more)
+        finally:
+            now.pop()
+
+    monkeypatch.setattr(blocks, "_execute", counted)
+    again = cases.study(runs=256 * (1 + plan.STUDY_IN_FLIGHT), chunk=chunk)
+    assert max(most) == together
+    assert cases.same(results(study), {name: x[:600] for name, x in results(again).items()})
 
 
 @pytest.mark.parametrize("runs", [1, 255, 256, 257])

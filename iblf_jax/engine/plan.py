@@ -87,7 +87,7 @@ STUDY_MEMORY = 256 * 2**20
 STEP_SIZE_CHUNK = 1000
 """Steps between two looks at the pair of runs that tells a step size."""
 STUDY_IN_FLIGHT = 4
-"""Blocks that are queued on a device at once: enough to keep it busy."""
+"""Blocks that are made for a device at once, each by a thread: what surrounds a kernel goes beside another's."""
 SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
 """Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that a sweep has at least, if it is large."""
 TUNE_TOGETHER = 16

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -153,18 +153,36 @@ def run_blocks(
     call = partial(_execute, study_run=study_run, record_every=record_every)
     copies = [jax.device_put(shared, place) for place in places]
     _compile(study_run, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
-    waiting: deque = deque()
-    for k, block in enumerate(blocks):
+
+    def results(k: int) -> tuple[Any, int]:
+        """Those of block `blocks[k]`, on the host, and how many bytes it took."""
         place = k % len(places)
-        lanes = jax.device_put(lanes_of(np.arange(block * size, (block + 1) * size)), places[place])
+        lanes = jax.device_put(lanes_of(np.arange(blocks[k] * size, (blocks[k] + 1) * size)), places[place])
         out = call(copies[place], lanes)
-        waiting.append((block, out))
-        each = sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
-        allowed = plan.blocks_in_flight(chunk, memory, each, size, len(places))
-        while len(waiting) >= allowed:
-            yield _harvest(*waiting.popleft())
-    while waiting:
-        yield _harvest(*waiting.popleft())
+        return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
+
+    if not blocks:
+        return
+    first, each = results(0)  # alone: what is compiled is compiled once, and what a block takes is known after it
+    yield blocks[0], first
+    in_flight = plan.blocks_in_flight(chunk, memory, each, size, len(places))
+    # A thread a block in flight: draws, start and results of one are made while another is stepped.
+    pool, waiting = ThreadPoolExecutor(in_flight, "block"), deque[tuple[int, Future]]()
+    try:
+        for k in range(1, len(blocks)):
+            waiting.append((blocks[k], pool.submit(results, k)))
+            if len(waiting) == in_flight:
+                yield _first_of(waiting)
+        while waiting:
+            yield _first_of(waiting)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _first_of(waiting: deque[tuple[int, Future]]) -> tuple[int, Any]:
+    """The block that waits longest, and its results."""
+    block, future = waiting.popleft()
+    return block, future.result()[0]
 
 
 def _compile(study_run: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]) -> None:
@@ -178,7 +196,3 @@ def _compile(study_run: StudyRun, record_every: int | None, copies: list[StudyIn
 
     with ThreadPoolExecutor(len(copies)) as pool:
         list(pool.map(one, copies, lanes))
-
-
-def _harvest(block: int, out: Any) -> tuple[int, Any]:
-    return block, jax.tree.map(np.asarray, out)
