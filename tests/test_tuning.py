@@ -18,7 +18,9 @@ import iblf_jax as ij
 from iblf_jax.core import checks
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
+from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import _tune, newton, problem, quadratic
@@ -26,6 +28,7 @@ from iblf_jax.tuning.newton import Newton, Pieces, planned
 from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
+from iblf_jax.tuning.ranges import SHARE, STEP, THEOREM, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 
@@ -196,6 +199,13 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
     run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
     assert run.ok
     assert 1e-3 * float(run.fastest_mode) > 1.2
+    # Together they keep to the same share of the step, which each alone would leave free to a larger range.
+    together = ij.with_parameters(paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]})
+    mode = 1e-3 * fastest_along(canonical(together), TIMES)
+    assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
+    _, alone = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
+    assert np.all(np.exp(alone.high) > 1.001 * high[2:4])
+    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and alone.reasons[0] == (THEOREM, STEP)
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):

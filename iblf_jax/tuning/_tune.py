@@ -29,7 +29,7 @@ from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
 from iblf_jax.tuning.objectives import Objective, check_signals, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, sampled_too_slowly, values_at
+from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, values_at
 from iblf_jax.tuning.problem import (
     NO_LEVEL,
     NUMBERS_A_RUN,
@@ -43,6 +43,7 @@ from iblf_jax.tuning.problem import (
     slope,
     value,
 )
+from iblf_jax.tuning.ranges import sampled_too_slowly
 from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
@@ -192,6 +193,7 @@ def tune(
         report_seed,
         confidence,
         tuple(zip(*(in_units(problem.formulation.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
+        reasons=problem.box.reasons,
     )
     return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began)
 

@@ -43,9 +43,11 @@ class AtLimit(NamedTuple):
     side: str
     """"lower" or "upper"."""
     limit: float
+    reason: str = ""
+    """What set this end; empty where that is not known."""
 
     def __str__(self) -> str:
-        return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}"
+        return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}" + (f" ({self.reason})" if self.reason else "")
 
 
 @partial(jax.jit, static_argnames=("run", "backend"))
@@ -72,6 +74,8 @@ class TuneSetup:
     confidence: float
     limits: tuple[tuple[float, float], ...] = ()
     """Lower and upper limit of each tuned number, (p, 2), in its unit; empty in results that were saved without."""
+    reasons: tuple[tuple[str, str], ...] = dataclasses.field(default=(), kw_only=True)
+    """What set them, in words, (p, 2); empty in results that were saved without."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,11 +134,12 @@ class TuneResult:
     def at_limits(self) -> dict[str, AtLimit]:
         """The tuned numbers that sit at an end of their range, by name: a wider range, or a price on what they cost, would move them."""
         found = {}
-        for name, x, ends in zip(self.names, self.tuned, self.setup.limits, strict=False):
+        why = self.setup.reasons or (("", ""),) * len(self.names)
+        for name, x, ends, reasons in zip(self.names, self.tuned, self.setup.limits, why, strict=False):
             width = ends[1] - ends[0] if np.isfinite(ends[1] - ends[0]) else 1.0
-            for side, end in zip(("lower", "upper"), ends, strict=True):
+            for side, end, reason in zip(("lower", "upper"), ends, reasons, strict=True):
                 if np.isfinite(end) and abs(x - end) <= NEAR * (abs(end) or width):
-                    found[name] = AtLimit(float(x), side, float(end))
+                    found[name] = AtLimit(float(x), side, float(end), reason)
         return found
 
     @property
