@@ -296,7 +296,7 @@ def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
             ij.load_rollouts(tmp_path / "bad.npz")
     whole = json.loads(saved)
     bad = [{key: x for key, x in whole.items() if key != left_out} for left_out in whole if left_out != "report"]
-    bad += [whole | {key: value} for key in whole for value in (None, 3, [[1]]) if key not in ("report", "best_start", "seconds")]
+    bad += [whole | {key: value} for key in whole for value in (None, 3, [[1]]) if key not in ("report", "best_start", "seconds", "probes")]
     for data in (*map(json.dumps, bad), saved[:200], "[]", "[" * 100_000):
         (tmp_path / "bad.json").write_text(data)
         with pytest.raises(ValueError, match=r"path: got .*TuneResult\.save"):

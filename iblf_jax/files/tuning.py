@@ -188,7 +188,7 @@ def _objective(terms: Any, requirements: Any) -> Objective:
 # ------------------------------------------------------------------------------------------------------------- saved results
 
 
-RESULT = ("names", "best_start", "stopped", "optimiser", "mode", "seconds", "multipliers", "residuals")
+RESULT = ("names", "best_start", "stopped", "optimiser", "mode", "seconds", "multipliers", "residuals", "probes")
 """Fields of a result that are words and numbers."""
 
 
@@ -287,5 +287,6 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         setup=setup,
         multipliers=ends[0],
         residuals=ends[1],
+        probes=checks.positive_integer("probes", data["probes"], least=0),
         **words,
     )

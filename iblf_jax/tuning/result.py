@@ -91,8 +91,8 @@ class TuneResult:
     names: tuple[str, ...]
     """What each coordinate is called, (p,)."""
     history: dict[str, np.ndarray]
-    """Per step, (steps, starts, ...): loss, objective, terms, excess of the requirements, margin [rad], gradient_norm, valid, z and
-    x (the gains tried, in their units); evaluations is (steps,)."""
+    """Per step, (steps, starts, ...), two starts where two searches took turns: loss, objective, terms, excess of the requirements,
+    margin [rad], gradient_norm, valid, z and x (the gains tried, in their units); evaluations is (steps,)."""
     best_start: int
     """Which of the starts won."""
     stopped: str
@@ -108,6 +108,8 @@ class TuneResult:
     residuals: tuple[float, ...] = ()
     """At the end, of "newton": the largest entry of the Lagrangian's gradient by the coordinates z that no limit of a gain holds, the
     largest excess g of a requirement, and the sum of multipliers times distances from the limits; all 0 at an optimum."""
+    probes: int = 0
+    """Values without derivatives that were computed to find where to start, each of `setup.runs` rollouts."""
 
     @property
     def objective(self) -> float:
@@ -295,7 +297,9 @@ class TuneResult:
 
     def __repr__(self) -> str:
         steps, how = len(self.history["evaluations"]), f"{self.optimiser}, {self.mode} mode"
-        lines = [f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {self.stopped})"]
+        lines = [
+            f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations, {self.probes} probes, {self.seconds:.3g} s; {self.stopped})"
+        ]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
