@@ -296,10 +296,9 @@ class TuneResult:
         save_tuning(self, path)
 
     def __repr__(self) -> str:
+        probes = f", {self.probes} probes" if self.probes else ""
         steps, how = len(self.history["evaluations"]), f"{self.optimiser}, {self.mode} mode"
-        lines = [
-            f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations, {self.probes} probes, {self.seconds:.3g} s; {self.stopped})"
-        ]
+        lines = [f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations{probes}, {self.seconds:.3g} s; {self.stopped})"]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
