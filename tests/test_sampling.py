@@ -16,15 +16,20 @@ from scipy.integrate import solve_ivp
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine.period import radius_at
+from iblf_jax.engine.step_size import start_and_along
+from iblf_jax.simulation.closed_loop import sampled
 from iblf_jax.simulation.sampling import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.parameters import layout
+from iblf_jax.tuning.ranges import COUNT, PERIOD, TIMES, TOGETHER
+from iblf_jax.tuning.result import AtLimit
 
 PAPER = ij.presets.zhang_yan_2024(reading="corrected")
 SLOW = ij.with_parameters(PAPER, {"controller.K2": 4.0, "observer.kf": 4.0})
 """Slow enough for a filter and a drive in the loop."""
 MOTOR = ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0, limit=[15.0, 5.0], stall=[14.0, 6.0], no_load_speed=[6.0, 8.0])
 OFFSET = np.array([1e-3, -2e-3])
+MOVED = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 ENCODER = ij.sensors.Encoder(counts=65536, offset=OFFSET, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
 
 
@@ -310,6 +315,36 @@ def test_tuning_hears_the_noise():
     high = np.exp(np.max(box.high))
     assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 0.9 * high})), 1e-3, np.linspace(0, 6, 7)) < 1.0
     assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 1.1 * high})), 1e-3, np.linspace(0, 6, 7)) >= 1.0
+
+
+def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
+    sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+    scenario = ij.with_parts(
+        SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0)
+    )
+    gains = ["controller.k1", "controller.K2", "observer.kf"]
+    blocks, box = layout(canonical(scenario), gains, 1e-3, "rk4")
+    assert box.reasons[0][1] == COUNT + TOGETHER
+    assert TOGETHER in str(AtLimit(1.0, "upper", 1.0, box.reasons[0][1]))
+
+    def rate_for_a_count(factor):
+        """The largest rate that the motor is asked for when one joint moves on by a count, with the sensor as it rounds."""
+        values = {b.path: factor * np.exp(box.high[b.start : b.start + b.size]) for b in blocks}
+        changed = canonical(ij.with_parameters(scenario, values))
+        count, rates = 2 * np.pi / 65536, []
+        states = start_and_along(changed, jnp.asarray(TIMES))
+        for i, t in enumerate([0.0, *TIMES]):
+            state = jax.tree.map(lambda x, i=i: x[i], states)
+            commands = [sampled(changed, t, state._replace(q=q), jnp.zeros((0, 2))).held.commands[0] for q in state.q + count * MOVED]
+            rates.append(600.0 * np.max(np.abs(np.stack(commands[1:]) - commands[0])))
+        return max(rates)
+
+    assert rate_for_a_count(0.98) < 900.0 < rate_for_a_count(1.02)
+    # Half the rate allows less, and a drive that the start already asks too much of sets no limit.
+    slower = ij.with_parts(scenario, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=450.0))
+    assert np.all(layout(canonical(slower), gains, 1e-3, "rk4")[1].high < box.high)
+    hopeless = ij.with_parts(scenario, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=1.0))
+    assert layout(canonical(hopeless), gains, 1e-3, "rk4")[1].reasons[0][1] == PERIOD + TOGETHER
 
 
 def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():

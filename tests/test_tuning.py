@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +19,18 @@ import iblf_jax as ij
 from iblf_jax.core import checks
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
+from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import _tune, newton, problem, quadratic
 from iblf_jax.tuning.newton import Newton, Pieces, planned
 from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
+from iblf_jax.tuning.probes import APART, REACH, Probes
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
+from iblf_jax.tuning.ranges import SHARE, STEP, THEOREM, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 
@@ -196,6 +201,13 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
     run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
     assert run.ok
     assert 1e-3 * float(run.fastest_mode) > 1.2
+    # Together they keep to the same share of the step, which each alone would leave free to a larger range.
+    together = ij.with_parameters(paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]})
+    mode = 1e-3 * fastest_along(canonical(together), TIMES)
+    assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
+    _, alone = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
+    assert np.all(np.exp(alone.high) > 1.001 * high[2:4])
+    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and alone.reasons[0] == (THEOREM, STEP)
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):
@@ -292,6 +304,54 @@ def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
     assert state["done"][0]
     np.testing.assert_allclose(state["z"][0], [1.0, 0.0], atol=1e-4)
     assert state["residuals"][0, 1] == pytest.approx(0.5, abs=1e-4)
+
+
+class Valleys:
+    """Seven coordinates and a requirement that does not bind; a broad valley at -1, a deeper one at 1."""
+
+    LOW, DEEP = 1.3, 1.0
+
+    def __call__(self, z):
+        a, b = self.LOW + np.sum((z + 1) ** 2, axis=1), self.DEEP + 3 * np.sum((z - 1) ** 2, axis=1)
+        f, eye = np.minimum(a, b), np.eye(z.shape[1])
+        gradient = np.where((a < b)[:, None], 2 * (z + 1), 6 * (z - 1))
+        value = problem.Value(f, f, f[:, None], -np.ones((len(z), 1)), -np.ones((len(z), 1)), np.ones(len(z)), np.ones(len(z), bool))
+        hessian = np.where((a < b)[:, None, None], 2 * eye, 6 * eye)
+        return problem.Slope(value, gradient, hessian, -np.ones((len(z), 1, 1)), np.zeros((len(z), 1, z.shape[1], 1)))
+
+
+class Turns(Valleys):
+    """As a `CountedProblem`: only what is needed is counted."""
+
+    def __init__(self):
+        self.evaluations, self.needed = 0, np.ones(2, bool)
+        self.lanes = SimpleNamespace(index=np.zeros((2, 1)), _replace=lambda **changes: self.lanes)
+        self.formulation = SimpleNamespace(shares=(0.0,))
+        self.shared = SimpleNamespace(objective=objectives.tracking(), _replace=lambda **changes: self.shared)
+
+    def __call__(self, z):
+        self.evaluations += int(self.needed.sum())
+        return super().__call__(z)
+
+
+def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
+    box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 4.0))
+    valleys = Valleys()
+    probes = Probes(lambda z: valleys(z).value, box, 0, lambda z: False)
+    assert probes.count == 128 and np.all(np.abs(probes.points - box.z) <= REACH)
+    first = probes.points[0]
+    assert np.sum((first + 1) ** 2) < np.sum((probes.points[-1] + 1) ** 2)
+    assert np.max(np.abs(probes.best(first[None]) - first)) > APART
+    # Told where to go on, it finds the deeper valley, and comes to its bottom.
+    problem_, method = Turns(), Newton(box, limits=Pieces.of((1,), (0.0,), 1))
+    loop = Loop(problem_, method, np.stack([first] * 2))
+    asked = []
+    loop.take_turns(lambda used: asked.append(used) or np.full(7, 0.5))
+    assert loop.run(60, tolerance=1e-5, patience=15, on_step=lambda loop: None) == "converged"
+    assert loop.best == 1 and loop.state["best_key"][1][1] == pytest.approx(Valleys.DEEP)
+    np.testing.assert_allclose(asked[0], [first, -np.ones(7)], atol=1e-2)
+    # One at a time: as many values as steps.
+    assert problem_.evaluations == len(loop.history["z"]) <= 40
 
 
 # ---------------------------------------------------------------------------------------------------------------- the loop
@@ -518,6 +578,22 @@ def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper):
     assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["valid"][-1].all()
     with pytest.raises(ValueError, match=r"Take dt=\S+, not 0.001 s"):
         ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
+
+
+def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeypatch):
+    """The nominal run may be fine where some perturbed ones are not: dry friction of a narrow width is what no gain makes slower."""
+    lane = jax.tree.map(lambda x: x[0], nominal.lanes(nominal.box.z[None]))
+    status = np.array([0, int(ij.Status.STEP_TOO_LARGE), 0, int(ij.Status.BOUND_VIOLATED)])
+    smooth = np.ones((4, len(nominal.shared.objective.quantities) + 1))
+    smooth[2, 0] = np.nan
+    found = problem._value(nominal.formulation, nominal.shared, lane, smooth, smooth, status)
+    assert not found.valid and float(found.trusted) == 0.5
+    monkeypatch.setattr(nominal, "runs", 4)
+    monkeypatch.setattr(nominal, "step", lambda: 2e-4)
+    seen = jax.tree.map(lambda x: np.asarray(x)[None], found)
+    monkeypatch.setattr(_tune, "value", lambda *args, **options: seen)
+    with pytest.raises(ValueError, match=r"only 2 of 4 runs can be integrated.*Take dt=0.0002, not 0.001 s"):
+        _tune.look_around(nominal, 0, nominal.box.z[None])
 
 
 # ---------------------------------------------------------------------------------------------------------------- robust

@@ -199,7 +199,7 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
 def _check_torque_and_ends(paper, best, figure):
     """Report, repr and figure show both, although the objective asked for neither; the legend covers no curve."""
     peaks = [np.asarray(ij.simulate(scenario, **SHORT).metrics.peak_torque) for scenario in (paper, best.scenario)]
-    assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5)
+    assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5, "as given")
     for text in (repr(best), str(best.report)):
         assert "controller.k1[0] = 2.5 is at the upper end of its range, 2.5" in text
     assert f"peak torque of the nominal run: {peaks[0].max():.5g} -> {peaks[1].max():.5g} N m" in repr(best)
@@ -218,9 +218,10 @@ def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
     """1 % of the limit, or of the range where the limit is 0; an infinite limit is never reached."""
     limits = ((0.0, 100.0), (1.01, np.inf), (-np.inf, 50.0), (1.0, 9.0))
     values = {"a": np.array(0.5), "b": np.array(1.011), "c": np.array(49.8), "d": np.array(5.0)}
-    result = TuneResult(None, None, values, ("a", "b", "c", "d"), {}, 0, "", "newton", "forward", 0.0, SimpleNamespace(limits=limits))
+    setup = SimpleNamespace(limits=limits, reasons=())
+    result = TuneResult(None, None, values, ("a", "b", "c", "d"), {}, 0, "", "newton", "forward", 0.0, setup)
     assert {name: end.side for name, end in result.at_limits.items()} == {"a": "lower", "b": "lower", "c": "upper"}
-    assert dataclasses.replace(result, setup=SimpleNamespace(limits=())).at_limits == {}
+    assert dataclasses.replace(result, setup=SimpleNamespace(limits=(), reasons=())).at_limits == {}
 
 
 @pytest.mark.parametrize(("b", "scale"), [([1.0, 30.0, 2000.0], "log"), ([1.0, 1.5, 2.0], "linear"), ([-1.0, 0.0, 2000.0], "linear")])
@@ -295,7 +296,7 @@ def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
             ij.load_rollouts(tmp_path / "bad.npz")
     whole = json.loads(saved)
     bad = [{key: x for key, x in whole.items() if key != left_out} for left_out in whole if left_out != "report"]
-    bad += [whole | {key: value} for key in whole for value in (None, 3, [[1]]) if key not in ("report", "best_start", "seconds")]
+    bad += [whole | {key: value} for key in whole for value in (None, 3, [[1]]) if key not in ("report", "best_start", "seconds", "probes")]
     for data in (*map(json.dumps, bad), saved[:200], "[]", "[" * 100_000):
         (tmp_path / "bad.json").write_text(data)
         with pytest.raises(ValueError, match=r"path: got .*TuneResult\.save"):

@@ -188,7 +188,7 @@ def _objective(terms: Any, requirements: Any) -> Objective:
 # ------------------------------------------------------------------------------------------------------------- saved results
 
 
-RESULT = ("names", "best_start", "stopped", "optimiser", "mode", "seconds", "multipliers", "residuals")
+RESULT = ("names", "best_start", "stopped", "optimiser", "mode", "seconds", "multipliers", "residuals", "probes")
 """Fields of a result that are words and numbers."""
 
 
@@ -196,7 +196,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     target, setup = checks.file_to_write("path", path), result.setup
     history = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
-    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits")
+    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits", "reasons")
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
@@ -251,7 +251,11 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         objective=checked(components.decode_fields(Objective, data["objective"], "objective")),
         perturbations={key: components.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
         risk=as_risk(Risk(*data["risk"])),
-        **data["setup"] | {"limits": tuple((float(low), float(high)) for low, high in data["setup"].get("limits", ()))},
+        **data["setup"]
+        | {
+            "limits": tuple((float(low), float(high)) for low, high in data["setup"].get("limits", ())),
+            "reasons": tuple((str(low), str(high)) for low, high in data["setup"].get("reasons", ())),
+        },
     )
     tableau(setup.method)
     checks.one_of("backend", setup.backend, BACKENDS)
@@ -283,5 +287,6 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         setup=setup,
         multipliers=ends[0],
         residuals=ends[1],
+        probes=checks.positive_integer("probes", data["probes"], least=0),
         **words,
     )

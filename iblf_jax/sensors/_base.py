@@ -29,7 +29,8 @@ class Measurement(NamedTuple):
 class Sensor(Protocol):
     """What the package asks of a sensor.
 
-    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on it.  It may have a method
+    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on it; and `resolution`, what a count is,
+    () or (n,) [rad], for the default ranges of gains.  It may have a method
     `advice(period)`, a list of warnings.
     """
 

@@ -51,11 +51,16 @@ class Encoder:
         """The same without counts."""
         return dataclasses.replace(self, counts=None)
 
+    @property
+    def resolution(self) -> jax.Array | float:
+        """What a count is, () or (n,) [rad]; 0 if not rounded."""
+        return 0.0 if self.counts is None else 2.0 * math.pi / self.counts
+
     def _read(self, q: jax.Array) -> jax.Array:
         """The counts that a position is read as, in [rad]."""
         if self.counts is None:
             return q
-        step = 2.0 * math.pi / self.counts
+        step = self.resolution
         return q + jax.lax.stop_gradient(step * jnp.round(q / step) - q)
 
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:

@@ -25,11 +25,14 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, targets_of
 from iblf_jax.studies.recommended import recommended_dt
 from iblf_jax.studies.statistics import check_confidence
+from iblf_jax.tuning import newton
+from iblf_jax.tuning import probes as probing
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
 from iblf_jax.tuning.objectives import Objective, check_signals, checked, complete, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, sampled_too_slowly, values_at
+from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, values_at
+from iblf_jax.tuning.probes import Probes
 from iblf_jax.tuning.problem import (
     NO_LEVEL,
     NUMBERS_A_RUN,
@@ -43,6 +46,7 @@ from iblf_jax.tuning.problem import (
     slope,
     value,
 )
+from iblf_jax.tuning.ranges import sampled_too_slowly
 from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
@@ -109,9 +113,9 @@ def tune(
         it), "lbfgs" and "adam" (requirements are penalties), or "auto": newton where forward mode is used, else lbfgs, and adam where
         runs are resampled.
       mode: "forward", "reverse", or "auto": forward up to 32 numbers.
-      starts: number of starting points; the first is the scenario's, the others are drawn around it.  They run as one batch; at each
-        sharpening the better half goes on.  Eight are worth their price where there are several valleys, as with nine gains and more
-        under limits that bind.
+      starts: number of starting points.  1: the scenario's; with six gains and more under requirements, where there are valleys, the
+        best of some values around it, and where the search from there has soon arrived, a second one from another of them (`probes`).
+        More: the scenario's, the others are drawn around it; they run as one batch, and at each sharpening the better half goes on.
       sharpenings: how many times the smoothing of the peaks in the objective's terms is divided by 4, each time once the starts have
         converged; 0 where no term is smoothed, and with adam.  Requirements are exact from the start.
       iterations: steps of the optimiser at most.
@@ -154,14 +158,19 @@ def tune(
     problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing, mode=mode)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
-    z = starting_points(problem.box, starts, seed)
-    method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate, problem.limits, problem.runs)
+    # With a checkpoint too: what is looked at is no part of it, and the same again.
+    probes = problem.probes(seed) if starts == 1 and optimiser == "newton" and problem.has_valleys else None
+    z = starting_points(problem.box, starts, seed) if probes is None else np.stack([probes.points[0]] * 2)
+    radius = probing.FIRST_RADIUS if problem.has_valleys else newton.FIRST_RADIUS
+    method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate, problem.limits, problem.runs, radius)
     # The line search of L-BFGS is a loop of JAX's around the problem.
     formulation = problem.formulation._replace(nested=optimiser == "lbfgs", penalised=method_.penalised)
     evaluator = CountedProblem(formulation, problem.shared, problem.lanes(z), mode)
     stages = sharpenings if method_.converges and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
     loop.rescue = partial(way_in, problem, seed)
+    if probes is not None:
+        loop.take_turns(probes.best)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
     mark = fingerprint(formulation, problem.shared, options)
     if checkpoint is not None and checkpoint.exists():
@@ -192,8 +201,9 @@ def tune(
         report_seed,
         confidence,
         tuple(zip(*(in_units(problem.formulation.blocks, z).tolist() for z in (problem.box.low, problem.box.high)), strict=True)),
+        reasons=problem.box.reasons,
     )
-    return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began)
+    return _result(problem, loop, setup, stopped, optimiser, mode, time.perf_counter() - began, 0 if probes is None else probes.count)
 
 
 class Problem:
@@ -204,18 +214,33 @@ class Problem:
         self.step = step
         """Looks for a time step that will do, which takes some runs."""
 
-    def too_stiff(self) -> ValueError:
-        """The error of a problem in which no gains that were tried have runs that can be integrated; it names a step that will do."""
+    def too_stiff(self, trusted: float = 0.0) -> ValueError:
+        """The error of a problem in which no gains that were tried have runs that can all be integrated; it names a step that will do.
+
+        Args:
+          trusted: share of the runs that can, at the best of these gains.
+        """
+        count = round(trusted * self.runs)
+        how_many = f"only {count} of {self.runs} runs" if count else "no run"
         return checks.fail(
             "scenario",
-            "gains with which no run could be integrated to its end",
-            "a start whose runs are all finite and within the step's stability",
+            f"gains with which {how_many} can be integrated to the end, and stably",
+            "a start with which all runs can",
             f"Take dt={self.step():g}, not {float(self.shared.dt):g} s (ij.recommended_dt), lower gains, or narrower perturbations.",
         )
 
     def too_slow(self, z: np.ndarray) -> bool:
         """Whether the law is sampled too slowly for these gains, (p,)."""
         return sampled_too_slowly(with_parameters(self.shared.cases.scenario, values_at(self.formulation.blocks, jnp.asarray(z))))
+
+    @property
+    def has_valleys(self) -> bool:
+        """Whether it is to be expected that searches from different starts end at different gains."""
+        return bool(self.formulation.shares) and len(self.box.z) >= probing.LEAST
+
+    def probes(self, seed: int) -> Probes:
+        """Values around the start."""
+        return Probes(lambda z: value(self.shared, self.lanes(z), formulation=self.formulation), self.box, seed, self.too_slow)
 
     @property
     def limits(self) -> Pieces:
@@ -287,11 +312,18 @@ def choose(mode: str, optimiser: str, size: int, resample: bool) -> tuple[str, s
 
 
 def make_method(
-    optimiser: str, box: Box, iterations: int, tolerance: float, learning_rate: float, limits: Pieces | None = None, runs: int = 1
+    optimiser: str,
+    box: Box,
+    iterations: int,
+    tolerance: float,
+    learning_rate: float,
+    limits: Pieces | None = None,
+    runs: int = 1,
+    radius: float = newton.FIRST_RADIUS,
 ) -> Any:
     """The optimiser by name."""
     if optimiser == "newton":
-        return Newton(box, tolerance, limits=limits, runs=runs)
+        return Newton(box, tolerance, radius, limits, runs)
     return LBFGS(box, tolerance) if optimiser == "lbfgs" else Adam(box, iterations, learning_rate)
 
 
@@ -331,7 +363,7 @@ def look_around(problem: Problem, seed: int, z: np.ndarray) -> tuple[np.ndarray,
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
     seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), formulation=problem.formulation))
     if not np.any(seen.valid):
-        raise problem.too_stiff()
+        raise problem.too_stiff(float(np.max(seen.trusted)))
     return points, seen, np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)
 
 
@@ -342,7 +374,9 @@ def _show(shown: Any, loop: Loop) -> None:
     shown.set_postfix_str(f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin {last['margin'][s]:.3g} rad")
 
 
-def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float) -> TuneResult:
+def _result(
+    problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimiser: str, mode: str, seconds: float, probes: int
+) -> TuneResult:
     state, blocks = loop.state, problem.formulation.blocks
     best = loop.best
     broken = state["best_key"][best][0] > 0
@@ -377,4 +411,5 @@ def _result(problem: Problem, loop: Loop, setup: TuneSetup, stopped: str, optimi
         setup=setup,
         multipliers=tuple(map(float, prices)),
         residuals=tuple(map(float, residuals)),
+        probes=probes,
     )

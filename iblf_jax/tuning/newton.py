@@ -224,6 +224,10 @@ class Newton:
         state["secant"][start], state["trial"][start] = 0.0, state["z"][start]
         state["radius"][start] = max(state["radius"][start], 0.1 * self.radius)
 
+    def go_on(self, state: dict[str, np.ndarray], start: int) -> None:
+        """After a change of the tolerance: the trial that was planned last is made."""
+        state["done"][start] = False
+
     def begin(self, state: dict[str, np.ndarray], start: int, z: np.ndarray) -> None:
         """One start begins anew, at another z (p,)."""
         for name, x in self.init(z[None]).items():

@@ -14,6 +14,9 @@ all starts have converged at the tolerance ROUGH (or after INNER steps, HASTY wh
 divided by SHARPER, the better half of the starts goes on and the others are given up.  What counts as the best is judged without
 smoothing throughout.
 
+Under limits, a single start takes turns with a second one (`probes`): it is followed to the tolerance ROUGH, then, if that took no more
+than SOON values with derivatives, the second one, until LONG values are spent; then the better of them goes on to the end.
+
 A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
 from there and gives the same numbers, bit by bit, as one that was not.
 """
@@ -32,7 +35,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.engine.plan import starts_together
 from iblf_jax.tuning import problem
-from iblf_jax.tuning.objectives import sharper
+from iblf_jax.tuning.objectives import is_smoothed, sharper
 from iblf_jax.tuning.problem import Formulation, Lane, ProblemInputs, Slope
 
 INNER = 12
@@ -45,6 +48,9 @@ SHARPER = 4.0
 ROUGH, HASTY = 1e-3, 6
 """Tolerance before the last sharpening, and steps at most of several starts without requirements: what is found there is a place to go on
 from, and good enough to choose by."""
+
+SOON, LONG = 25, 40
+"""Values with derivatives of two searches that take turns: after how many at most the second begins, and with how many both end."""
 
 
 class CountedProblem:
@@ -127,6 +133,7 @@ class Loop:
             "worst": np.full(starts, np.inf),
             "finished": np.zeros(starts, bool),
             "retired": np.zeros(starts, bool),
+            "waiting": np.zeros(starts, bool),
             "stale": np.asarray(0),
             "stage": np.asarray(0),
             "stage_steps": np.asarray(0),
@@ -139,6 +146,15 @@ class Loop:
         self.history: dict[str, list[np.ndarray]] = {}
         self.rescue: Callable[[np.ndarray, Slope], np.ndarray | None] = lambda z, found: None
         """Called with the first step's points and what they gave; better starting points, or None."""
+        self.second: Callable[[np.ndarray], np.ndarray | None] | None = None
+        """Called where the first start began and ended, (2, p); where the second begins, or None."""
+
+    def take_turns(self, second: Callable[[np.ndarray], np.ndarray | None]) -> None:
+        """Of two starts, the second waits until the first has arrived, and begins where `second` says."""
+        self.second = second
+        self.sharpenings = max(self.sharpenings, 1)
+        self.state["waiting"][1] = self.state["finished"][1] = True
+        self.method.retire(self.state["method"], 1)
 
     def run(self, iterations: int, *, tolerance: float, patience: int, on_step: Callable[[Loop], None]) -> str:
         """Steps until done; returns why it stopped."""
@@ -178,7 +194,10 @@ class Loop:
         for s in order[: -(-len(order) // 2)]:
             state["finished"][s] = False
             state["since"][s], state["outer"][s] = 0, 0
-            self.method.restart(state["method"], s)
+            if is_smoothed(self.smoothest):
+                self.method.restart(state["method"], s)
+            else:
+                self.method.go_on(state["method"], s)
         for s in order[-(-len(order) // 2) :]:
             state["finished"][s] = state["retired"][s] = True
             self.method.retire(state["method"], s)
@@ -201,7 +220,23 @@ class Loop:
             state["method"] = self.method.init(better)
         for s in range(len(z) if better is None else 0):
             self._outer(s, found)
+        if self.second is not None and not state["stage"]:
+            self._turn(self.second)
         state["iteration"], state["stage_steps"] = state["iteration"] + 1, state["stage_steps"] + 1
+
+    def _turn(self, second: Callable[[np.ndarray], np.ndarray | None]) -> None:
+        """Lets the second start begin where the first has soon arrived, and ends it where it takes long."""
+        state = self.state
+        if state["waiting"][1]:
+            if not state["finished"][0]:
+                return
+            state["waiting"][1] = False
+            begins = second(np.stack([self.history["z"][0][0], state["method"]["z"][0]])) if state["evaluations"] <= SOON else None
+            if begins is not None:
+                self.method.begin(state["method"], 1, begins)
+                state["finished"][1], state["since"][1], state["stale"] = False, 0, np.asarray(0)
+        elif state["evaluations"] >= LONG:
+            state["finished"][1] = True
 
     def _keep_best(self, z: np.ndarray, found: Slope, tolerance: float) -> bool:
         state, improved = self.state, False

@@ -6,13 +6,11 @@ work on a free w that is squashed into the box,
 
     z = z_low + (z_high - z_low) sigmoid(w)      both limits,      z = z_low + softplus(w)   or   z_high - softplus(w)      one.
 
-Default limits keep inside the conditions of Theorem 2 (k1 > 0, K2 > 1/2, kf > 1) and, above, inside what the step can carry: the
-fastest mode of the closed loop grows with every gain, and past stability / dt the numbers explode (see `stability`).
+Default limits are those of `ranges`.
 """
 
 from __future__ import annotations
 
-import re
 from typing import Any, NamedTuple
 
 import jax
@@ -20,22 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.period import radius_at
-from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.simulation import paths
-from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
+from iblf_jax.tuning.ranges import GIVEN, default_highs, default_low
 
-CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
-"""Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the paper's law."""
-SHARE = 0.7
-"""Part of the integrator's stability range that a gain may use up by default."""
-TIMES = np.linspace(0.0, 6.0, 7)
-"""Along the reference, where is looked for how fast a loop is [s]."""
-MOST = 1e2
-"""How far above its start a gain may go by default, as a factor, where the step sets no limit."""
 EDGE = 1e-3
 """Distance from a limit, relative to the box, from which a squashed coordinate starts at least."""
 
@@ -66,6 +53,8 @@ class Box(NamedTuple):
     z: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    reasons: tuple[tuple[str, str], ...] = ()
+    """What set the lower and the upper end of each coordinate, in words."""
 
 
 def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False, scale: str | None = None) -> Tunable:
@@ -107,7 +96,7 @@ def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple
     Args:
       scenario: canonical.
       parameters: paths or `Tunable`s.
-      dt, method: what the step can carry sets the default upper limits.
+      dt, method: of the runs, for the default upper limits (`ranges`).
 
     Raises:
       ValueError: an unknown or overlapping path, limits that exclude the start or are not admissible.
@@ -115,16 +104,24 @@ def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple
     given = checks.listed("parameters", parameters, '["controller.k1", "controller.K2"]')
     wanted = [x if isinstance(x, Tunable) else Tunable(x) for x in given]
     check_paths(scenario, [x.path for x in wanted], "parameters")
-    blocks, parts, start = [], [], 0
-    for item in wanted:
-        block, part = _one(scenario, item, start, dt, method)
+    starts = [_start_of(scenario, item) for item in wanted]
+    open_ended = {item.path: value for item, (value, _, _) in zip(wanted, starts, strict=True) if item.high is None}
+    highs = default_highs(scenario, open_ended, dt, method)
+    blocks, parts, reasons, start = [], [], [], 0
+    for item, (value, log, sign) in zip(wanted, starts, strict=True):
+        low, below = default_low(item.path, sign) if item.low is None else (item.low, GIVEN)
+        high, above = highs.get(item.path, (item.high, GIVEN))
+        block, part = _one(item, value, _limit(item, "low", low, value), _limit(item, "high", high, value), start, log)
         blocks.append(block)
         parts.append(part)
+        reasons += [(below, above)] * block.size
         start += block.size
-    return tuple(blocks), Box(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+    z, lowest, highest = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return tuple(blocks), Box(z, lowest, highest, tuple(reasons))
 
 
-def _one(scenario: Scenario, item: Tunable, start: int, dt: float, method: str) -> tuple[Block, tuple[np.ndarray, ...]]:
+def _start_of(scenario: Scenario, item: Tunable) -> tuple[np.ndarray, bool, str | None]:
+    """Where a leaf starts, whether its coordinate is a logarithm, and what sign it has to have."""
     value = np.asarray(paths.get(scenario, item.path), float)
     sign = paths.sign_at(scenario, item.path)
     log = item.scale == "log" if item.scale else sign == "positive"
@@ -132,9 +129,11 @@ def _one(scenario: Scenario, item: Tunable, start: int, dt: float, method: str) 
         raise checks.fail(item.path, value, "values > 0 for a logarithmic scale", 'Use scale="linear".')
     if item.tied and not np.all(value == value.flat[0]):
         value = np.full_like(value, np.exp(np.mean(np.log(value))) if log else np.mean(value))
+    return value, log, sign
+
+
+def _one(item: Tunable, value: np.ndarray, low: np.ndarray, high: np.ndarray, start: int, log: bool) -> tuple[Block, tuple]:
     size = 1 if item.tied else value.size
-    low = _limit(item, "low", item.low, _default_low(item.path, sign), value)
-    high = _limit(item, "high", item.high, lambda: _default_high(scenario, item, value, dt, method), value)
     if not np.all(low < high) or not np.all((low <= value) & (value <= high)):
         raise checks.fail(
             f"tunable({item.path!r})", value, f"a start between its limits {low.tolist()} and {high.tolist()}", "Widen the limits."
@@ -143,47 +142,12 @@ def _one(scenario: Scenario, item: Tunable, start: int, dt: float, method: str) 
     return block, tuple(_coordinate(x.reshape(-1)[:size], log) for x in (value, low, high))
 
 
-def _limit(item: Tunable, name: str, given: Any, default: Any, value: np.ndarray) -> np.ndarray:
-    if given is None:
-        given = default() if callable(default) else default
+def _limit(item: Tunable, name: str, given: Any, value: np.ndarray) -> np.ndarray:
     field = f"tunable({item.path!r}): {name}"
     limit = np.asarray(checks.as_floats(field, given), float)
     if limit.shape not in ((), value.shape):
         raise checks.fail(field, given, f"one number, or shape {value.shape}")
     return np.broadcast_to(limit, value.shape)
-
-
-def _default_low(path: str, sign: str | None) -> float:
-    leaf = re.sub(r"(\[\d+\])+$", "", path)
-    return CONDITIONS.get(leaf, 0.0 if sign in ("positive", "nonnegative") else -np.inf)
-
-
-def _default_high(scenario: Scenario, item: Tunable, value: np.ndarray, dt: float, method: str) -> np.ndarray:
-    """The largest multiple of the start, at most MOST, with which SHARE of the stability range is kept, or a sampled loop stays stable."""
-    if not item.path.startswith(("controller.", "observer.")) or not np.all(value > 0):
-        return np.full(value.shape, np.inf)
-
-    def fits(factor: float) -> bool:
-        changed = with_parameters(scenario, {item.path: jnp.asarray(value * factor)})
-        if changed.sampling is not None:
-            return not sampled_too_slowly(changed)
-        return dt * fastest_along(changed, TIMES) <= SHARE * tableau(method).stability
-
-    if not fits(1.0):
-        return 1.01 * value
-    low, high = 0.0, float(np.log(MOST))
-    if fits(MOST):
-        return MOST * value
-    for _ in range(10):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(float(np.exp(middle))) else (low, middle)
-    return np.exp(low) * value
-
-
-def sampled_too_slowly(scenario: Scenario) -> bool:
-    """Whether the law is sampled and its loop grows from one period to the next."""
-    sampling = scenario.sampling
-    return sampling is not None and not radius_at(scenario, float(sampling.period), TIMES) < 1.0
 
 
 def _coordinate(x: np.ndarray, log: bool) -> np.ndarray:

@@ -115,6 +115,8 @@ class Value(NamedTuple):
     valid: Any = ()
     exact: Any = ()
     """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the margin."""
+    trusted: Any = ()
+    """Share of the runs that were integrated to their end, and stably; 1 where valid."""
 
 
 class Slope(NamedTuple):
@@ -204,7 +206,8 @@ def _loss(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth: j
 
 
 def _value(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth, exact, status) -> Value:
-    valid = jnp.all(status & int(UNTRUSTED) == 0) & jnp.all(jnp.isfinite(smooth))
+    fine = (status & int(UNTRUSTED) == 0) & jnp.all(jnp.isfinite(smooth), axis=-1)
+    valid = jnp.all(fine)
     return Value(
         jnp.where(valid, _loss(formulation, shared, lane, smooth), jnp.inf),
         _objective(formulation, shared, lane, exact),
@@ -214,6 +217,7 @@ def _value(formulation: Formulation, shared: ProblemInputs, lane: Lane, smooth, 
         -jnp.max(exact[:, -1]),
         valid,
         jnp.mean(exact, axis=0),
+        jnp.mean(fine.astype(exact.dtype)),
     )
 
 

@@ -43,9 +43,11 @@ class AtLimit(NamedTuple):
     side: str
     """"lower" or "upper"."""
     limit: float
+    reason: str = ""
+    """What set this end; empty where that is not known."""
 
     def __str__(self) -> str:
-        return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}"
+        return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}" + (f" ({self.reason})" if self.reason else "")
 
 
 @partial(jax.jit, static_argnames=("run", "backend"))
@@ -72,6 +74,8 @@ class TuneSetup:
     confidence: float
     limits: tuple[tuple[float, float], ...] = ()
     """Lower and upper limit of each tuned number, (p, 2), in its unit; empty in results that were saved without."""
+    reasons: tuple[tuple[str, str], ...] = dataclasses.field(default=(), kw_only=True)
+    """What set them, in words, (p, 2); empty in results that were saved without."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,8 +91,8 @@ class TuneResult:
     names: tuple[str, ...]
     """What each coordinate is called, (p,)."""
     history: dict[str, np.ndarray]
-    """Per step, (steps, starts, ...): loss, objective, terms, excess of the requirements, margin [rad], gradient_norm, valid, z and
-    x (the gains tried, in their units); evaluations is (steps,)."""
+    """Per step, (steps, starts, ...), two starts where two searches took turns: loss, objective, terms, excess of the requirements,
+    margin [rad], gradient_norm, valid, z and x (the gains tried, in their units); evaluations is (steps,)."""
     best_start: int
     """Which of the starts won."""
     stopped: str
@@ -104,6 +108,8 @@ class TuneResult:
     residuals: tuple[float, ...] = ()
     """At the end, of "newton": the largest entry of the Lagrangian's gradient by the coordinates z that no limit of a gain holds, the
     largest excess g of a requirement, and the sum of multipliers times distances from the limits; all 0 at an optimum."""
+    probes: int = 0
+    """Values without derivatives that were computed to find where to start, each of `setup.runs` rollouts."""
 
     @property
     def objective(self) -> float:
@@ -130,11 +136,12 @@ class TuneResult:
     def at_limits(self) -> dict[str, AtLimit]:
         """The tuned numbers that sit at an end of their range, by name: a wider range, or a price on what they cost, would move them."""
         found = {}
-        for name, x, ends in zip(self.names, self.tuned, self.setup.limits, strict=False):
+        why = self.setup.reasons or (("", ""),) * len(self.names)
+        for name, x, ends, reasons in zip(self.names, self.tuned, self.setup.limits, why, strict=False):
             width = ends[1] - ends[0] if np.isfinite(ends[1] - ends[0]) else 1.0
-            for side, end in zip(("lower", "upper"), ends, strict=True):
+            for side, end, reason in zip(("lower", "upper"), ends, reasons, strict=True):
                 if np.isfinite(end) and abs(x - end) <= NEAR * (abs(end) or width):
-                    found[name] = AtLimit(float(x), side, float(end))
+                    found[name] = AtLimit(float(x), side, float(end), reason)
         return found
 
     @property
@@ -289,8 +296,9 @@ class TuneResult:
         save_tuning(self, path)
 
     def __repr__(self) -> str:
+        probes = f", {self.probes} probes" if self.probes else ""
         steps, how = len(self.history["evaluations"]), f"{self.optimiser}, {self.mode} mode"
-        lines = [f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {self.stopped})"]
+        lines = [f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations{probes}, {self.seconds:.3g} s; {self.stopped})"]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
