@@ -148,7 +148,7 @@ def limit(dtype):
         text = (FOLDER / "limit" / "paper_loop.cc").read_text()
         for name in ("vector.h", "mathlib.h"):
             text = text.replace(f'#include "{name}"', (Path(lowering.__file__).parent / "c" / name).read_text())
-        library = toolchain.loaded(toolchain.built(f"#define DOUBLE {int(dtype == 'float64')}\n" + text)[0])
+        library = toolchain.loaded(toolchain.built(f"#define DOUBLE {int(dtype == 'float64')}\n" + text, ("-O3",))[0])
     except toolchain.ToolchainError as error:
         print(f"no limit: {error}")
         return None
