@@ -118,6 +118,19 @@ def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
     assert largest_difference(found.q, expected.q) > 1e-5
 
 
+def test_a_locked_joint_in_a_frame_is_held_where_it_is():
+    inner = '<frame pos="0 0.02 0" euler="0 0 0.4"><body name="palm" pos="0.03 0 0" euler="0 0 -0.3"><joint name="wrist" axis="0 0 1"/>'
+    held = f'<frame pos="0.05 0 0" euler="0 0 0.9">{inner}<geom size="0.02" pos="0.1 0 0" mass="0.2"/>{FINGER}</body></frame></frame>'
+    locked = {"wrist": 0.7, "grip": 0.1}
+    arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=held)), tip="fore", locked=locked)
+    scenario = ij.with_parts(PAPER, robot=arm, sampling=ij.Sampling(1e-3))
+    found = ij.cosimulate(scenario, "arm.xml", locked=locked, **TIMING)
+    expected = ij.simulate(scenario, **TIMING)
+    assert largest_difference(found.q, expected.q) < 1e-9
+    elsewhere = ij.cosimulate(scenario, "arm.xml", locked={"wrist": 0.0, "grip": 0.1}, **TIMING)
+    assert largest_difference(elsewhere.q, expected.q) > 1e-5
+
+
 @pytest.fixture(autouse=True)
 def _in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
