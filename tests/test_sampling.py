@@ -15,7 +15,11 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
+from iblf_jax.engine import native
+from iblf_jax.engine.execute import run_batch_jvp
 from iblf_jax.engine.period import radius_at
+from iblf_jax.engine.step import Run
+from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.sampling import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.parameters import layout
@@ -206,6 +210,24 @@ def test_derivatives_are_differences():
         slope = jax.grad(lambda x, path=path, unit=unit: loss({path: x * unit}))(jnp.ravel(here)[0])
         ends = [float(loss({path: here + sign * step * unit})) for sign in (1, -1)]
         assert np.isclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=2e-4), path
+
+
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_derivatives_beside_a_batch_are_those_of_every_backend():
+    sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+    motor = ij.actuators.Motor(bandwidth=800.0)
+    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=7e-4), sensor=sensor, actuator=motor))
+    directions = {"controller.K2": np.eye(3, 2), "sampling.delay": np.eye(3)[2]}
+    varied, folds = {"initial.q": scenario.initial.q + jnp.asarray([[0.0], [0.01]])}, standard()[:1]
+
+    def pushed(backend):
+        run = Run(40, "heun")
+        return jax.jit(lambda v: run_batch_jvp(scenario, v, directions, folds, jnp.asarray(5e-4), run, backend=backend))(varied)
+
+    (_, expected, _), (_, found, _) = pushed("vmap"), pushed("native")
+    assert np.all(np.any(expected["rmse"] != 0, axis=-1))
+    for name, slopes in expected.items():
+        np.testing.assert_allclose(found[name], slopes, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
 def test_rounding_is_left_out_of_derivatives():
