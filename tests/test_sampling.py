@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import native
-from iblf_jax.engine.execute import run_batch_jvp
+from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.metrics import standard
@@ -228,6 +228,20 @@ def test_derivatives_beside_a_batch_are_those_of_every_backend():
     assert np.all(np.any(expected["rmse"] != 0, axis=-1))
     for name, slopes in expected.items():
         np.testing.assert_allclose(found[name], slopes, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_a_run_says_the_same_alone_as_in_a_batch_to_the_bit():
+    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=4e-3, delay=1.3e-3)))
+    starts = scenario.initial.q + 0.01 * jnp.arange(11.0)[:, None]
+
+    @jax.jit
+    def runs(starts):
+        return run_batch(scenario, {"initial.q": starts}, standard()[:1], jnp.asarray(1e-3), Run(40, "heun"), backend="native")
+
+    together, alone = runs(starts), runs(starts[4:5])
+    for name, x in (together.metrics | {"mode": together.fastest_mode}).items():
+        np.testing.assert_array_equal(x[4], (alone.metrics | {"mode": alone.fastest_mode})[name][0], err_msg=name)
 
 
 def test_rounding_is_left_out_of_derivatives():

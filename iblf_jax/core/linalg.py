@@ -28,7 +28,6 @@ def matmul_in_order(left: jax.Array, right: jax.Array, *, written_out: bool = Fa
       left, right: (m, n) and (n, p).
       written_out: XLA sees the terms one by one: more to compile, and in a batch three to six times as fast.
     """
-
     if written_out:
         # The first product is kept apart: of two in one sum a processor may round either, and batches and lone runs would differ.
         total = jax.lax.optimization_barrier(left[:, :1] * right[0])
