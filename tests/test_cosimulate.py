@@ -10,6 +10,7 @@ from arm_cases import ARMS
 import iblf_jax as ij
 
 mujoco = pytest.importorskip("mujoco")
+from iblf_jax.deployment.film import has_shapes
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
@@ -118,6 +119,19 @@ def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
     assert largest_difference(found.q, expected.q) > 1e-5
 
 
+def test_a_locked_joint_in_a_frame_is_held_where_it_is():
+    inner = '<frame pos="0 0.02 0" euler="0 0 0.4"><body name="palm" pos="0.03 0 0" euler="0 0 -0.3"><joint name="wrist" axis="0 0 1"/>'
+    held = f'<frame pos="0.05 0 0" euler="0 0 0.9">{inner}<geom size="0.02" pos="0.1 0 0" mass="0.2"/>{FINGER}</body></frame></frame>'
+    locked = {"wrist": 0.7, "grip": 0.1}
+    arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=held)), tip="fore", locked=locked)
+    scenario = ij.with_parts(PAPER, robot=arm, sampling=ij.Sampling(1e-3))
+    found = ij.cosimulate(scenario, "arm.xml", locked=locked, **TIMING)
+    expected = ij.simulate(scenario, **TIMING)
+    assert largest_difference(found.q, expected.q) < 1e-9
+    elsewhere = ij.cosimulate(scenario, "arm.xml", locked={"wrist": 0.0, "grip": 0.1}, **TIMING)
+    assert largest_difference(elsewhere.q, expected.q) > 1e-5
+
+
 @pytest.fixture(autouse=True)
 def _in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -212,6 +226,17 @@ def test_records_and_films(tmp_path):
     ij.save_rollouts(some, tmp_path / "run.nc")
     with Image.open(tmp_path / "arm.gif") as film:
         assert film.n_frames == 6
+
+
+def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
+    shapes = spec_of(PAPER.plant)
+    bare = mujoco.MjModel.from_xml_path(str(ARMS / "iiwa14.urdf"))
+    assert has_shapes(shapes.compile())
+    assert not has_shapes(bare)
+    shapes.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.1, 0.1])
+    for geom in shapes.geoms:
+        geom.group = 0 if geom.parent == shapes.worldbody else 3
+    assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
 
 
 def test_films_may_follow_each_other(tmp_path):

@@ -15,9 +15,13 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
+from iblf_jax.engine import native
+from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.period import radius_at
+from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import start_and_along
 from iblf_jax.simulation.closed_loop import sampled
+from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.sampling import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.parameters import layout
@@ -211,6 +215,43 @@ def test_derivatives_are_differences():
         slope = jax.grad(lambda x, path=path, unit=unit: loss({path: x * unit}))(jnp.ravel(here)[0])
         ends = [float(loss({path: here + sign * step * unit})) for sign in (1, -1)]
         assert np.isclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=2e-4), path
+
+
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_derivatives_beside_a_batch_are_those_of_every_backend():
+    sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+    motor = ij.actuators.Motor(bandwidth=800.0)
+    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=7e-4), sensor=sensor, actuator=motor))
+    directions = {"controller.K2": np.eye(3, 2), "sampling.delay": np.eye(3)[2]}
+    varied, folds = {"initial.q": scenario.initial.q + jnp.asarray([[0.0], [0.01]])}, standard()[:1]
+
+    def pushed(backend):
+        run = Run(40, "heun")
+        return jax.jit(lambda v: run_batch_jvp(scenario, v, directions, folds, jnp.asarray(5e-4), run, backend=backend))(varied)
+
+    (_, expected, _), (_, found, _) = pushed("vmap"), pushed("native")
+    assert np.all(np.any(expected["rmse"] != 0, axis=-1))
+    for name, slopes in expected.items():
+        np.testing.assert_allclose(found[name], slopes, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.release  # it takes XLA's optimisation to round a batch and a lone run apart
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_a_run_says_the_same_alone_as_in_a_batch_to_the_bit():
+    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=4e-3, delay=1.3e-3)))
+    varied = {"initial.q": scenario.initial.q + 0.01 * jnp.arange(11.0)[:, None], "plant.mass[1]": jnp.linspace(0.6, 1.1, 11)}
+
+    @jax.jit
+    def runs(varied):
+        found = run_batch(scenario, varied, standard()[:1], jnp.asarray(1e-3), Run(400, "rk4"), backend="native")
+        return found.metrics | {"mode": found.fastest_mode}
+
+    together = runs(varied)
+    for i in range(11):
+        for name, x in runs({path: values[i : i + 1] for path, values in varied.items()}).items():
+            # The estimate of the step's error, 1e-9 rad, is rounded differently in short vectors.
+            rtol = 1e-14 if "numerical_error" in name else 0
+            np.testing.assert_allclose(together[name][i], x[0], rtol=rtol, err_msg=name)
 
 
 def test_rounding_is_left_out_of_derivatives():

@@ -70,7 +70,8 @@ def cosimulate(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
       seed: fixes the noise of a sensor, as in `simulate`.
-      film: file to write the motion to, ".gif" or ".html": MuJoCo's picture where it can draw one, the arm's skeleton otherwise.
+      film: file to write the motion to, ".gif" or ".html": MuJoCo's picture where it can draw one and the arm has shapes, the arm's
+        skeleton otherwise.
 
     Returns:
       A `Rollout` as `simulate` gives.  Of MuJoCo's robot nothing is known but how it moves: `fastest_mode` is NaN, there is no

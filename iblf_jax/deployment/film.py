@@ -19,6 +19,10 @@ from iblf_jax.simulation.results import Rollout
 FPS = 25.0
 SIZE = (480, 640)
 """Height and width of a picture [pixels]: MuJoCo's own buffer of a model that says nothing else."""
+SHOWN_GROUPS = 3
+"""Groups of shapes that MuJoCo draws unasked: the first ones."""
+AMBIENT, DIFFUSE = 0.5, 0.6
+"""Of the camera's lamp, at least, in a model without lights: MuJoCo's own leaves a grey arm nearly black."""
 
 
 def film_run(run: Rollout, robot: MujocoPlant, positions: np.ndarray, dt: float, path: Path) -> Path:
@@ -41,8 +45,14 @@ def film_run(run: Rollout, robot: MujocoPlant, positions: np.ndarray, dt: float,
 
 
 def _renderer(robot: MujocoPlant) -> Any:
-    """MuJoCo's renderer; None where nothing can be drawn."""
-    return robot.mujoco.Renderer(robot.model, *SIZE) if _can_draw() else None
+    """MuJoCo's renderer; None where nothing can be drawn, or nothing of the arm can be seen."""
+    return robot.mujoco.Renderer(robot.model, *SIZE) if has_shapes(robot.model) and _can_draw() else None
+
+
+def has_shapes(model: Any) -> bool:
+    """Whether MuJoCo's picture of a model has something that moves: the arm of a URDF whose meshes are not there has no shape."""
+    seen = (model.geom_group < SHOWN_GROUPS) & (model.geom_rgba[:, 3] > 0)
+    return bool(np.any(model.body_weldid[model.geom_bodyid[seen]] > 0))
 
 
 @cache
@@ -61,4 +71,7 @@ def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Itera
         data.qpos[:] = place
         robot.mujoco.mj_forward(robot.model, data)
         renderer.update_scene(data)
+        if not robot.model.nlight:
+            lamp = renderer.scene.lights[0]
+            lamp.ambient, lamp.diffuse = np.maximum(lamp.ambient, AMBIENT), np.maximum(lamp.diffuse, DIFFUSE)
         yield renderer.render().copy()

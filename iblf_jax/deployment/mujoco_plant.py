@@ -250,9 +250,10 @@ def _locked(mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, 
     for j, position in held.items():
         data.qpos[whole.jnt_qposadr[j]] = position
     mujoco.mj_kinematics(whole, data)
+    gone = _in_the_way(mujoco, spec, held)  # before any frame is added, with which the numbers of joints are lost
     for body in {int(whole.jnt_bodyid[j]) for j in held}:
         _weld(mujoco, whole, data, spec, body, held)
-    for x in _in_the_way(mujoco, spec, held):
+    for x in gone:
         spec.delete(x)
     left = [j for j in range(whole.njnt) if j not in held]
     return _compiled(spec, plant), [left.index(j) for j in joints]
@@ -289,11 +290,10 @@ def _weld(mujoco: Any, model: Any, data: Any, spec: Any, body: int, held: dict[i
     if not all(j in held for j in own):
         got, remedy = "a locked joint beside one that moves", "Write each into a body of its own, or lock it at its reference."
         raise checks.fail(f"body {element.name!r}", Shown(got), "joints that are locked alone", remedy)
-    if element.frame is not None:
-        remedy = "Write the body without the <frame>, or lock its joint at its reference."
-        raise checks.fail(f"body {element.name!r}", Shown("a joint locked in a <frame>"), "a body without one", remedy)
     parent, back, turned = int(model.body_parentid[body]), np.zeros(4), np.zeros(4)
     mujoco.mju_negQuat(back, data.xquat[parent])
     mujoco.mju_mulQuat(turned, back, data.xquat[body])
     element.pos = data.xmat[parent].reshape(3, 3).T @ (data.xpos[body] - data.xpos[parent])
     element.quat, element.alt.type = turned, mujoco.mjtOrientation.mjORIENTATION_QUAT
+    if element.frame is not None:  # its place is in the parent now: a frame there that moves nothing takes the other's place
+        element.set_frame(spec.bodies[parent].add_frame())

@@ -26,7 +26,7 @@ from iblf_jax.engine.step import (
     verdict,
 )
 from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.closed_loop import initial_state, surroundings
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME
 
@@ -141,7 +141,8 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]
 
     def around(inputs):
         unseen = accuracy.unseen(inputs.scenario, method, inputs.dt, inputs.steps)
-        return probed(jnp.zeros_like(inputs.dt), initial_state(inputs.scenario), unseen)
+        state = initial_state(inputs.scenario)
+        return probed(jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen)
 
     found = _probed(executor, batch, batch.each(around))
     return batch.each(lambda inputs, found: start(inputs, method, found.jacobian), found), found
@@ -161,9 +162,9 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
     """The outcome after the last step, without records; `at_start` is what a `Probe` has found there."""
 
     def critical(inputs, carry):
-        instants = ((carry.nearest.t, carry.nearest.state), (inputs.dt * inputs.steps, carry.state))
-        nothing = accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3)
-        return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant, nothing) for instant in instants))
+        instants = ((carry.nearest.t, carry.nearest.around), (inputs.dt * inputs.steps, surroundings(carry.state)))
+        watched, nothing = at_start.jacobian.shape[-1], accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant, watched, nothing) for instant in instants))
 
     def judged(inputs, carry, at_start, later):
         instants = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later)

@@ -61,7 +61,8 @@ class Nearest(NamedTuple):
 
     xi: jax.Array
     t: jax.Array
-    state: LoopState
+    around: Any
+    """What `closed_loop.surroundings` gives there."""
 
 
 class Carry(NamedTuple):
@@ -132,7 +133,7 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     if inputs.scenario.sampling is not None:
         jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), there, jacobian)
     estimate = accuracy.begin(method, jacobian, there)
-    return Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(zero), zero, there), estimate)
+    return Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(zero), zero, surroundings(there)), estimate)
 
 
 def _blank_sample(inputs: Inputs, state: LoopState) -> Sample:
@@ -233,7 +234,7 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         begun = _begun_at(index, folds, sample, carry.accumulators)
         accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-        here = Nearest(near, sample.t, jax.lax.stop_gradient(carry.state))
+        here = Nearest(near, sample.t, jax.lax.stop_gradient(surroundings(carry.state)))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
         width, held = sample.upper - sample.lower, scenario.sampling is not None
         estimate = accuracy.observed(carry.accuracy, method, dt, index, pieces, width, held)
@@ -332,9 +333,9 @@ def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
     return stability.growth_rate_by(probed.jacobian) if complete else stability.growth_rate(probed.growth)
 
 
-def probed(time: jax.Array, state: LoopState, unseen: accuracy.Unseen) -> Probed:
-    """The carry of a `Probe`."""
-    x, watched = ravel_pytree(surroundings(state))[0], accuracy.places(state).size
+def probed(time: jax.Array, around: Any, watched: int, unseen: accuracy.Unseen) -> Probed:
+    """The carry of a `Probe` of what `surroundings` gave, of which `accuracy` watches so many numbers."""
+    x = ravel_pytree(around)[0]
     return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype), unseen))
 
 

@@ -9,6 +9,7 @@ number of C99, and `plain_function` gives the function alone.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from types import MappingProxyType
@@ -69,6 +70,8 @@ class _Emitter:
             i: tables.setdefault(self._numbers(node), f"table_{len(tables)}") for i, node in enumerate(program.nodes) if node.op == "lookup"
         }
         self.calls = calls
+        self.in_place: dict[int, int] = {}
+        """Choices that change a carried number where it stands -> the number before."""
         self.end: list[str] = []
         """What stands at the end of every function."""
 
@@ -93,6 +96,12 @@ class _Emitter:
                 names[i] = self.calls.results[i]
                 continue
             args = [names[a] for a in node.args]
+            if i in self.in_place:
+                condition, yes, no = args
+                old, new, unless = (no, yes, "") if node.args[2] == self.in_place[i] else (yes, no, "!")
+                self.lines.append(f"  if ({unless}AT({condition}, 0)) {old} = {new};")
+                names[i] = old
+                continue
             if node.op == "call":
                 self.lines += self.calls.statement(i, args)
                 names[i] = "called"
@@ -236,6 +245,7 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
         e.lines.append(f"  {'F' if kind == 'f' else 'I'} c{c} = {'-' if kind == 'b' else ''}{places[c]};")
         if program.carry[c][0] >= 0:
             names[program.carry[c][0]] = f"c{c}"
+    e.in_place = _in_place(program)
     e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
     e.lines += [e.calls.room, *e.calls.filled(names)] if e.calls.functions else []
     e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
@@ -243,12 +253,30 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
     e.statements(names, [o for _, o in program.carry])
     if program.samples:
         _record(e, names)
-    moved = [(c, names[o]) for c, (a, o) in enumerate(program.carry) if a != o]
+    moved = [(c, names[o]) for c, (a, o) in enumerate(program.carry) if a != o and names[o] != f"c{c}"]
     e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
     e.lines += [f"  c{c} = n{c};" for c, _ in moved]
     e.lines.append("  }")
     e.lines += [f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]]
     return e.function(HEAD_OF_ADVANCE)
+
+
+def _in_place(program: Program) -> dict[int, int]:
+    """Choices, the same for all runs, between a carried number and the next one, where nobody else needs the number before.
+
+    What a sampled law said is so written once a period, not copied in every step.
+    """
+    nodes, classes = program.nodes, program.classes()
+    uses = Counter(a for node in nodes for a in node.args) + Counter(program.samples) + Counter(o for _, o in program.carry)
+    found = {}
+    for a, o in program.carry:
+        node = nodes[o]
+        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & LANE:
+            (new,) = [x for x in node.args[1:] if x != a]
+            # A call whose result is the new number has read the one before.
+            if uses[a] == 1 + (nodes[new].op == "result" and nodes[nodes[new].args[0]].args.count(a)):
+                found[o] = a
+    return found
 
 
 class _Segments:

@@ -141,7 +141,9 @@ class Calls:
         given = {"F": list[str](), "I": list[str]()}
         for place in self.put[k]:
             given[c_type(self.nodes[given_to(node)[place]])].append(args[place])
-        arrays = [f"  {t} {name}{call}[{len(given[t]) + 1}] = {{{', '.join(given[t])}}};" for t, name in (("F", "p"), ("I", "q"))]
+        # Element by element: a list of all makes GCC clear the array before.
+        arrays = [f"  {t} {name}{call}[{len(given[t]) + 1}];" for t, name in (("F", "p"), ("I", "q"))]
+        arrays += [f"  {name}{call}[{k}] = {x};" for t, name in (("F", "p"), ("I", "q")) for k, x in enumerate(given[t])]
         floats, others = self.begins[call]
         made = [*arrays, f"  function_{k}(constants, once, p{call}, q{call}, r + {floats}, s + {others});"]
         return made if condition is None else [f"  if (AT({condition}, 0)) {{", *made, "  }"]

@@ -112,7 +112,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     table = tableau(method)
     none = jnp.zeros((2 * n,), jacobian.dtype)
     if state.held:
-        return Accuracy((none,), none, response(jacobian, n)[:, :n], none[:n], none[0])
+        return Accuracy((none,) if len(table.c) == 1 else (), none, response(jacobian, n)[:, :n], none[:n], none[0])
     pending = (none,) * ((len(table.differences) - 1) // (2 if table.halfway else 1))
     return Accuracy(pending, none, response(jacobian, n), none[:n], none[0])
 
@@ -166,24 +166,27 @@ def _observed_within(
     accuracy: Accuracy, table: Tableau, dt: jax.Array, pieces: list[tuple[jax.Array, list[LoopState]]], width: jax.Array
 ) -> Accuracy:
     """As `observed`, from the stages of one step; a method of one stage is held against the step before."""
-    n, drift, before = width.size, (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending[0]
-    starts: list[jax.Array] = []
+    n, drift, before = width.size, (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending
+
+    def moved(slope: LoopState) -> jax.Array:
+        return _rate(accuracy, slope._replace(observer=(), actuator=()))
+
     for length, slopes in pieces:
-        rates = [_rate(accuracy, slope._replace(observer=(), actuator=())) for slope in slopes]
-        if len(rates) > 1:
+        if before:
+            here = moved(slopes[0])
+            error, before = (here - before[0]) / 2.0, (here,)
+        else:
             late = table.halfway or 1
             later = jax.tree.map(jnp.subtract, slopes[late], slopes[late - 1])
             early = jax.tree.map(jnp.subtract, slopes[1], slopes[0]) if table.halfway else slopes[0]
             sizes = [sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part))) for part in (early, later)]
             fast = jnp.minimum((2.0 if table.halfway else 1.0) * sizes[1] / jnp.maximum(sizes[0], jnp.finfo(dt.dtype).tiny), 2.0)
-            error = (rates[late] - rates[late - 1]) * (fast**2 / 3.0 if table.halfway else fast * 5.0 / 3.0)
-        else:
-            error = (rates[0] - before) / 2.0
-        starts.append(rates[0])
-        before, drift = rates[0], drift + jax.lax.stop_gradient(length) * error
+            error = moved(later) * (fast**2 / 3.0 if table.halfway else fast * 5.0 / 3.0)
+        drift = drift + jax.lax.stop_gradient(length) * error
     size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
     relative = jnp.maximum(accuracy.relative, jnp.max(size / jax.lax.stop_gradient(width)))
-    return Accuracy((starts[0],), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
+    pending = (moved(pieces[0][1][0]),) if before else ()
+    return Accuracy(pending, drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
 class Unseen(NamedTuple):

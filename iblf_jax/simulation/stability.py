@@ -15,6 +15,7 @@ that map, of all that is remembered, is below 1.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -28,11 +29,13 @@ from iblf_jax.simulation.scenario import Scenario
 POWER_ITERATIONS, AVERAGED = 48, 16
 """Steps of the power iteration, and how many of the last are averaged over: a power of two, and a third of the steps."""
 TAYLOR, HALVINGS = 8, 8
-"""Terms of a matrix exponential, and how often its argument is halved before: exact to rounding for |A| t up to 30."""
+"""Terms of a flow, and how often its time is halved before: exact to rounding for |A| t up to 30."""
 SQUARINGS = 20
 """Of a map, for its spectral radius."""
 RADIUS = "sampling_radius"
 """Name of what a sampled run says of this, beside its metrics."""
+product = partial(matmul_in_order, written_out=True)
+"""Of what a sampled loop asks for: up to fifty products of matrices an instant and run."""
 SLOWEST = 1.0
 """1/s.  A loop slower than this still follows a reference."""
 
@@ -99,16 +102,19 @@ def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     return jax.lax.map(lambda unit: along(rate_at, x, unit), jnp.eye(x.size, dtype=x.dtype)).T
 
 
-def exponential(A: jax.Array) -> jax.Array:
-    """The exponential of a matrix, (m, m)."""
-    unit = jnp.eye(len(A), dtype=A.dtype)
-    small = A / 2.0**HALVINGS
+def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
+    """Where x' = A x + B u goes in a time t: its state by the one before and by u, which is held; (m, m + n) for A (m, m) and B (m, n)."""
+    m, scale = len(A), t / 2.0**HALVINGS
+    held = jnp.concatenate([jnp.zeros_like(A), B], axis=1) * scale
+    unit, small = jnp.eye(m, m + B.shape[1], dtype=A.dtype), A * scale
 
-    def next_term(k, total):
-        return unit + matmul_in_order(small, total) / (TAYLOR - k).astype(A.dtype)
+    def next_term(k, found):
+        return unit + (product(small, found) + held) / (TAYLOR - k).astype(A.dtype)
 
-    total = jax.lax.fori_loop(0, TAYLOR, next_term, unit)
-    return jax.lax.fori_loop(0, HALVINGS, lambda _, x: matmul_in_order(x, x), total)
+    def twice(_, found):
+        return product(found[:, :m], found) + jnp.concatenate([jnp.zeros_like(A), found[:, m:]], axis=1)
+
+    return jax.lax.fori_loop(0, HALVINGS, twice, jax.lax.fori_loop(0, TAYLOR, next_term, unit))
 
 
 def spectral_radius(A: jax.Array) -> jax.Array:
@@ -119,7 +125,7 @@ def spectral_radius(A: jax.Array) -> jax.Array:
         power, logarithm = found
         size = jnp.maximum(jnp.max(jnp.abs(power)), tiny)
         power = power / size
-        return matmul_in_order(power, power), logarithm + jnp.log(size) / 2.0 ** k.astype(A.dtype)
+        return product(power, power), logarithm + jnp.log(size) / 2.0 ** k.astype(A.dtype)
 
     _, logarithm = jax.lax.fori_loop(0, SQUARINGS, squared, (A, jnp.zeros((), A.dtype)))
     return jnp.exp(logarithm)
@@ -140,19 +146,19 @@ def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> j
     knows = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
     law, memory = derivative[plant : plant + n, knows], derivative[plant + n :, knows]
 
-    def flow(t: jax.Array) -> jax.Array:
-        """The plant's state after t by its state and by a torque that is held."""
-        return exponential(jnp.block([[A, B], [jnp.zeros((n, plant + n), A.dtype)]]) * t)
-
-    whole = jnp.floor(sampling.delay / sampling.period + 1e-9)
-    late = jnp.maximum(sampling.delay - whole * sampling.period, 0.0)
-    before, after = jax.lax.map(flow, jnp.stack([late, sampling.period - late]))[:, :plant]
-    then, after = after[:, plant:], after[:, :plant]
-    by_state, before = jnp.split(matmul_in_order(after, before), [plant], axis=1)
-    # Commands: the new one first, then those under way.
-    each = [jnp.where(whole == k, then, 0.0) + jnp.where(whole == k - 1, before, 0.0) for k in range(queue + 1)]
+    if queue:
+        whole = jnp.floor(sampling.delay / sampling.period + 1e-9)
+        late = jnp.maximum(sampling.delay - whole * sampling.period, 0.0)
+        before, after = jax.lax.map(partial(flow, A, B), jnp.stack([late, sampling.period - late]))
+        then, after = after[:, plant:], after[:, :plant]
+        by_state, before = jnp.split(product(after, before), [plant], axis=1)
+        # Commands: the new one first, then those under way.
+        each = [jnp.where(whole == k, then, 0.0) + jnp.where(whole == k - 1, before, 0.0) for k in range(queue + 1)]
+    else:
+        by_state, then = jnp.split(flow(A, B, sampling.period), [plant], axis=1)
+        each = [then]
     remembered = size - plant - n
-    moved = jnp.concatenate([by_state, jnp.zeros((plant, remembered), A.dtype)], axis=1) + matmul_in_order(each[0], law)
+    moved = jnp.concatenate([by_state, jnp.zeros((plant, remembered), A.dtype)], axis=1) + product(each[0], law)
     rows = [
         jnp.concatenate([moved, *each[1:]], axis=1),
         jnp.concatenate([memory, jnp.zeros((remembered, queue * n), A.dtype)], axis=1),
