@@ -249,7 +249,7 @@ def test_a_run_says_the_same_alone_as_in_a_batch_to_the_bit():
     together = runs(varied)
     for i in range(11):
         for name, x in runs({path: values[i : i + 1] for path, values in varied.items()}).items():
-            # The estimate of the step's error, 1e-9 rad, is rounded differently in short vectors.
+            # The estimate of the step's error, 1e-9 rad, is rounded by XLA, which compiles the start of a lone run in another way.
             rtol = 1e-14 if "numerical_error" in name else 0
             np.testing.assert_allclose(together[name][i], x[0], rtol=rtol, err_msg=name)
 
