@@ -21,25 +21,17 @@ def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.sum(left[:, :, None] * right[None, :, :], axis=1)
 
 
-def matmul_in_order(left: jax.Array, right: jax.Array, *, written_out: bool = False) -> jax.Array:
-    """The product of two matrices in a loop over its terms: XLA orders those of a reduction by the number of runs beside it.
+def matmul_in_order(left: jax.Array, right: jax.Array) -> jax.Array:
+    """The product of two matrices, term by term: XLA orders those of a reduction by the number of runs beside it.
 
-    Args:
-      left, right: (m, n) and (n, p).
-      written_out: XLA sees the terms one by one: more to compile, and in a batch three to six times as fast.
+    Written out, as XLA then goes over the runs once, not once a term: 4,096 runs of seven joints took 0.67 s before and after their steps
+    with a loop, and take half of that processor time so.
     """
-    if written_out:
-        # The first product is kept apart: of two in one sum a processor may round either, and batches and lone runs would differ.
-        total = jax.lax.optimization_barrier(left[:, :1] * right[0])
-        for k in range(1, len(right)):
-            total = total + left[:, k, None] * right[k]
-        return total
-
-    def add(total, term):
-        column, row = term
-        return total + column[:, None] * row, None
-
-    return jax.lax.scan(add, jnp.zeros((len(left), right.shape[1]), left.dtype), (left.T, right))[0]
+    # The first product is kept apart: of two in one sum a processor may round either, and batches and lone runs would differ.
+    total = jax.lax.optimization_barrier(left[:, :1] * right[0])
+    for k in range(1, len(right)):
+        total = total + left[:, k, None] * right[k]
+    return total
 
 
 def inner(u: jax.Array, v: jax.Array) -> jax.Array:

@@ -34,8 +34,6 @@ SQUARINGS = 20
 """Of a map, for its spectral radius."""
 RADIUS = "sampling_radius"
 """Name of what a sampled run says of this, beside its metrics."""
-product = partial(matmul_in_order, written_out=True)
-"""Of what a sampled loop asks for: up to fifty products of matrices an instant and run."""
 SLOWEST = 1.0
 """1/s.  A loop slower than this still follows a reference."""
 
@@ -109,10 +107,10 @@ def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
     unit, small = jnp.eye(m, m + B.shape[1], dtype=A.dtype), A * scale
 
     def next_term(k, found):
-        return unit + (product(small, found) + held) / (TAYLOR - k).astype(A.dtype)
+        return unit + (matmul_in_order(small, found) + held) / (TAYLOR - k).astype(A.dtype)
 
     def twice(_, found):
-        return product(found[:, :m], found) + jnp.concatenate([jnp.zeros_like(A), found[:, m:]], axis=1)
+        return matmul_in_order(found[:, :m], found) + jnp.concatenate([jnp.zeros_like(A), found[:, m:]], axis=1)
 
     return jax.lax.fori_loop(0, HALVINGS, twice, jax.lax.fori_loop(0, TAYLOR, next_term, unit))
 
@@ -125,7 +123,7 @@ def spectral_radius(A: jax.Array) -> jax.Array:
         power, logarithm = found
         size = jnp.maximum(jnp.max(jnp.abs(power)), tiny)
         power = power / size
-        return product(power, power), logarithm + jnp.log(size) / 2.0 ** k.astype(A.dtype)
+        return matmul_in_order(power, power), logarithm + jnp.log(size) / 2.0 ** k.astype(A.dtype)
 
     _, logarithm = jax.lax.fori_loop(0, SQUARINGS, squared, (A, jnp.zeros((), A.dtype)))
     return jnp.exp(logarithm)
@@ -151,14 +149,14 @@ def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> j
         late = jnp.maximum(sampling.delay - whole * sampling.period, 0.0)
         before, after = jax.lax.map(partial(flow, A, B), jnp.stack([late, sampling.period - late]))
         then, after = after[:, plant:], after[:, :plant]
-        by_state, before = jnp.split(product(after, before), [plant], axis=1)
+        by_state, before = jnp.split(matmul_in_order(after, before), [plant], axis=1)
         # Commands: the new one first, then those under way.
         each = [jnp.where(whole == k, then, 0.0) + jnp.where(whole == k - 1, before, 0.0) for k in range(queue + 1)]
     else:
         by_state, then = jnp.split(flow(A, B, sampling.period), [plant], axis=1)
         each = [then]
     remembered = size - plant - n
-    moved = jnp.concatenate([by_state, jnp.zeros((plant, remembered), A.dtype)], axis=1) + product(each[0], law)
+    moved = jnp.concatenate([by_state, jnp.zeros((plant, remembered), A.dtype)], axis=1) + matmul_in_order(each[0], law)
     rows = [
         jnp.concatenate([moved, *each[1:]], axis=1),
         jnp.concatenate([memory, jnp.zeros((remembered, queue * n), A.dtype)], axis=1),
