@@ -28,7 +28,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import compile_seconds, report
+from _timing import compile_seconds, in_turn, report
 
 import iblf_jax as ij
 from iblf_jax import lowering
@@ -165,18 +165,6 @@ def limit(dtype):
         return x[:, : len(q)]
 
     return run
-
-
-def in_turn(calls: dict[str, Callable], repeats: int) -> dict[str, tuple[float, float]]:
-    """The smallest wall and processor seconds of each call, taken in turn so that a slow moment of the machine meets all of them."""
-    best = dict.fromkeys(calls, (math.inf, math.inf))
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start, cpu = time.perf_counter(), time.process_time()
-            jax.block_until_ready(call())
-            wall, used = best[name]
-            best[name] = min(wall, time.perf_counter() - start), min(used, time.process_time() - cpu)
-    return best
 
 
 def measured(call, repeats: int) -> tuple[float, float]:

@@ -148,11 +148,14 @@ def run_blocks(
       devices: the devices; all of this process if not given.
       record_every: record trajectories instead of metrics.
     """
+    if not blocks:
+        return
     size = block_size()
-    places = list(jax.local_devices() if devices is None else devices)[: max(1, len(blocks))]
+    places = list(jax.local_devices() if devices is None else devices)[: len(blocks)]
     call = partial(_execute, study_run=study_run, record_every=record_every)
     copies = [jax.device_put(shared, place) for place in places]
-    _compile(study_run, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
+    if len(places) > 1:
+        _compile(study_run, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
 
     def results(k: int) -> tuple[Any, int]:
         """Those of block `blocks[k]`, on the host, and how many bytes it took."""
@@ -161,8 +164,6 @@ def run_blocks(
         out = call(copies[place], lanes)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
 
-    if not blocks:
-        return
     first, each = results(0)  # alone: what is compiled is compiled once, and what a block takes is known after it
     yield blocks[0], first
     in_flight = plan.blocks_in_flight(chunk, memory, each, size, len(places))
@@ -187,8 +188,6 @@ def _first_of(waiting: deque[tuple[int, Future]]) -> tuple[int, Any]:
 
 def _compile(study_run: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]) -> None:
     """Compiles the block for several devices at the same time; tracing is done once and shared."""
-    if len(copies) < 2:
-        return
     _execute.trace(copies[0], lanes[0], study_run=study_run, record_every=record_every)
 
     def one(shared, lane):
