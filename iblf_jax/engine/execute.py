@@ -331,9 +331,15 @@ def chosen_backend(
 
 
 def _up_to_the_end(executor: Executor, batch: Batch, run: Run) -> Any:
-    """What needs kernels of a batch: the verdict at the end takes none of its own."""
+    """What needs programs of a batch: the verdict at the end takes none of its own."""
     carry, _ = begin(executor, batch, run.method)
     return executor(TimeStep.of(run), batch, carry, run.steps + 1, None)
+
+
+def _judge_for_xla(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    """An executor that makes the program and goes no further: XLA has nothing to build ahead."""
+    xla.compilable(program_of(step, batch, carry).program)
+    return carry, ()
 
 
 @lru_cache(maxsize=64)
@@ -344,7 +350,11 @@ def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], s
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
 
         def run_on(name):
-            run_lowered(name, _lowered_batch(inputs_of(scenario, folds, dt, run), varied, run), run, go=_up_to_the_end)
+            batch = _lowered_batch(inputs_of(scenario, folds, dt, run), varied, run)
+            if name == "xla":
+                _up_to_the_end(_judge_for_xla, batch, run)
+            else:
+                run_lowered(name, batch, run, go=_up_to_the_end)
             return name
 
         found.append(with_fallback(backend, run_on, lambda: "vmap"))

@@ -8,7 +8,7 @@ products with the quadrant are exact.  Coefficients: S. Moshier, Cephes.  Errors
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +64,9 @@ def _quadrant(s, c, k):
     return lax.select(k & 2 != 0, -y, y)
 
 
-def _near(op: str, x: jax.Array) -> jax.Array:
+# Traced once for every shape: a step has dozens of them.
+@partial(jax.jit, static_argnames="op", inline=True)
+def _near(x: jax.Array, op: str) -> jax.Array:
     s, c, k = _parts(x)
     return _quadrant(s, c, k if op == "sin" else k + 1)
 
@@ -78,7 +80,7 @@ def sines(ops: Sequence[str], xs: Sequence[jax.Array]) -> Sequence[jax.Array]:
 
     One branch for all, which is seldom taken: each costs XLA's compiler more than a sine does.
     """
-    near = [_near(op, x) for op, x in zip(ops, xs, strict=True)]
+    near = [_near(x, op) for op, x in zip(ops, xs, strict=True)]
     is_far = [lax.abs(x) > LIMIT[np.dtype(x.dtype)] for x in xs]
     far = reduce(lax.bitwise_or, is_far)
 

@@ -32,9 +32,7 @@ def run(
     Raises:
       UnsupportedError: the step is too long for XLA.
     """
-    program = written_out(program)
-    if len(program.nodes) > plan.XLA_LONGEST:
-        raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
+    program = compilable(program)
     runs = carry.floats.shape[1]
     width = plan.xla_width(jax.default_backend(), len(program.nodes), runs)
     blocks = -(-runs // width)
@@ -49,6 +47,18 @@ def run(
 
     done, samples = _in_blocks(program, shared, apart(lane), jax.tree.map(apart, carry), steps, every)
     return jax.tree.map(together, done), jax.tree.map(together, samples)
+
+
+def compilable(program: Program) -> Program:
+    """The program without functions, which XLA does not have.
+
+    Raises:
+      UnsupportedError: it is too long for XLA.
+    """
+    program = written_out(program)
+    if len(program.nodes) > plan.XLA_LONGEST:
+        raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
+    return program
 
 
 def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every: int | None) -> tuple[Packed, list[jax.Array]]:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -50,6 +51,10 @@ class Pose(NamedTuple):
     """(3,) [m]."""
     rotation: jax.Array
     """(3, 3); its columns are the frame's axes."""
+
+
+traced_once = partial(jax.jit, inline=True)
+"""For what is asked of an arm alone too: operation by operation it would be hundreds of programs, each compiled by itself."""
 
 
 class Frames(NamedTuple):
@@ -196,6 +201,7 @@ class Arm:
 
     # ------------------------------------------------------------------------------------------------------- where things are
 
+    @traced_once
     def _frames(self, q: jax.Array) -> Frames:
         """Frames of the links and directions of the joints at q."""
         turns = np.array([kind == "revolute" for kind in self.kinds])
@@ -215,6 +221,7 @@ class Arm:
             w, v = jnp.where(turns[:, None], w, jnp.zeros_like(z)), jnp.where(turns[:, None], v, z)
         return Frames(H, jnp.stack([w, v], axis=1))
 
+    @traced_once
     def _bodies(self, frames: Frames) -> tuple[jax.Array, jax.Array]:
         """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the last with all that the tip carries."""
         P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
@@ -224,10 +231,12 @@ class Arm:
         P = jnp.concatenate([P[:-1], P[-1:] + held])
         return spatial.moved(frames.placement, P), P[:, 3, 3:]
 
+    @traced_once
     def _tip_placement(self) -> jax.Array:
         """[R, p] of the tip in the last link's frame, (3, 4)."""
         return spatial.placement(spatial.rotation(self.tip_rotation), self.tip_position)
 
+    @traced_once
     def pose(self, q: jax.Array) -> Pose:
         """Position and orientation of the tip's frame in the base's."""
         H = spatial.joined(self._frames(q).placement[-1], self._tip_placement())
@@ -237,6 +246,7 @@ class Arm:
         """Position of the tip, (3,) [m]."""
         return self.pose(q).position
 
+    @traced_once
     def skeleton(self, q: jax.Array) -> jax.Array:
         """Origins of the joints' frames, then the tip, (n + 1, 3) [m]."""
         return jnp.concatenate([self._frames(q).placement[:, :, 3], self.tip(q)[None]])
@@ -252,6 +262,7 @@ class Arm:
 
     # ---------------------------------------------------------------------------------------------------------------- dynamics
 
+    @traced_once
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
         frames = self._frames(q)
@@ -275,6 +286,7 @@ class Arm:
             forces = L[0] + 0.5 * jnp.sum(spatial.along_wrench(jnp.stack([V, U]), L[1:]), axis=0)
         return _felt(S, forces)
 
+    @traced_once
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the momentum of all beyond it."""
         frames = self._frames(q)
@@ -282,10 +294,12 @@ class Arm:
         V = _moving(S, v)
         return _felt(spatial.along(V, S), spatial.momentum(bodies, V))
 
+    @traced_once
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q) = - g . sum_i m_i c_i, () [J]; zero with all mass at the base's origin."""
         return -jnp.sum(self.g * self._bodies(self._frames(q))[0][:, :, 3])
 
+    @traced_once
     def gravity(self, q: jax.Array) -> jax.Array:
         """G(q), (n,) [N m]."""
         frames = self._frames(q)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import warnings
-from functools import partial
 from typing import Any
 
 import jax
@@ -261,7 +260,7 @@ def canonical(scenario: Scenario) -> Scenario:
     check_values(scenario)
     scenario = with_room(scenario)
     dtype = _shared_dtype(scenario)
-    scenario = _typed(scenario, dtype)
+    scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
     if checks.is_concrete(scenario):
         _check_start(scenario)
         for law in layers(scenario.controller):
@@ -274,10 +273,11 @@ def canonical(scenario: Scenario) -> Scenario:
     return scenario
 
 
-@partial(jax.jit, static_argnames="dtype")
-def _typed(scenario: Scenario, dtype) -> Scenario:
-    """The scenario with every leaf an array of a type: in one call, as one a leaf would take a millisecond."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), scenario)
+def _typed(x: Any, dtype) -> jax.Array:
+    """A leaf as an array of a type; numbers of the host are copied there, as JAX compiles a program for every new shape."""
+    if isinstance(x, jax.Array):
+        return x if x.dtype == dtype and not x.weak_type else jax.lax.convert_element_type(x, np.dtype(dtype))
+    return jnp.asarray(np.array(x, dtype))
 
 
 def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:

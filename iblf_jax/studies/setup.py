@@ -50,7 +50,8 @@ class StudySetup:
     @cached_property
     def shapes(self) -> Results:
         """Shapes and types of what a block leaves."""
-        return jax.eval_shape(partial(_execute, study_run=self.study_run), self.shared, self.lanes(np.arange(block_size())))
+        block = partial(_execute, study_run=self.study_run, record_every=None)  # as `run_blocks` calls it, so that it is traced once
+        return jax.eval_shape(block, self.shared, self.lanes(np.arange(block_size())))
 
     @property
     def bytes_a_case(self) -> float:

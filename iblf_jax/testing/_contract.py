@@ -159,7 +159,12 @@ def same_structure(findings: Findings, label: str, got: Any, like: Any) -> bool:
 
 def in_dtype(tree: Any, dtype: str) -> Any:
     """A pytree with its floating-point numbers in another type."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else jnp.asarray(x), tree)
+
+    def one(x):
+        is_float = jnp.issubdtype(jnp.result_type(x), jnp.floating)
+        return jnp.asarray(np.asarray(x, dtype if is_float else None))  # by NumPy: JAX compiles a program for every shape
+
+    return jax.tree.map(one, tree)
 
 
 def probe(findings: Findings, outputs: Callable, member: Any, args: Sequence[Any], *, rtol: float = 1e-5, seed: int = 0) -> None:
@@ -189,13 +194,13 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
 
     def random_like(x):
         size = np.where(np.isfinite(x), np.maximum(np.abs(x), 0.1), 0.1)  # a limit may be infinite
-        return jnp.asarray(rng.normal(size=np.shape(x)) * size)
+        return rng.normal(size=np.shape(x)) * size
 
     def floats(p):
         return {k: v for k, v in function(p).items() if jnp.issubdtype(v.dtype, jnp.floating)}
 
     direction = jax.tree.map(random_like, point)
-    weights = {k: jnp.asarray(rng.normal(size=v.shape)) for k, v in values.items() if jnp.issubdtype(v.dtype, jnp.floating)}
+    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if jnp.issubdtype(v.dtype, jnp.floating)}
 
     @jax.jit
     def both(point, direction, weights):
@@ -208,15 +213,15 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
     except Exception as error:
         findings.add(f"it cannot be differentiated ({type(error).__name__}: {str(error).splitlines()[0]})", "Use jax.numpy only")
         return
-    ahead = function(jax.tree.map(lambda x, d: x + STEP * d, point, direction))
-    behind = function(jax.tree.map(lambda x, d: x - STEP * d, point, direction))
+    ahead = function(jax.tree.map(lambda x, d: np.asarray(x) + STEP * d, point, direction))
+    behind = function(jax.tree.map(lambda x, d: np.asarray(x) - STEP * d, point, direction))
     for name, slope in forward.items():
         difference = (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * STEP)
         scale = max(1.0, float(np.max(np.abs(difference), initial=0)), float(np.max(np.abs(values[name]), initial=0)))
         apart = float(np.max(np.abs(slope - difference), initial=0))
         remedy = "Is something rounded, cut off, stopped (stop_gradient) or given a wrong custom derivative?"
         findings.require(apart <= rtol * scale, f"the derivative of {name} differs from its finite difference by {apart:.2g}", remedy)
-    along = float(_dot(weights, forward))
+    along = sum(float(np.vdot(weights[k], forward[k])) for k in weights)
     size = max([1.0, *(float(np.max(np.abs(x), initial=0)) for x in forward.values())])
     off = abs(float(reverse) - along)
     remedy = "Look at custom derivatives and at jnp.where over infinities"
@@ -230,9 +235,9 @@ def _dot(a: Any, b: Any) -> Any:
 def _batch(findings, function, values, point) -> None:
     """A batch of three points gives what each gives alone."""
     factors = (1.0, 1.001, 0.999)
-    points = [jax.tree.map(lambda x, c=c: c * x, point) for c in factors]
+    points = [jax.tree.map(lambda x, c=c: c * np.asarray(x), point) for c in factors]
     try:
-        batch = jax.jit(jax.vmap(function))(jax.tree.map(lambda *xs: jnp.stack(xs), *points))
+        batch = jax.jit(jax.vmap(function))(jax.tree.map(lambda *xs: np.stack(xs), *points))
     except Exception as error:
         findings.add(
             f"it does not work under vmap ({type(error).__name__}: {str(error).splitlines()[0]})", "Write it for one run, in jax.numpy"

@@ -135,14 +135,14 @@ def _claims(findings: Findings, barrier: Any, tube: Tube, k1: jax.Array, numbers
     ratio = getattr(barrier, "error_over_slope", lambda tube, q: None)
     if ratio(tube, tube.q_d) is not None:
         q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
-        found, slope = np.asarray(jax.vmap(lambda q: ratio(tube, q))(jnp.asarray(q))), np.asarray(numbers["slope"])
+        found, slope = np.asarray(jax.jit(jax.vmap(lambda q: ratio(tube, q)))(q)), np.asarray(numbers["slope"])
         off = np.abs(found * slope - (q - np.asarray(tube.q_d)))[inside]
         remedy = "It is e1/s inside the wall, written so that it has no 0/0 at e1 = 0"
         findings.require(np.max(off) < 1e-9, f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})", remedy)
         findings.require(np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy)
     bound = getattr(barrier, "xi_bound", lambda V, tube: None)
     if bound(jnp.asarray(V1[0]), tube) is not None:
-        claimed = np.asarray(jax.vmap(lambda V: bound(V, tube))(jnp.asarray(V1)))
+        claimed = np.asarray(jax.jit(jax.vmap(lambda V: bound(V, tube)))(V1))
         kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]
         findings.require(np.all(kept), "|xi| is beyond xi_bound(V1, tube)", "It must hold wherever V1 <= V; return None for no claim")
 
@@ -154,5 +154,5 @@ def _joints_apart(findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1
         ("slope", lambda q: barrier.slope(tube, q)),
         ("virtual_velocity", lambda q: barrier.virtual_velocity(tube, q, k1, o)),
     ):
-        J = np.asarray(jax.jacfwd(function)(q))
+        J = np.asarray(jax.jit(jax.jacfwd(function))(q))
         findings.require(np.all(np.diag(np.diag(J)) == J), f"{label} mixes joints", "It is written joint by joint; the law needs it so")
