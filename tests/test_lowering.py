@@ -227,7 +227,7 @@ def test_classes_of_a_program():
     shapes = Shapes.of(flat, 1)
     classes = p.classes()
     sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
-    assert sines.count(program.LANE | program.TIME) <= 4 < sines.count(program.TIME), "signals of time belong to no run"
+    assert sines.count(program.LANE | program.TIME) <= 8 < sines.count(program.TIME), "signals of time belong to no run"
     assert len(p.carry) == shapes.size
     packed = pack(flat, shapes, jnp.float64, 1)
     assert len(packed.floats) + len(packed.ints) == shapes.size
