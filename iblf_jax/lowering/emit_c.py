@@ -160,7 +160,7 @@ def source(
     program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE, segment: int | None = None
 ) -> str:
     """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of `segment` operations if given."""
-    if target is NATIVE and not segment:  # a function that is called has work enough at any time, and no registers to spare
+    if target is NATIVE and not segment:  # not the functions that it calls: they have work enough at any time, and no registers to spare
         program = scheduled(program)
     layout, tables = Layout.of(program), dict[str, str]()
     calls = Calls(program, layout)
