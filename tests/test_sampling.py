@@ -303,7 +303,7 @@ def test_nothing_is_claimed_of_a_sampled_loop():
     assert certificate.verdict == "not applicable"
     claimed = [line for line in certificate.lines if line.counts]
     assert claimed and all(line.verdict == "not applicable" and "sampled" in line.note for line in claimed)
-    assert 0 <= certificate["V2, sampled less continuous"].value < 0.1
+    assert -1e-12 < certificate["V2, sampled less continuous"].value < 0.1  # at the start they are alike, to rounding
     assert -0.01 < certificate["margin, sampled less continuous"].value < 0.01
 
 

@@ -33,8 +33,7 @@ typedef struct { F q1, q2, v1, v2, n1, n2; } state;
 
 INLINE state slope(const arm *p, const real *r, state x) {
   reduced u = reduce(x.q1), w = reduce(x.q2);
-  F s1 = quadrant_value(u, u.quadrant), c1 = quadrant_value(u, u.quadrant + 1);
-  F s2 = quadrant_value(w, w.quadrant), c2 = quadrant_value(w, w.quadrant + 1), c12 = c1 * c2 - s1 * s2;
+  F s1 = sine_of(u), c1 = cosine_of(u), s2 = sine_of(w), c2 = cosine_of(w), c12 = c1 * c2 - s1 * s2;
   F k = p->p3 * c2, m12 = p->p2 + k, m11 = p->p1 + m12 + k, m22 = p->p2;
   F K = P3 * c2, M12 = K + P2, M11 = M12 + K + P1;
   F sum = x.v1 + x.v2, c_1 = s2 * (x.v2 * x.v1 + sum * x.v2), c_2 = s2 * x.v1 * x.v1;

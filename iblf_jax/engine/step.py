@@ -110,8 +110,8 @@ def sample_status(sample: Sample) -> jax.Array:
 
 def is_sound(state: LoopState) -> jax.Array:
     """Whether a state is finite and slow enough to be a robot's, () bool."""
-    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(moving(state))])
-    return jnp.all(finite) & jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT)
+    slow, others = jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT), jax.tree.leaves((state.q, moving(state)[2:]))
+    return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))
 
 
 def keep_if(condition, new, old):

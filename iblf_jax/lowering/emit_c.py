@@ -18,11 +18,14 @@ import numpy as np
 
 from iblf_jax.lowering.layout import Calls, Layout, literal, places, unpacked
 from iblf_jax.lowering.operations import OPERATIONS
+from iblf_jax.lowering.passes import scheduled
 from iblf_jax.lowering.program import LANE, TIME, Node, Program, UnsupportedError, frontier, needed
 
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
+TURNS = frozenset({"sin", "cos"})
+"""Operations that `mathlib.h` has in two parts: a polynomial, and what takes its place where an angle is huge."""
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
@@ -64,6 +67,8 @@ class _Emitter:
 
     def __init__(self, program: Program, tables: dict[str, str], calls: Calls) -> None:
         self.program = program
+        self.turns = TURNS
+        """Operations of which several are done with one test (`_turned`)."""
         self.classes = program.classes()
         self.lines: list[str] = []
         self.tables = {
@@ -87,8 +92,16 @@ class _Emitter:
     def statements(self, names: dict[int, str], wanted: Iterable[int], stored: Mapping[int, str] = MappingProxyType({})) -> None:
         """Adds statements for `wanted` and what it needs; `stored` has places in memory of some of them."""
         nodes = self.program.nodes
-        for i in self.needed(names, wanted):
+        order = self.needed(names, wanted)
+        turns = [i for i in order if nodes[i].op in self.turns]
+        for i in order:
             node = nodes[i]
+            if i in names:
+                continue
+            together = [j for j in turns if j not in names and nodes[j].args[0] in names] if node.op in self.turns else []
+            if len(together) > 1:
+                self._turned(together, names, stored)
+                continue
             if node.op == "const":
                 names[i] = literal(node, self.program.dtype)
                 continue
@@ -115,6 +128,17 @@ class _Emitter:
             if i in stored:  # at once: a compiler then needs no place of its own for it
                 self.lines.append(f"  {stored[i]} = v{i};")
 
+    def _turned(self, turns: list[int], names: dict[int, str], stored: Mapping[int, str]) -> None:
+        """Adds statements for sines and cosines: all whose angles are there, as one test sees whether any of these is huge."""
+        nodes = self.program.nodes
+        angles = {i: names[nodes[i].args[0]] for i in turns}
+        names |= {i: f"v{i}" for i in turns}
+        self.lines += [f"  F v{i} = near_{nodes[i].op}({angle});" for i, angle in angles.items()]
+        self.lines.append(f"  if (RARELY({' | '.join(f'is_far({angle})' for angle in dict.fromkeys(angles.values()))})) {{")
+        self.lines += [f"    v{i} = {nodes[i].op}_where(is_far({angle}), {angle}, v{i});" for i, angle in angles.items()]
+        self.lines.append("  }")
+        self.lines += [f"  {stored[i]} = v{i};" for i in turns if i in stored]
+
     def function(self, head: str) -> str:
         """The C function of the statements so far."""
         body, self.lines = "\n".join([*self.lines, *self.end]), []
@@ -136,6 +160,8 @@ def source(
     program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE, segment: int | None = None
 ) -> str:
     """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of `segment` operations if given."""
+    if target is NATIVE and not segment:  # not the functions that it calls: they have work enough at any time, and no registers to spare
+        program = scheduled(program)
     layout, tables = Layout.of(program), dict[str, str]()
     calls = Calls(program, layout)
     e = _Emitter(program, tables, calls)
@@ -164,6 +190,7 @@ def plain_function(
     tables = dict[str, str]()
     e = _Emitter(program, tables, Calls(program, Layout.of(program)))
     e.tables = {i: f"{name}_{table}" for i, table in e.tables.items()}
+    e.turns = frozenset()  # each by itself
     names = {i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs}
     wanted = [*(o for _, o in program.carry), *program.samples]
     seen = [p.split()[-1].lstrip("*") for p in parameters]

@@ -8,6 +8,7 @@ derivatives, and zeros of a mechanism (`Builder.absent`): what has no lever move
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -146,11 +147,49 @@ def _not(b: Builder, args, kind):
     return node.args[0] if node.op == "not" else None
 
 
+def _is_finite(b: Builder, args, kind):
+    """Whether a sum is finite: its logarithms have a value, and the rest is.
+
+    No logarithm is above 1e3, and where a sum may overflow its numbers have no digits there.  A status asks so of V, which a run that is
+    not recorded needs for nothing else.
+    """
+    rest, logarithms = _without_logarithms(b, args[0], {})
+    if not logarithms:
+        return None
+    found = [b.emit("is_finite", rest, kind="b")] if rest is not None else []
+    for x in logarithms:
+        found += [b.emit("gt", x, b.constant(-1, "f"), kind="b"), b.emit("lt", x, b.constant(math.inf, "f"), kind="b")]
+    return reduce(lambda one, other: b.emit("and", one, other, kind="b"), found)
+
+
+def _without_logarithms(b: Builder, i: int, known: dict) -> tuple[int | None, list[int]]:
+    """A sum without its terms log1p(x), None if it has no others, and these x; `known`: what was found of its nodes."""
+    if i in known:
+        return known[i]
+    node = b.nodes[i]
+    if node.op == "log1p":
+        known[i] = None, [node.args[0]]
+        return known[i]
+    halved = node.op == "mul" and any(0 < abs(b.value(a) or 0) <= 1 for a in node.args)
+    is_sum = node.kind == "f" and (halved or node.op in ("add", "sub", "neg"))
+    parts = [_without_logarithms(b, a, known) for a in node.args] if is_sum else []
+    logarithms, rests = [x for _, found in parts for x in found], [rest for rest, _ in parts if rest is not None]
+    if not logarithms:
+        known[i] = i, []
+    elif len(rests) == len(parts):
+        known[i] = b.emit(node.op, *rests), logarithms
+    elif halved or not rests:
+        known[i] = None, logarithms
+    else:
+        known[i] = b.emit("neg", rests[0]) if node.op == "sub" and parts[0][0] is None else rests[0], logarithms
+    return known[i]
+
+
 def _extreme(b: Builder, args, kind):
     return args[0] if args[0] == args[1] else None
 
 
 _RULES = {
     "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "abs": _abs, "select": _select,
-    "and": _logic(True), "or": _logic(False), "not": _not, "max": _extreme, "min": _extreme,
+    "and": _logic(True), "or": _logic(False), "not": _not, "is_finite": _is_finite, "max": _extreme, "min": _extreme,
 }  # fmt: skip

@@ -96,9 +96,10 @@ class TwoLink:
 
     def gravity(self, q: jax.Array) -> jax.Array:
         """G(q), (2,) [N m]."""
-        p = self.lumped()
-        outer = p.p5 * self.g * jnp.cos(q[0] + q[1])
-        return jnp.stack([p.p4 * self.g * jnp.cos(q[0]) + outer, outer])
+        p, c1 = self.lumped(), jnp.cos(q[0])
+        # cos(q1 + q2): M and C need cos q2 and sin q2 too, and a third angle costs more than two products.
+        outer = p.p5 * self.g * (c1 * jnp.cos(q[1]) - jnp.sin(q[0]) * jnp.sin(q[1]))
+        return jnp.stack([p.p4 * self.g * c1 + outer, outer])
 
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q) = p4 g sin q1 + p5 g sin(q1 + q2), () [J]."""

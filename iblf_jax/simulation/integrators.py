@@ -86,11 +86,9 @@ def _unrolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
 
 def _combine(state, dt, weights, slopes):
     def one(x, *ks):
-        total = None
-        for weight, k in zip(weights, ks, strict=True):
-            if weight != 0.0:
-                total = weight * k if total is None else total + weight * k
-        return x if total is None else x + dt * total
+        # Weights times dt are shared by all numbers and runs; x is added last, so that it is rounded once.
+        terms = [weight * dt * k for weight, k in zip(weights, ks, strict=True) if weight != 0.0]
+        return x + sum(terms[1:], terms[0]) if terms else x
 
     return jax.tree.map(one, state, *slopes)
 

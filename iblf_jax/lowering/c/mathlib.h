@@ -83,24 +83,31 @@ INLINE reduced reduce(F x) {
   return out;
 }
 
-INLINE F quadrant_value(reduced a, I q) {
-  I swapped = (q & 1) != 0;
-  F y = swapped ? a.c : a.s;
-  return from_bits(bits(y) ^ ((q & 2) << (8 * (int)sizeof(real) - 2)));
+/* Every second quadrant takes the other polynomial, every second pair of them the other sign. */
+#define TO_SIGN (8 * (int)sizeof(real) - 2)
+INLINE F sine_of(reduced a) {
+  F y = (a.quadrant & 1) != 0 ? a.c : a.s;
+  return from_bits(bits(y) ^ ((a.quadrant << TO_SIGN) & SIGN_BIT));
 }
-/* Of x, the polynomial's y being right up to SINCOS_LIMIT; the C library's where it is not, or infinite. */
+INLINE F cosine_of(reduced a) {
+  F y = (a.quadrant & 1) != 0 ? a.s : a.c;
+  return from_bits(bits(y) ^ (((a.quadrant << TO_SIGN) + ((integer)1 << TO_SIGN)) & SIGN_BIT));
+}
+/* Right up to SINCOS_LIMIT; beyond it, and where x is infinite, the C library's, of x, takes the place of y.  One test does for several angles
+   (`emit_c`). */
+INLINE F near_sin(F x) { return sine_of(reduce(x)); }
+INLINE F near_cos(F x) { return cosine_of(reduce(x)); }
+INLINE I is_far(F x) { return MASK(f_abs(x) > splat(SINCOS_LIMIT)); }
+#define RARELY(which) __builtin_expect(any_run(which), 0)
 LANEWISE_WHERE(sin_where, sin)
 LANEWISE_WHERE(cos_where, cos)
-INLINE I is_far(F x) { return MASK(f_abs(x) > splat(SINCOS_LIMIT)); }
 INLINE F f_sin(F x) {
-  reduced a = reduce(x);
-  F y = quadrant_value(a, a.quadrant);
-  return __builtin_expect(any_run(is_far(x)), 0) ? sin_where(is_far(x), x, y) : y;
+  F y = near_sin(x);
+  return RARELY(is_far(x)) ? sin_where(is_far(x), x, y) : y;
 }
 INLINE F f_cos(F x) {
-  reduced a = reduce(x);
-  F y = quadrant_value(a, a.quadrant + 1);
-  return __builtin_expect(any_run(is_far(x)), 0) ? cos_where(is_far(x), x, y) : y;
+  F y = near_cos(x);
+  return RARELY(is_far(x)) ? cos_where(is_far(x), x, y) : y;
 }
 INLINE F f_tan(F x) { return f_sin(x) / f_cos(x); }
 
