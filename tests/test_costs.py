@@ -73,8 +73,9 @@ CALLS = {
     "simulate": lambda paper: ij.simulate(paper, duration=0.1, dt=1e-3),
     "certify": lambda paper: ij.certify(paper, duration=0.1, dt=1e-3),
     "monte_carlo": lambda paper: ij.monte_carlo(paper, UNKNOWN, runs=32, duration=0.1, dt=1e-3, progress=False),
-    "tune": lambda paper: ij.tune(paper, ["controller.K2"], ij.objectives.tracking(), duration=0.1, dt=1e-3, iterations=2, progress=False),
+    "tune": lambda paper: ij.tune(paper, ["controller.K2"], ij.objectives.tracking(), iterations=2, progress=False, **SHORT).report,
 }
+SHORT = {"duration": 0.1, "dt": 1e-3}
 UNKNOWN = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
 OPERATION = re.compile(r"^\s*(?:%\S+ = )?\"?(?:stablehlo|chlo|func\.call|call)\b", re.MULTILINE)
 SLACK = 1.02

@@ -129,11 +129,21 @@ All arrays have the run axis first, records then the time axis; `every` is None 
 
 def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
     """What a `Probe` of every run has found."""
-    leaves = batch.leaves
+    leaves = _without_folds(batch.leaves)
     shared, lane = jax.lax.stop_gradient((leaves.shared, leaves.lane))
     batch = batch._replace(leaves=leaves._replace(shared=shared, lane=lane))
     steps = probe_steps(leaves.first.scenario)
     return executor(Probe(), batch, carry, steps, None)[0]
+
+
+def _without_folds(leaves: Leaves) -> Leaves:
+    """The leaves of inputs without what a `Probe` does not read: one program of it serves all metrics and derivatives."""
+    places: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_lane)))
+    kept, treedef = jax.tree.flatten(places._replace(folds=(), noise=(), direction=()))
+    shared, lane = iter(leaves.shared), iter(leaves.lane)
+    values = [next(lane if is_lane else shared) for is_lane in leaves.is_lane]
+    is_lane = tuple(leaves.is_lane[i] for i in kept)
+    return Leaves(treedef, is_lane, [values[i] for i in kept if not leaves.is_lane[i]], [values[i] for i in kept if leaves.is_lane[i]])
 
 
 def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]:

@@ -125,7 +125,8 @@ def run_lowered(name: str, batch: Batch, run: Run, program: Program | None = Non
     """
     if name == "native":
         program = program or _program(batch, run)
-        native.ahead(program, Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size, batch.runs or 1)
+        sizes = Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size
+        native.ahead(program, *sizes, batch.runs or 1, run.steps + 1)
     try:
         return (go or run_all)(executor_named(name), batch, run)
     except BaseException:

@@ -39,13 +39,13 @@ def _text(program: Program, shared: int, lane: int, narrow: bool) -> tuple[str, 
     return source(program, shared, lane, segment=segment), flags
 
 
-def _is_narrow(program: Program, runs: int) -> bool:
-    return runs * program.dtype.itemsize <= plan.NATIVE_NARROW
+def _is_narrow(program: Program, runs: int, steps: int) -> bool:
+    return runs * program.dtype.itemsize <= plan.NATIVE_NARROW and steps > plan.NATIVE_FEW
 
 
-def ahead(program: Program, shared: int, lane: int, runs: int) -> None:
+def ahead(program: Program, shared: int, lane: int, runs: int, steps: int) -> None:
     """Starts to build the kernel of a program that `run` will be asked for."""
-    build_ahead(*_text(program, shared, lane, _is_narrow(program, runs)))
+    build_ahead(*_text(program, shared, lane, _is_narrow(program, runs, steps)))
 
 
 @lru_cache(maxsize=64)
@@ -55,7 +55,7 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
     Args:
       program: what a step does.
       shared, lane: how many numbers of each kind of leaf go in.
-      narrow: for one or two runs, in short vectors.
+      narrow: for one or two runs of many steps, in short vectors.
 
     Raises:
       ToolchainError: no compiler, or an error from it.
@@ -112,7 +112,7 @@ def run(
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every `every`-th step.
     """
     runs = carry.floats.shape[1]
-    name = kernel(program, shared.size, lane.shape[0], _is_narrow(program, runs))
+    name = kernel(program, shared.size, lane.shape[0], _is_narrow(program, runs, steps))
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(program, runs, steps, every)
     settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
     floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, jnp.asarray(settings))

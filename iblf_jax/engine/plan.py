@@ -65,6 +65,8 @@ NATIVE_STRETCH, NATIVE_GROUP = 128, 32
 512 steps and 8 to 128 blocks take the same time within 5 % (the paper's loop)."""
 NATIVE_NARROW = 16
 """Bytes of the runs of a batch up to which they are stepped in vectors of that length: a processor's longest would be mostly copies."""
+NATIVE_FEW = 80
+"""Steps up to which they are not: so few take less time than a build of their own, and a `Probe` of a run serves a batch too."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
 GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100
@@ -92,6 +94,9 @@ SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
 """Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that a sweep has at least, if it is large."""
 TUNE_TOGETHER = 16
 """Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a processor's vectors hold."""
+TUNE_FRESH = 10_000_000
+"""Steps up to which fresh runs are made in the shape of a search's values: half a second of work for the paper's scenario, where XLA
+compiles a block of them in 1.5 s."""
 CERTIFY_STRETCH = 1024
 """Steps that a certificate looks at together: memory does not grow with the length of a run, and one program serves every length."""
 CERTIFY_RECORDED = 20_000
@@ -194,7 +199,7 @@ def native_build(nodes: int, narrow: bool) -> tuple[int | None, tuple[str, ...]]
 
     Args:
       nodes: of the step.
-      narrow: for so few runs that they fill a short vector.
+      narrow: for so few runs, of many steps, that they fill a short vector.
     """
     sizes = (f"-DSTRETCH={NATIVE_STRETCH}", f"-DGROUP={NATIVE_GROUP}", *((f"-DVECTOR_BYTES={NATIVE_NARROW}",) if narrow else ()))
     return NATIVE_SEGMENT if nodes > NATIVE_LONG else None, sizes
@@ -228,7 +233,23 @@ def differentiates_forward(numbers: int) -> bool:
 
 def starts_together(starts: int, runs: int) -> int:
     """Starts of a tuning, of so many runs each, that are evaluated at once."""
-    return min(starts, -(-TUNE_TOGETHER // runs))
+    return min(starts, values_together(runs))
+
+
+def values_together(runs: int) -> int:
+    """Points of a tuning, of so many runs each, of which values are computed at once."""
+    return -(-TUNE_TOGETHER // runs)
+
+
+def fresh_together(platform: str, steps: int, compiled: int) -> int:
+    """Runs of a tuning's report that are made at once.
+
+    Args:
+      platform: as JAX names it.
+      steps: of all of them.
+      compiled: how many the search made at once for its values.
+    """
+    return compiled if steps <= TUNE_FRESH else study_block(platform)
 
 
 def checkpoint_edge(steps: int) -> tuple[int, int]:

@@ -26,7 +26,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -40,7 +39,7 @@ from iblf_jax.tuning._tune import Problem, build, look_around, make_method
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.optimise import CountedProblem, Loop
 from iblf_jax.tuning.parameters import Block, Tunable, in_units, names_of, values_at
-from iblf_jax.tuning.problem import NO_LEVEL, NUMBERS_A_RUN, Value, value
+from iblf_jax.tuning.problem import NO_LEVEL, NUMBERS_A_RUN, Value
 from iblf_jax.tuning.robust import Risk
 
 GIVEN = 1e-3
@@ -152,7 +151,7 @@ def pareto(
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
     tolerance, pair = checks.positive_number("tolerance", tolerance, "1", zero=True), _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
-    problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, levels=True, mode="forward")
+    problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, levels=True)
     if not differentiates_forward(len(problem.box.z)):
         raise checks.fail("parameters", f"{len(problem.box.z)} numbers", f"at most {FORWARD_MOST} for a front", "Tie or leave out some.")
     checks.fits("points", points, 8.0 * BETWEEN * problem.runs * NUMBERS_A_RUN)
@@ -266,9 +265,7 @@ class Search:
         along = np.concatenate([[0.0], np.cumsum(size)])
         at = (np.arange(count) + 0.5) / count * along[-1]
         z = np.stack([np.interp(at, along, x) for x in self.z[curve].T], axis=1)
-        problem = self.problem
-        seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(z), formulation=problem.formulation))
-        self._values(z, seen)
+        self._values(z, self.problem.values(z))
 
     def front(self, seconds: float) -> Front:
         """What no other trial beats."""

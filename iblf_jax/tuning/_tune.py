@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.plan import BACKENDS, differentiates_forward
+from iblf_jax.engine.plan import BACKENDS, differentiates_forward, values_together
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import check_step, has_noise
@@ -39,11 +39,8 @@ from iblf_jax.tuning.problem import (
     Formulation,
     Lane,
     ProblemInputs,
-    Slope,
     Value,
-    gradient,
     piece_counts,
-    slope,
     value,
 )
 from iblf_jax.tuning.ranges import sampled_too_slowly
@@ -155,12 +152,14 @@ def tune(
     if callback is not None and not callable(callback):
         raise checks.fail("callback", callback, "a function that is called with the loop after each step")
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
-    problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing, mode=mode)
+    problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
     checks.fits("starts", starts, 8.0 * len(problem.box.z) * NUMBERS_A_RUN)
     # With a checkpoint too: what is looked at is no part of it, and the same again.
     probes = problem.probes(seed) if starts == 1 and optimiser == "newton" and problem.has_valleys else None
     z = starting_points(problem.box, starts, seed) if probes is None else np.stack([probes.points[0]] * 2)
+    # Values alone: who is refused has waited for one small kernel.
+    z = way_in(problem, seed, z, problem.at_start if probes is None else probes.first)
     radius = probing.FIRST_RADIUS if problem.has_valleys else newton.FIRST_RADIUS
     method_ = make_method(optimiser, problem.box, iterations, tolerance, learning_rate, problem.limits, problem.runs, radius)
     # The line search of L-BFGS is a loop of JAX's around the problem.
@@ -168,7 +167,6 @@ def tune(
     evaluator = CountedProblem(formulation, problem.shared, problem.lanes(z), mode)
     stages = sharpenings if method_.converges and is_smoothed(problem.shared.objective) else 0
     loop = Loop(evaluator, method_, z, resample=resample, sharpenings=stages)
-    loop.rescue = partial(way_in, problem, seed)
     if probes is not None:
         loop.take_turns(probes.best)
     options = (optimiser, mode, starts, tolerance, learning_rate, resample, stages, iterations if optimiser == "adam" else 0)
@@ -238,9 +236,24 @@ class Problem:
         """Whether it is to be expected that searches from different starts end at different gains."""
         return bool(self.formulation.shares) and len(self.box.z) >= probing.LEAST
 
+    def values(self, z: np.ndarray) -> Value:
+        """The problem without derivatives at some points, (S, p), as arrays; so many at once that few shapes are compiled."""
+        # Where many points will be looked at, what they take serves one too.
+        many = len(z) > 1 or self.runs > 1 or self.has_valleys or self.formulation.levels
+        group, parts = values_together(self.runs) if many else 1, []
+        for first in range(0, len(z), group):
+            lanes = self.lanes(np.resize(z[first : first + group], (group, z.shape[1])))
+            parts.append(jax.tree.map(np.asarray, value(self.shared, lanes, formulation=self.formulation)))
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(z)], *parts)
+
+    @cached_property
+    def at_start(self) -> Value:
+        """The problem where it starts, (1, ...)."""
+        return self.values(self.box.z[None])
+
     def probes(self, seed: int) -> Probes:
         """Values around the start."""
-        return Probes(lambda z: value(self.shared, self.lanes(z), formulation=self.formulation), self.box, seed, self.too_slow)
+        return Probes(self.values, self.box, seed, self.too_slow)
 
     @property
     def limits(self) -> Pieces:
@@ -259,9 +272,7 @@ class Problem:
         return Lane(np.asarray(z, dtype), index, weights, lam, mu, level)
 
 
-def build(
-    scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, *, levels: bool = False, mode="auto"
-) -> Problem:
+def build(scenario, parameters, objective, perturbations, runs: int, seed: int, risk, timing, *, levels: bool = False) -> Problem:
     """Checks what `tune` and its relatives were asked for; `timing` is duration, dt, method and, if it is not "auto", backend."""
     tableau(timing["method"])
     checks.one_of("backend", timing.get("backend", "auto"), BACKENDS)
@@ -289,9 +300,7 @@ def build(
     again = {"duration": timing["duration"], "method": timing["method"], "perturbations": perturbations, "seed": seed}
     problem = Problem(formulation, inputs, box, runs, partial(recommended_dt, scenario, **again))
     if not is_complete(goal):
-        derive = slope if choose(mode, "auto", len(box.z), False)[0] == "forward" else gradient
-        start = np.asarray(derive(problem.shared, problem.lanes(box.z[None]), formulation=formulation).value.exact[0])
-        goal = complete(goal, start[: len(goal.terms)])
+        goal = complete(goal, problem.at_start.exact[0, : len(goal.terms)])
         problem.shared = problem.shared._replace(objective=jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
     return problem
 
@@ -334,8 +343,8 @@ def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
     return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
 
 
-def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarray | None:
-    """Better starting points where the first one leaves its bounds, cannot be integrated or is sampled too slowly, else None.
+def way_in(problem: Problem, seed: int, z: np.ndarray, first: Value) -> np.ndarray:
+    """The starting points, (S, p), or better ones where the first one leaves its bounds, cannot be integrated or is sampled too slowly.
 
     Past the wall the motion is chaotic, and so it is where it grows from sample to sample: its gradient points nowhere.  So SCREENED points
     of the box are looked at, values only, and the starts are those that are stable and break the requirements and the bounds least.
@@ -343,8 +352,8 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, found: Slope) -> np.ndarr
     Raises:
       ValueError: as `look_around`.
     """
-    if found.value.valid[0] and found.value.margin[0] > 0 and not problem.too_slow(z[0]):
-        return None
+    if first.valid[0] and first.margin[0] > 0 and not problem.too_slow(z[0]):
+        return z
     points, seen, broken = look_around(problem, seed, z)
     slow = np.array([problem.too_slow(point) for point in points])
     order = np.lexsort((seen.objective, broken, slow, ~seen.valid))
@@ -361,7 +370,7 @@ def look_around(problem: Problem, seed: int, z: np.ndarray) -> tuple[np.ndarray,
     low = np.where(np.isfinite(box.low), box.low, box.z - 3 * SPREAD)
     high = np.where(np.isfinite(box.high), box.high, box.z + 3 * SPREAD)
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
-    seen = jax.tree.map(np.asarray, value(problem.shared, problem.lanes(points), formulation=problem.formulation))
+    seen = problem.values(points)
     if not np.any(seen.valid):
         raise problem.too_stiff(float(np.max(seen.trusted)))
     return points, seen, np.max(np.maximum(seen.exact_excess, 0.0), axis=1, initial=0.0) + np.maximum(-seen.margin, 0.0)

@@ -144,8 +144,6 @@ class Loop:
         }
         self.penalised = method.penalised
         self.history: dict[str, list[np.ndarray]] = {}
-        self.rescue: Callable[[np.ndarray, Slope], np.ndarray | None] = lambda z, found: None
-        """Called with the first step's points and what they gave; better starting points, or None."""
         self.second: Callable[[np.ndarray], np.ndarray | None] | None = None
         """Called where the first start began and ended, (2, p); where the second begins, or None."""
 
@@ -215,10 +213,7 @@ class Loop:
         improved = self._keep_best(z, found, tolerance)
         state["stale"] = np.asarray(0) if improved else state["stale"] + 1
         self._record(z, found)
-        better = self.rescue(z, found) if int(state["iteration"]) == 0 else None
-        if better is not None:
-            state["method"] = self.method.init(better)
-        for s in range(len(z) if better is None else 0):
+        for s in range(len(z)):
             self._outer(s, found)
         if self.second is not None and not state["stage"]:
             self._turn(self.second)

@@ -21,8 +21,8 @@ from iblf_jax.tuning.problem import Value
 
 LEAST = 6
 """Gains from which on there may be valleys enough.  Three problems of six: one of them 4 % better, the others as good without."""
-A_GAIN, GROUP = 14, 32
-"""Points a gain, and how many are computed at once; their number is a multiple of it, so that one shape is compiled."""
+A_GAIN = 14
+"""Points a gain."""
 FIRST_RADIUS = 0.5
 """Of the first step of `newton`, where there are valleys."""
 REACH = 1.5
@@ -45,16 +45,18 @@ class Probes:
 
     def __init__(self, value: Callable[[np.ndarray], Value], box: Box, seed: int, too_slow: Callable[[np.ndarray], bool]):
         size = len(box.z)
-        count = -(-A_GAIN * size // GROUP) * GROUP
+        count = A_GAIN * size
         drawn = box.z + np.random.default_rng([seed, 4]).uniform(-REACH, REACH, (count - 1, size))
         points = np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
-        parts = [jax.tree.map(np.asarray, value(points[i : i + GROUP])) for i in range(0, count, GROUP)]
-        seen = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        seen = value(points)
         excess = np.sum(np.maximum(seen.exact_excess, 0.0), axis=1)
         merit = seen.objective + RHO * np.abs(seen.objective) * excess
         fine = seen.valid & np.isfinite(merit) & (seen.margin > 0)
         # Where none is fine, the start's own comes first.
-        self.points, self.count, self.too_slow = points[np.argsort(np.where(fine, merit, np.inf), kind="stable")], count, too_slow
+        order = np.argsort(np.where(fine, merit, np.inf), kind="stable")
+        self.points, self.count, self.too_slow = points[order], count, too_slow
+        self.first = jax.tree.map(lambda x: x[order[:1]], seen)
+        """What the first of them gave, (1, ...)."""
 
     def best(self, away_from: np.ndarray) -> np.ndarray | None:
         """The best of them, (p,), that is APART from all of some points, (k, p); None if none is."""

@@ -34,8 +34,10 @@ from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch, run_for_reverse
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.step import Run
+from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
-from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.metrics import Torque
+from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
@@ -159,11 +161,19 @@ def _fold(formulation: Formulation, shared: ProblemInputs) -> tuple[Quantities, 
 def _varied(formulation: Formulation, shared: ProblemInputs, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
     """Path -> value for one run."""
     point = {path: x.astype(shared.dt.dtype) for path, x in values_at(formulation.blocks, z).items()}
-    noise = noise_of(shared.cases.scenario, shared.cases.key, index)
-    if not formulation.targets:
-        return point | noise
-    made, _, _ = draw(shared.cases, formulation.targets, index, point, {})
-    return merge(shared.cases.scenario, point, made) | noise
+    return _drawn(shared.cases, formulation.targets, point, index)[0]
+
+
+def _drawn(cases: Cases, targets: tuple[Target, ...], point: dict[str, jax.Array], index: jax.Array, nominal: bool = False):
+    """Path -> value for one run with the leaves of a point, and whether its draws were admissible."""
+    noise = noise_of(cases.scenario, cases.key, index)
+    if not targets:
+        return point | noise, jnp.asarray(True)
+    made, _, admissible = draw(cases, targets, index, point, {})
+    if nominal:
+        scenario = with_parameters(cases.scenario, point)
+        made, admissible = {path: jnp.asarray(get(scenario, path)) for path in made}, jnp.asarray(True)
+    return merge(cases.scenario, point, made) | noise, admissible
 
 
 def _of_lanes(formulation: Formulation, shared: ProblemInputs, lanes: Lane):
@@ -257,22 +267,56 @@ def _over_levels(formulation: Formulation, shared: ProblemInputs, lane: Lane, sm
     return excess, jnp.zeros((len(smooth), *slopes.shape), smooth.dtype).at[0].set(slopes)
 
 
-@partial(jax.jit, static_argnames="formulation")
+class Rollouts(NamedTuple):
+    """What runs give, (R, ...)."""
+
+    smooth: Any
+    exact: Any
+    """Each quantity, the last minus the margin, (R, K + 1)."""
+    peak_torque: Any
+    """Joint by joint, (R, n)."""
+    relative_error: Any
+    """What the step made of each run, as a part of its tube."""
+    status: Any
+    fastest_mode: Any
+
+
+@partial(jax.jit, static_argnames=("run", "backend"))
+def rollouts(scenario: Scenario, varied: dict[str, jax.Array], objective: Objective, dt: jax.Array, *, run: Run, backend: str) -> Rollouts:
+    """Runs without derivatives: what a search, and the report on what it found, have in common.
+
+    Args:
+      scenario, varied, dt, run, backend: as `run_batch`.
+      objective: complete.
+    """
+    folds = (*fold_of(objective, dt.dtype, run.steps * dt), Torque())
+    outcome = run_batch(scenario, varied, folds, dt, run, backend=backend)
+    smooth, exact, peak_torque, error = (outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque", RELATIVE))
+    return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode)
+
+
+@partial(jax.jit, static_argnames=("targets", "nominal"))
+def drawn(cases: Cases, points: dict[str, jax.Array], index: jax.Array, *, targets: tuple[Target, ...], nominal: bool):
+    """Path -> values of runs by their points (R, ...) and numbers (R,), drawn or `nominal`, and whether their draws were admissible."""
+    return jax.vmap(lambda point, i: _drawn(cases, targets, point, i, nominal))(points, index)
+
+
 def value(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
-    fold = _fold(formulation, shared)
-    varied = _flat(_of_lanes(formulation, shared, lanes))
-    outcome = run_batch(
-        shared.cases.scenario,
-        varied,
-        fold,
-        shared.dt,
-        Run(formulation.steps, formulation.method, mechanism=formulation.mechanism),
-        backend=formulation.backend,
-        nested=formulation.nested,
-    )
-    smooth, exact, _ = (outcome.metrics[name].reshape(*lanes.index.shape, -1) for name in Quantities.units)
-    status = outcome.status.reshape(lanes.index.shape)
+    run = Run(formulation.steps, formulation.method, mechanism=formulation.mechanism)
+    varied = _flat_varied(shared, lanes, formulation=formulation)
+    found = rollouts(shared.cases.scenario, varied, shared.objective, shared.dt, run=run, backend=formulation.backend)
+    return _values(shared, lanes, found, formulation=formulation)
+
+
+@partial(jax.jit, static_argnames="formulation")
+def _flat_varied(shared: ProblemInputs, lanes: Lane, *, formulation: Formulation) -> dict[str, jax.Array]:
+    return _flat(_of_lanes(formulation, shared, lanes))
+
+
+@partial(jax.jit, static_argnames="formulation")
+def _values(shared: ProblemInputs, lanes: Lane, found: Rollouts, *, formulation: Formulation) -> Value:
+    smooth, exact, status = (x.reshape(*lanes.index.shape, *x.shape[1:]) for x in (found.smooth, found.exact, found.status))
     return jax.vmap(partial(_value, formulation, shared))(lanes, smooth, exact, status)
 
 

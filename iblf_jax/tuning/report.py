@@ -15,20 +15,26 @@ upper Clopper-Pearson limit of its breaking is within what is allowed, fails if 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import checks
 from iblf_jax.core.status import Status
-from iblf_jax.engine.simulate import simulate
-from iblf_jax.simulation.metrics import Margin, Torque
-from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.monte_carlo import monte_carlo
+from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.plan import fresh_together
+from iblf_jax.engine.step import Run
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.studies.draws import Cases, targets_of
+from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.quantities import Quantities
+from iblf_jax.tuning.problem import Rollouts, drawn, rollouts
 from iblf_jax.tuning.robust import Risk, worst_share
 
 
@@ -164,23 +170,55 @@ APART = 0.01
 """By how much the objective may differ at half the step before the report warns."""
 
 
-class _Sample:
+class _Sample(NamedTuple):
     """What a report needs of N runs with one set of gains."""
 
-    def __init__(self, exact: np.ndarray, status: np.ndarray, margin: np.ndarray, torque: np.ndarray, made: np.ndarray):
-        self.exact, self.status, self.margin, self.torque, self.made = exact, status, margin, torque, made
+    exact: np.ndarray
+    """Of each quantity of the objective, and minus the margin, (N, K + 1)."""
+    torque: np.ndarray
+    """The largest of each joint, (N, n)."""
+    status: np.ndarray
+    made: np.ndarray
+
+    @property
+    def margin(self) -> np.ndarray:
+        """Of each run, (N,) [rad]."""
+        return -self.exact[:, -1]
 
 
-def _run(scenario: Scenario, objective: Objective, perturbations, runs: int, seed: int, timing: dict[str, Any], backend: str) -> _Sample:
-    folds = (Quantities(objective.quantities), Margin(), Torque())
-    if not perturbations:
-        run = simulate(scenario, metrics=folds, record_every=10**9, **timing)
-        exact, margin = np.asarray(run.metrics["tuning_exact"])[None], np.min(np.asarray(run.metrics["margin"]))[None]
-        return _Sample(exact, np.asarray(run.status)[None], margin, np.asarray(run.metrics["peak_torque"])[None], np.ones(1, bool))
-    study = monte_carlo(scenario, perturbations, runs=runs, seed=seed, metrics=folds, progress=False, backend=backend, **timing)
-    margin = np.asarray(study.metrics["margin"]).min(axis=1)
-    torque = np.asarray(study.metrics["peak_torque"])
-    return _Sample(np.asarray(study.metrics["tuning_exact"]), np.asarray(study.status), margin, torque, np.asarray(study.made))
+def _run(
+    scenarios: Sequence[Scenario],
+    tuned: Sequence[str],
+    objective: Objective,
+    perturbations,
+    runs: int,
+    seed: int,
+    timing: dict[str, Any],
+    backend: str,
+    together: int,
+) -> list[_Sample]:
+    """The same runs of scenarios that differ in what was tuned: drawn ones, or the nominal one where `runs` is 0, so many together.
+
+    They are made by the program of a search's values, and the nominal one replaces what is drawn too: one kernel does for all.
+    """
+    first = canonical(scenarios[0])
+    dtype, (targets, by_path) = first.initial.q.dtype, targets_of(first, perturbations or {})
+    by_path, objective, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, objective, timing["dt"]))
+    cases = Cases(first, by_path, jax.random.PRNGKey(seed))
+    run = Run(checks.whole_steps(timing["duration"], timing["dt"]), timing["method"], mechanism=mechanism_of(first))
+    points = {path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios]) for path in tuned}
+    index, of = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios)), np.repeat(np.arange(len(scenarios)), runs or 1)
+    parts = []
+    for begin in range(0, len(of), together):
+        rows = np.resize(np.arange(len(of))[begin : begin + together], together)
+        varied, made = drawn(cases, {path: x[of[rows]] for path, x in points.items()}, index[rows], targets=targets, nominal=not runs)
+        parts.append(jax.tree.map(np.asarray, (rollouts(first, varied, objective, dt, run=run, backend=backend), made)))
+    whole: tuple[Rollouts, np.ndarray] = jax.tree.map(lambda *x: np.concatenate(x)[: len(of)], *parts)
+    found, made = whole
+    if len(scenarios) > 1:  # once a report
+        tell_of_step(found.status, found.fastest_mode, found.relative_error, timing["dt"], timing["method"])
+    each = (x.reshape(len(scenarios), -1, *x.shape[1:]) for x in (found.exact, found.peak_torque, found.status, made))
+    return [_Sample(*x) for x in zip(*each, strict=True)]
 
 
 def influence(risk: Risk, losses: np.ndarray) -> np.ndarray:
@@ -221,6 +259,7 @@ def _broken(objective: Objective, r: int, sample: _Sample) -> np.ndarray:
 def make_report(
     before: Scenario,
     after: Scenario,
+    tuned: Sequence[str],
     objective: Objective,
     perturbations: Any,
     *,
@@ -230,6 +269,7 @@ def make_report(
     confidence: float,
     timing: dict[str, Any],
     backend: str = "auto",
+    together: int = 1,
     at_limits: tuple[str, ...] | None = None,
     prices: tuple[float, ...] = (),
     notes: tuple[str, ...] = (),
@@ -238,18 +278,26 @@ def make_report(
 
     Args:
       before, after: the scenario with its starting gains and with the tuned ones.
+      tuned: paths of these.
       objective: complete, with scales and limits.
       perturbations: path -> perturbation; one nominal run if empty.
       runs, seed: of the fresh draws.
       risk: how the objective combines runs.
       confidence: of the intervals.
       timing: duration, dt, method.
-      backend: what the fresh runs run on.
+      backend: what the runs run on.
+      together: how many runs a search made at once for its values: what is compiled serves again.
       at_limits: the tuned numbers at an end of their range, in words.
       prices: of each requirement, by the unit of its limit; none if not known.
       notes: lines for the reader.
     """
-    samples = [_run(scenario, objective, perturbations, runs, seed, timing, backend) for scenario in (before, after)]
+
+    def made(scenarios: tuple[Scenario, ...], runs: int, dt: float) -> list[_Sample]:
+        steps = runs * len(scenarios) * checks.whole_steps(timing["duration"], dt)
+        at_once = fresh_together(jax.default_backend(), steps, together)
+        return _run(scenarios, tuned, objective, perturbations, runs, seed, timing | {"dt": dt}, backend, at_once)
+
+    samples = made((before, after), runs if perturbations else 0, timing["dt"])
     both = samples[0].made & samples[1].made
     terms = [np.stack([np.asarray(t.value(jnp.asarray(s.exact[both, i]))) for i, t in enumerate(objective.terms)], axis=1) for s in samples]
     level = f" {risk.level:g}" if risk.kind == "cvar" else ""
@@ -271,11 +319,11 @@ def make_report(
     left = tuple(probability(s.status & int(VIOLATED) != 0, s.made, confidence, "independent", 1) for s in samples)
     margins = tuple(float(s.margin[s.made].min()) for s in samples)
     torques = tuple(tuple(s.torque[s.made].max(axis=0).tolist()) for s in samples)
-    drawn = seed if perturbations else None
-    halved = _at_half_the_step(after, objective, timing, samples[1] if not perturbations else None)
+    full = samples[1] if not perturbations else made((after,), 0, timing["dt"])[0]
+    half = made((after,), 0, 0.5 * timing["dt"])[0]
     return Report(
         len(both),
-        drawn,
+        seed if perturbations else None,
         confidence,
         tuple(changes),
         tuple(verdicts),
@@ -283,15 +331,13 @@ def make_report(
         margins,  # type: ignore[arg-type]
         torques,  # type: ignore[arg-type]
         at_limits,
-        halved,
+        _at_half_the_step(objective, full, half),
         notes,
     )
 
 
-def _at_half_the_step(scenario: Scenario, objective: Objective, timing: dict[str, Any], known: _Sample | None) -> str:
+def _at_half_the_step(objective: Objective, full: _Sample, half: _Sample) -> str:
     """The nominal run at dt and at dt / 2, in words: a result that the step made is no result."""
-    full = _run(scenario, objective, None, 1, 0, timing, "auto") if known is None else known
-    half = _run(scenario, objective, None, 1, 0, timing | {"dt": 0.5 * timing["dt"]}, "auto")
     values = [float(sum(t.value(jnp.asarray(s.exact[0, i])) for i, t in enumerate(objective.terms))) for s in (full, half)]
     text = f"the nominal run at dt / 2: objective {values[1]:.5g} instead of {values[0]:.5g}"
     text += f", smallest margin {half.margin[0]:.4g} rad, peak torque {np.max(half.torque):.5g} N m"

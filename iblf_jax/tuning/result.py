@@ -15,6 +15,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.plan import values_together
 from iblf_jax.engine.simulate import simulate_unchecked
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation import paths
@@ -221,6 +222,7 @@ class TuneResult:
         return make_report(
             self.start,
             self.scenario,
+            tuple(self.values),
             setup.objective,
             setup.perturbations,
             runs=setup.report_runs if runs is None else checks.positive_integer("runs", runs),
@@ -229,6 +231,7 @@ class TuneResult:
             confidence=setup.confidence,
             timing=timing,
             backend=setup.backend,
+            together=setup.runs * values_together(setup.runs) if self.probes or setup.runs > 1 else 1,
             at_limits=tuple(f"{name} {end}" for name, end in self.at_limits.items()) if setup.limits else None,
             prices=tuple(self.prices.values()),
             notes=self.notes,
