@@ -17,7 +17,7 @@ from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.step import Form, Inputs, Run, TimeStep, start
-from iblf_jax.lowering import program
+from iblf_jax.lowering import passes, program
 from iblf_jax.lowering.from_jaxpr import closed
 from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.packed import Shapes, pack
@@ -230,6 +230,42 @@ def test_a_sum_is_finite_where_its_logarithms_have_a_value_and_the_rest_is():
     v = b.emit("sub", b.input("carry", 0, "f"), b.emit("log1p", b.input("carry", 1, "f")))
     p = program.finished(b, [], [], [b.emit("is_finite", v, kind="b")])
     assert {"log1p", "sub"}.isdisjoint(node.op for node in p.nodes)
+
+
+@pytest.mark.parametrize("terms", [12, 2000])
+def test_long_sums_are_asked_whether_they_are_finite(terms):
+    """A chain as long as a `reduce_sum` makes it, and sums that each take the one before twice."""
+
+    def whether(x):
+        doubled = jnp.log1p(x[0])
+        for _ in range(terms // 100 + 25):
+            doubled = doubled + 0.5 * doubled
+        return jnp.isfinite(jnp.sum(x)) & jnp.isfinite(doubled)
+
+    for x in (np.full(terms, 0.5), np.r_[np.full(terms - 1, 0.5), np.inf], np.r_[-2.0, np.full(terms - 1, 0.5)]):
+        np.testing.assert_array_equal(lowered_function(whether, x), whether(jnp.asarray(x)))
+
+
+def test_a_call_for_samples_alone_does_not_write_over_what_the_carry_reads():
+    """A call may overwrite what nobody reads of the one before; the order for a processor must not change which that is."""
+
+    def chain(length, extra):
+        b = program.Builder(np.float64)
+        a = b.input("argument", 0, "f")
+        x = b.emit("sin", a)
+        for _ in range(length):
+            x = b.emit("add", b.emit("mul", x, b.constant(0.5, "f")), b.constant(0.1, "f"))
+        return program.finished(b, [], [], [x, *(b.emit("add", a, b.constant(100.0 + k, "f")) for k in range(extra))])
+
+    b = program.Builder(np.float64)
+    x = b.input("carry", 0, "f")
+    kept = b.result(b.call(chain(4, 0), [x]), 0)
+    sample = b.result(b.call(chain(60, 3), [x]), 0)
+    for _ in range(80):
+        sample = b.emit("sin", sample)
+    p = program.finished(b, [x], [kept], [sample], (1,))
+    order = [node.value.size for node in passes.scheduled(p).nodes if node.op == "call"]
+    assert order == [node.value.size for node in p.nodes if node.op == "call"] and len(order) == 2
 
 
 def test_classes_of_a_program():

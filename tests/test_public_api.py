@@ -58,7 +58,7 @@ def undocumented(name: str, thing: object) -> list[str]:
         missing = [name]
     if inspect.isclass(thing):
         for key, value in vars(thing).items():
-            function = value.fget if isinstance(value, property) else value
+            function = inspect.unwrap(value.fget if isinstance(value, property) else value)
             if not key.startswith("_") and inspect.isfunction(function) and not (function.__doc__ or "").strip():
                 missing.append(f"{name}.{key}")
     return missing

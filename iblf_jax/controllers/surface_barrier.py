@@ -58,8 +58,8 @@ class SurfaceBarrier:
 
     def check_start(self, setting: Setting) -> None:
         """Raises ValueError for bounds of the surface that do not have 0 between them at t = 0."""
-        zero = jnp.zeros(setting.model.n)
-        lower, upper = (side.at(jnp.zeros(()), zero) for side in (self.surface.lower, self.surface.upper))
+        zero = jnp.zeros(setting.model.n, self.a.dtype)
+        lower, upper = (side.at(zero[0], zero) for side in (self.surface.lower, self.surface.upper))
         if not (jnp.all(lower < 0) and jnp.all(upper > 0)):
             raise checks.fail("SurfaceBarrier.surface", (lower, upper), "lower < 0 < upper at t = 0", "Exchange or widen them.")
 

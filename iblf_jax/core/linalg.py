@@ -89,12 +89,6 @@ def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     A matrix that is not positive definite gives NaN.  The derivative is that of the equation, dx = matrix^-1 (drhs - dmatrix x), with
     the same factors.
     """
-    if len(rhs) == 2:
-        # One division instead of two in a row: a step of two joints waits for them.
-        a, b, c = matrix[0, 0], matrix[1, 0], matrix[1, 1]
-        determinant = a * c - b * b
-        scale = 1.0 / jnp.where((a > 0) & (determinant > 0), determinant, jnp.nan)
-        return jnp.stack([(c * rhs[0] - b * rhs[1]) * scale, (a * rhs[1] - b * rhs[0]) * scale])
     lower, inverse = _factors(matrix)
     n = len(inverse)
     y: list[jax.Array] = []

@@ -1,8 +1,9 @@
 """Constant folding, and identities that hold for every floating-point number, NaN and infinities included.
 
 x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN, and a run that is not finite must
-be seen to be so.  There are two exceptions: programs of derivatives (`Builder.sparse`), whose values are those of a program without
-derivatives, and zeros of a mechanism (`Builder.absent`): what has no lever moves nothing.
+be seen to be so.  There are three exceptions: programs of derivatives (`Builder.sparse`), whose values are those of a program without
+derivatives; zeros of a mechanism (`Builder.absent`): what has no lever moves nothing; and whether a sum with logarithms is finite, where
+it is so large that it overflows (`_is_finite`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from iblf_jax.lowering.operations import OPERATIONS
 
 if TYPE_CHECKING:
-    from iblf_jax.lowering.program import Builder
+    from iblf_jax.lowering.program import Builder, Node
 
 
 def fold(op: str, values: list, kinds: list[str], kind: str, dtype: np.dtype):
@@ -147,42 +148,63 @@ def _not(b: Builder, args, kind):
     return node.args[0] if node.op == "not" else None
 
 
+LONGEST_SUM = 64
+"""Operations of a sum in which logarithms are looked for: a V of seven joints has thirty."""
+
+
 def _is_finite(b: Builder, args, kind):
     """Whether a sum is finite: its logarithms have a value, and the rest is.
 
     No logarithm is above 1e3, and where a sum may overflow its numbers have no digits there.  A status asks so of V, which a run that is
     not recorded needs for nothing else.
     """
-    rest, logarithms = _without_logarithms(b, args[0], {})
-    if not logarithms:
+    parts = _of_sum(b, args[0])
+    if not any(b.nodes[i].op == "log1p" for i in parts):
         return None
+    rest, logarithms = _without_logarithms(b, parts)
     found = [b.emit("is_finite", rest, kind="b")] if rest is not None else []
     for x in logarithms:
         found += [b.emit("gt", x, b.constant(-1, "f"), kind="b"), b.emit("lt", x, b.constant(math.inf, "f"), kind="b")]
     return reduce(lambda one, other: b.emit("and", one, other, kind="b"), found)
 
 
-def _without_logarithms(b: Builder, i: int, known: dict) -> tuple[int | None, list[int]]:
-    """A sum without its terms log1p(x), None if it has no others, and these x; `known`: what was found of its nodes."""
-    if i in known:
-        return known[i]
-    node = b.nodes[i]
-    if node.op == "log1p":
-        known[i] = None, [node.args[0]]
-        return known[i]
-    halved = node.op == "mul" and any(0 < abs(b.value(a) or 0) <= 1 for a in node.args)
-    is_sum = node.kind == "f" and (halved or node.op in ("add", "sub", "neg"))
-    parts = [_without_logarithms(b, a, known) for a in node.args] if is_sum else []
-    logarithms, rests = [x for _, found in parts for x in found], [rest for rest, _ in parts if rest is not None]
-    if not logarithms:
-        known[i] = i, []
-    elif len(rests) == len(parts):
-        known[i] = b.emit(node.op, *rests), logarithms
-    elif halved or not rests:
-        known[i] = None, logarithms
-    else:
-        known[i] = b.emit("neg", rests[0]) if node.op == "sub" and parts[0][0] is None else rests[0], logarithms
-    return known[i]
+def _halves(b: Builder, node: Node) -> bool:
+    return node.op == "mul" and any(0 < abs(b.value(a) or 0) <= 1 for a in node.args)
+
+
+def _adds(b: Builder, node: Node) -> bool:
+    return node.kind == "f" and (node.op in ("add", "sub", "neg") or _halves(b, node))
+
+
+def _of_sum(b: Builder, total: int) -> list[int]:
+    """The sums that a sum is made of and their terms, terms first; none if they are too many."""
+    found, waiting = set[int](), [total]
+    while waiting and len(found) <= LONGEST_SUM:
+        i = waiting.pop()
+        if i not in found:
+            found.add(i)
+            waiting += b.nodes[i].args if _adds(b, b.nodes[i]) else ()
+    return [] if waiting else sorted(found)
+
+
+def _without_logarithms(b: Builder, parts: list[int]) -> tuple[int | None, list[int]]:
+    """The last of `parts` (`_of_sum`) without its terms log1p(x), None if it has no others, and these x."""
+    known: dict[int, tuple[int | None, list[int]]] = {}
+    for i in parts:
+        node = b.nodes[i]
+        terms = [known[a] for a in node.args] if _adds(b, node) else []
+        logarithms, rests = list(dict.fromkeys(x for _, found in terms for x in found)), [rest for rest, _ in terms if rest is not None]
+        if node.op == "log1p":
+            known[i] = None, [node.args[0]]
+        elif not logarithms:
+            known[i] = i, []
+        elif len(rests) == len(terms):
+            known[i] = b.emit(node.op, *rests), logarithms
+        elif _halves(b, node) or not rests:
+            known[i] = None, logarithms
+        else:
+            known[i] = b.emit("neg", rests[0]) if node.op == "sub" and terms[0][0] is None else rests[0], logarithms
+    return known[parts[-1]]
 
 
 def _extreme(b: Builder, args, kind):

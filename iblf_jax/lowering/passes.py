@@ -13,7 +13,7 @@ from collections import Counter
 from functools import lru_cache
 
 from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.program import LANE, TIME, Builder, Node, Program, finished
+from iblf_jax.lowering.program import LANE, TIME, Builder, Node, Program, finished, needed
 
 
 def rebuilt(program: Program, rule) -> Program:
@@ -109,6 +109,9 @@ def scheduled(program: Program) -> Program:
             if not left[user]:
                 heapq.heappush(waiting, (at[user], user))
         now += cost[i]
+    # What only samples need stays last: a call that only they need must not write over what the next one has left there (`layout.Calls`).
+    in_time = set(needed(nodes, [o for _, o in program.carry])) | known
+    order.sort(key=lambda i: i not in in_time)
     place = {i: k for k, i in enumerate(order)}
     carry = tuple((place.get(a, -1), place[o]) for a, o in program.carry)
     moved = tuple(nodes[i]._replace(args=tuple(place[a] for a in nodes[i].args)) for i in order)

@@ -87,11 +87,11 @@ INLINE reduced reduce(F x) {
 #define TO_SIGN (8 * (int)sizeof(real) - 2)
 INLINE F sine_of(reduced a) {
   F y = (a.quadrant & 1) != 0 ? a.c : a.s;
-  return from_bits(bits(y) ^ ((a.quadrant << TO_SIGN) & SIGN_BIT));
+  return from_bits(bits(y) ^ ((a.quadrant & 2) << TO_SIGN));
 }
 INLINE F cosine_of(reduced a) {
   F y = (a.quadrant & 1) != 0 ? a.s : a.c;
-  return from_bits(bits(y) ^ (((a.quadrant << TO_SIGN) + ((integer)1 << TO_SIGN)) & SIGN_BIT));
+  return from_bits(bits(y) ^ (((a.quadrant + 1) & 2) << TO_SIGN));
 }
 /* Right up to SINCOS_LIMIT; beyond it, and where x is infinite, the C library's, of x, takes the place of y.  One test does for several angles
    (`emit_c`). */
