@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.core.status import FAILED
+from iblf_jax.core.status import FAILED, Status
 from iblf_jax.engine import execute
 from iblf_jax.engine.step import Run
 from iblf_jax.lowering import toolchain
@@ -75,13 +75,18 @@ def agree(name, dtype, run, asked):
     taken = {execute.chosen_backend(backend, scenario, varied, folds, dt, method=run.method) for backend in asked}
     for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap
         found = jax.tree.map(np.asarray, outcome_of(*arguments, run=run, backend=backend))
-        np.testing.assert_array_equal(found.status, expected.status, err_msg=backend)
+        np.testing.assert_array_equal(comparable(found.status), comparable(expected.status), err_msg=backend)
         times = (x.metrics["first_violation_time"] for x in (found, expected))
         np.testing.assert_allclose(*times, rtol=0, atol=1.01 * DT, err_msg=backend)
         for field in ("q", "dq", "e1", "xi", "tau", "disturbance_estimate"):
             one, other = (x.records[0][field][ok] for x in (found, expected))
             scale = max(1.0, np.abs(other).max())
             np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=f"{backend} {field}")
+
+
+def comparable(status):
+    """A status without what is chance: the fastest mode of a run at the instant at which it ran away."""
+    return np.where(status & int(Status.NOT_FINITE), status & ~int(Status.STEP_TOO_LARGE), status)
 
 
 def has_compiler() -> bool:

@@ -560,7 +560,8 @@ def test_search_finds_the_gap_of_the_printed_law_only():
         "controller.K2": between(0.6, 20.0),
         "observer.kf": between(1.1, 40.0),
     }
-    found = counterexample(ij.presets.printed_gap(), perturbations, starts=4)
+    # Of four starts the best is one or another with the last digit.
+    found = counterexample(ij.presets.printed_gap(), perturbations, starts=8)
     assert found.growth > 0.3
     for path, perturbation in perturbations.items():
         low, high = perturbation.distribution.support()
