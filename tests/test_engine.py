@@ -11,7 +11,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, machine_function, plan, transformable
+from iblf_jax.engine import execute, machine_function, plan
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
 from iblf_jax.engine.step import Inputs, Run
@@ -100,7 +100,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
     """By their length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)
     monkeypatch.setattr(plan, "LONG_EVALUATION", 0)
-    transformable.run_now.clear_cache()
+    execute._way_of_one.cache_clear()
     try:
 
         def ise(K2):
@@ -111,7 +111,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
         slope = jax.grad(ise)(K2)
         values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
     finally:
-        transformable.run_now.clear_cache()
+        execute._way_of_one.cache_clear()
     np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
     step = 1e-3
     for i in range(2):

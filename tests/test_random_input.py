@@ -156,7 +156,7 @@ def test_arguments_of_simulate(paper, data, value):
     name = data.draw(st.sampled_from(["duration", "dt", "method", "record_every", "metrics", "scenario"]))
     options = {"scenario": paper, **SHORT, name: value}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "run_now", entered)
+        patch.setattr(simulate, "run_one", entered)
         try:
             accepts_or_value_error(lambda: ij.simulate(options.pop("scenario"), **options))
         except Entered:
@@ -287,7 +287,7 @@ TIMED = ("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "
 def no_runs(monkeypatch):
     """Whatever would run raises Entered."""
     for place in (
-        "engine.simulate.run_now",
+        "engine.simulate.run_one",
         "studies.blocks._execute",
         "studies.setup._execute",
         "tuning.problem.rollouts",

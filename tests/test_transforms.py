@@ -256,7 +256,8 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     traces = []
     original = step.advance
     monkeypatch.setattr(step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
-    before = transformable.run_now._cache_size()
+    parts = (execute._before_steps, execute._steps, execute._after_steps)
+    before = [part._cache_size() for part in parts]
     for changes in (
         {"controller.K2": 30.0},
         {"plant.mass[1]": 1},
@@ -269,16 +270,29 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     ij.simulate(fresh, **PAPER)
     ij.simulate(fresh, **PAPER, throw=True)
     assert traces == []
-    assert transformable.run_now._cache_size() == before
+    assert [part._cache_size() for part in parts] == before
 
 
 def test_a_new_structure_does_recompile(paper, monkeypatch):
-    """So that the test above can fail: another number of steps is another program."""
+    """So that the test above can fail."""
     traces = []
-    monkeypatch.setattr(execute, "run_all", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(execute, "begin", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        ij.simulate(paper, duration=0.037, dt=1e-3)
+        ij.simulate(paper, **SHORT, metrics=(ij.metrics.Torque(),))
     assert traces == [1]
+
+
+@pytest.mark.parametrize("backend", ["native", "xla"])
+def test_another_length_compiles_the_steps_alone(paper, backend):
+    def compiled():
+        return [part._cache_size() for part in (execute._before_steps, execute._steps, execute._after_steps)]
+
+    ij.simulate(paper, **SHORT, backend=backend)
+    before = compiled()
+    longer = ij.simulate(paper, duration=0.537, dt=1e-3, record_every=3, backend=backend)
+    assert [new - old for new, old in zip(compiled(), before, strict=True)] == [0, 1, 0]
+    again = ij.simulate(paper, **SHORT, backend=backend)
+    np.testing.assert_array_equal(longer.q[:150], again.q[:450:3])
 
 
 def test_the_same_run_twice_is_bit_identical(paper, short_run):

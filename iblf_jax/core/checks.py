@@ -184,16 +184,16 @@ def _from_host(value: Any) -> jax.Array:
 
 def check_values(name: str, array: Any, sign: str | None) -> None:
     """Raises if a concrete array has a NaN, an infinity or a number of the wrong sign."""
-    if array is None or not is_concrete(array):
+    if array is None or isinstance(array, jax.core.Tracer):
         return
     values = np.asarray(array)
-    if sign in LIMITS and np.any(np.isnan(values)):
+    if sign in LIMITS and np.isnan(values).any():
         raise fail(name, array, "numbers, infinite where there is no limit", "Replace the NaN entries.")
-    if sign not in LIMITS and not np.all(np.isfinite(values)):
+    if sign not in LIMITS and not np.isfinite(values).all():
         raise fail(name, array, "finite numbers", "Replace the NaN or infinite entries.")
-    if sign in ("positive", "positive limit") and not np.all(values > 0):
+    if sign in ("positive", "positive limit") and not (values > 0).all():
         raise fail(name, array, "numbers > 0", "Give positive values.")
-    if sign == "nonnegative" and not np.all(values >= 0):
+    if sign == "nonnegative" and not (values >= 0).all():
         raise fail(name, array, "numbers >= 0", "Give non-negative values.")
 
 

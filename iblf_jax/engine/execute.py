@@ -11,23 +11,25 @@ a `BackendWarning` says why, once.
 
 from __future__ import annotations
 
+import contextlib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.engine import gpu, native, plan, xla
-from iblf_jax.engine.batch import Batch, Executor, begin, carry_shapes, run_all
+from iblf_jax.engine.batch import Batch, Executor, begin, carry_shapes, end, run_all
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.mechanism import Mechanism, mechanism_of
-from iblf_jax.engine.step import Inputs, Outcome, Run, TimeStep
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, Run, TimeStep
 from iblf_jax.lowering.packed import Shapes
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import Program, UnsupportedError
@@ -61,6 +63,29 @@ def automatic() -> tuple[str, str | None]:
     return ("xla", reason) if reason else (best, None)
 
 
+def _asked_for(backend: str) -> tuple[str, ...]:
+    """The executors that lower a step, best first, for what the user asked for on this platform."""
+    checks.one_of("backend", backend, plan.BACKENDS)
+    platform = jax.default_backend()
+    if backend in plan.COMPILED.values() and plan.COMPILED.get(platform) != backend:
+        _tell(f"The {backend} backend is not for the default device, {platform}: running on xla.")
+        backend = "xla"
+    return plan.executors_for(backend, platform)
+
+
+def _first_that_can(names: list[str], run_on: Callable, on_scan: Callable, tell: Callable[[str], None]) -> Any:
+    """`run_on` the first name of a list that can, or `on_scan()`; what cannot is taken out of the list."""
+    while names:
+        try:
+            return run_on(names[0])
+        except ToolchainError as error:
+            tell(f"The {names.pop(0)} backend is not available ({error}): running on xla.")
+        except UnsupportedError as reason:
+            tell(f"This scenario runs on the vmap backend, several times slower: {reason}.")
+            names.clear()
+    return on_scan()
+
+
 def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
     """`run_on(name)` on the executor that was asked for, or the next one that can; `on_scan()` is scan.
 
@@ -72,26 +97,14 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
     Raises:
       ValueError: an unknown backend.
     """
-    checks.one_of("backend", backend, plan.BACKENDS)
-    platform = jax.default_backend()
-    if backend in plan.COMPILED.values() and plan.COMPILED.get(platform) != backend:
-        _tell(f"The {backend} backend is not for the default device, {platform}: running on xla.")
-        backend = "xla"
-    try:
-        for name in plan.executors_for(backend, platform):
-            try:
-                return run_on(name)
-            except ToolchainError as error:
-                _tell(f"The {name} backend is not available ({error}): running on xla.")
-    except UnsupportedError as reason:
-        _tell(f"This scenario runs on the vmap backend, several times slower: {reason}.")
-    return on_scan()
+    return _first_that_can(list(_asked_for(backend)), run_on, on_scan, _tell)
 
 
 def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: Any = None) -> Inputs:
     """What a run is made from; `noise` is the key of a sampled loop's."""
     noise = () if scenario.sampling is None else jnp.zeros((4,), dt.dtype) if noise is None else noise.astype(dt.dtype)
-    return Inputs(scenario, folds, dt, jnp.asarray(run.steps, dt.dtype), noise=noise)
+    steps: Any = np.asarray(run.steps, dt.dtype)
+    return Inputs(scenario, folds, dt, steps, noise=noise)
 
 
 def executor_named(name: str) -> Executor:
@@ -114,24 +127,34 @@ def _program(batch: Batch, run: Run) -> Program:
     return program_of(TimeStep.of(run), batch, carry_shapes(batch, run.method)).program
 
 
-def run_lowered(name: str, batch: Batch, run: Run, program: Program | None = None, go: Callable[..., Any] | None = None) -> Any:
-    """All runs on an executor that lowers; its longest kernel is built beside the others, as compilers use one core.
+def _build_ahead(batch: Batch, run: Run, program: Program) -> None:
+    """Starts to build the longest kernel of a run, beside whatever else is made: compilers use one core."""
+    sizes = Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size
+    native.ahead(program, *sizes, batch.runs or 1, run.steps + 1)
+
+
+@contextlib.contextmanager
+def _compilers_stop_with_it() -> Iterator[None]:
+    """What fails, or is interrupted, leaves no compiler behind."""
+    try:
+        yield
+    except BaseException:
+        stop_compilers()
+        raise
+
+
+def run_lowered(name: str, batch: Batch, run: Run, go: Callable[..., Any] | None = None) -> Any:
+    """All runs on an executor that lowers.
 
     Args:
       name: of the executor.
       batch, run: what to run.
-      program: of its step, where the caller has it.
       go: what is done, a function (executor, batch, run); `run_all` if not given.
     """
     if name == "native":
-        program = program or _program(batch, run)
-        sizes = Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size
-        native.ahead(program, *sizes, batch.runs or 1, run.steps + 1)
-    try:
+        _build_ahead(batch, run, _program(batch, run))
+    with _compilers_stop_with_it():
         return (go or run_all)(executor_named(name), batch, run)
-    except BaseException:
-        stop_compilers()
-        raise
 
 
 def operations(inputs: Inputs) -> int:
@@ -194,7 +217,9 @@ def run_batch(
 
 
 def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
-    """One run; call it inside `jit`, and do not batch or differentiate it from outside.
+    """One run; do not batch or differentiate it from outside.
+
+    Where it is lowered it is compiled in three parts: what comes before the steps and after them is the same for any number of them.
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
@@ -202,26 +227,89 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
         is long or does not lower is, on "auto" and "xla", on scan, without a warning.
       noise: key of a sampled loop's noise.
     """
-    inputs = inputs_of(scenario, folds, dt, run, noise)
-    batch = _lowered_batch(inputs, {"initial.q": scenario.initial.q[None]}, run)
+    leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, run, noise))
+    program = run._replace(steps=min(run.steps, plan.NATIVE_FEW + 1), record_every=run.record_every and 1)  # as far as it decides
+    names, shape = _way_of_one(backend, program, structure, tuple((x.shape, x.dtype) for x in leaves))
 
-    def run_on(name, program=None):
-        return jax.tree.map(lambda x: x[0], run_lowered(name, batch, run, program))
+    def in_parts(name):
+        way = Way(name, structure, shape)
+        with _compilers_stop_with_it():
+            carry, at_start = _before_steps(way, run._replace(steps=0, record_every=None), leaves)
+            carry, records = _steps(way, run, leaves, carry)
+            return _after_steps(way, run._replace(steps=0, record_every=None), leaves, carry, at_start)._replace(records=records)
 
-    def on_scan():
-        return _scanned(inputs, None, False, lambda batch: run_all(scan, batch, run))
+    tell = _tell if backend in plan.COMPILED.values() else lambda text: None
+    return _first_that_can(names, in_parts, lambda: _one_by_scan(structure, run, leaves), tell)
 
-    if backend in plan.COMPILED.values():
-        return with_fallback(backend, run_on, on_scan)
-    compiled = backend == "auto" and not native.unavailable()
-    name = plan.executor_of_one_run(compiled, jax.default_backend(), operations(inputs))
-    if name is None:
-        return on_scan()
-    try:
-        program = _program(batch, run)
-        return run_on(name, program) if plan.lowers_one_run(name, _nodes(name, program)) else on_scan()
-    except (UnsupportedError, ToolchainError):
-        return on_scan()
+
+class Way(NamedTuple):
+    """How one run is executed; static."""
+
+    executor: str
+    inputs: Any
+    """The tree of the `Inputs`."""
+    shape: plan.Shape
+
+    def batch(self, leaves: list, run: Run) -> Batch:
+        """The run as a batch, which is what is lowered."""
+        return _alone(jax.tree.unflatten(self.inputs, leaves), run, self.shape)
+
+
+@lru_cache(maxsize=256)
+def _way_of_one(backend: str, run: Run, structure: Any, shapes: tuple) -> tuple[list[str], plan.Shape]:
+    """The executors that one run is lowered for, best first and without what has failed, and its shape; the first one's kernel is begun.
+
+    It depends on structure and shapes alone, and the trace takes longer than many a run.
+    """
+    names: list[str] = []
+
+    def trace(leaves):
+        inputs = jax.tree.unflatten(structure, leaves)
+        platform, size = jax.default_backend(), operations(inputs)
+        shape = plan.lowered_shape(platform, size, 1, nested=False)
+        batch = _alone(inputs, run, shape)
+        if backend in plan.COMPILED.values():
+            names.extend(_asked_for(backend))
+        else:
+            compiled = backend == "auto" and not native.unavailable()
+            name = plan.executor_of_one_run(compiled, platform, size)
+            with contextlib.suppress(UnsupportedError):
+                if name and plan.lowers_one_run(name, _nodes(name, _program(batch, run))):
+                    names.append(name)
+        if names[:1] == ["native"]:
+            with contextlib.suppress(UnsupportedError, ToolchainError):
+                _build_ahead(batch, run, _program(batch, run))
+        found.append(shape)
+
+    found: list[plan.Shape] = []
+    jax.eval_shape(trace, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    return names, found[0]
+
+
+def _alone(inputs: Inputs, run: Run, shape: plan.Shape) -> Batch:
+    """One run as a batch, which is what is lowered."""
+    return Batch.of(inputs, {"initial.q": inputs.scenario.initial.q[None]}, shape, run.mechanism)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _before_steps(way: Way, run: Run, leaves: list) -> tuple[Carry, Probed]:
+    return begin(executor_named(way.executor), way.batch(leaves, run), run.method)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
+    carry, records = executor_named(way.executor)(TimeStep.of(run), way.batch(leaves, run), carry, run.steps + 1, run.record_every)
+    return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _after_steps(way: Way, run: Run, leaves: list, carry: Carry, at_start: Probed) -> Outcome:
+    return jax.tree.map(lambda x: x[0], end(executor_named(way.executor), way.batch(leaves, run), run, carry, at_start))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _one_by_scan(structure: Any, run: Run, leaves: list) -> Outcome:
+    return _scanned(jax.tree.unflatten(structure, leaves), None, False, lambda batch: run_all(scan, batch, run))
 
 
 def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: jax.Array | None = None) -> Outcome:

@@ -50,10 +50,6 @@ class Runs(NamedTuple):
         return Batch(Leaves(self.treedef, self.is_lane, shared, lane), self.runs, mechanism=self.run.mechanism)
 
 
-run_now = jax.jit(execute.run_one, static_argnames=("run", "backend"))
-"""A run of which all numbers are known."""
-
-
 def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
     """One run that may be batched and differentiated from outside.
 
@@ -118,7 +114,7 @@ def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
         run = runs.run._replace(mechanism=mechanism_of(inputs.scenario))
-        return run_now(inputs.scenario, inputs.folds, inputs.dt, run, noise=inputs.noise)
+        return execute.run_one(inputs.scenario, inputs.folds, inputs.dt, run, noise=inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 

@@ -456,7 +456,7 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenar
         that are no words, fields that are no numbers, or two folds that return the same name.
     """
     if metrics is None:
-        metrics = standard() if scenario is None else (*standard(), *watched(scenario))
+        return tuple(_in_type("metrics", fold, dtype) for fold in (*standard(), *(() if scenario is None else watched(scenario))))
     if not isinstance(metrics, tuple | list):
         raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
     owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")

@@ -231,6 +231,10 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
     return fitted
 
 
+NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
+"""What a leaf may be."""
+
+
 def check_values(part: Any, path: str = "") -> None:
     """Raises ValueError for the first concrete leaf that is not finite or has the wrong sign, with its path."""
     if isinstance(part, tuple):
@@ -241,7 +245,7 @@ def check_values(part: Any, path: str = "") -> None:
             name = f"{path}.{field.name}" if path else field.name
             if not field.metadata.get("static"):
                 value = getattr(part, field.name)
-                if isinstance(value, jax.Array | np.ndarray | float | int):
+                if isinstance(value, NUMBERS):
                     checks.check_values(name, value, field.metadata.get("sign"))
                 else:
                     check_values(value, name)
@@ -282,12 +286,12 @@ def _typed(x: Any, dtype) -> jax.Array:
 
 def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
     """float32 if all numbers are float32, else JAX's default."""
-    for path, value in jax.tree_util.tree_leaves_with_path(scenario):
-        if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-            raise checks.fail(
-                jax.tree_util.keystr(path).lstrip("."), value, "an array of numbers", "Other things belong in a static field."
-            )
-    types = {x.dtype if isinstance(x, jax.Array) else jnp.result_type(x) for x in jax.tree.leaves(scenario)}
+    leaves = jax.tree.leaves(scenario)
+    if not all(isinstance(x, NUMBERS) for x in leaves):
+        path, value = next((path, x) for path, x in jax.tree_util.tree_leaves_with_path(scenario) if not isinstance(x, NUMBERS))
+        name = jax.tree_util.keystr(path).lstrip(".")
+        raise checks.fail(name, value, "an array of numbers", "Other things belong in a static field.")
+    types = {x.dtype if isinstance(x, jax.Array) else jnp.result_type(x) for x in leaves}
     floats = {x for x in types if jnp.issubdtype(x, jnp.floating)}
     if len(floats) == 1 and floats <= {jnp.dtype("float32"), jnp.dtype("float64")}:
         return floats.pop()
