@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
+from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
@@ -78,23 +80,31 @@ def component(cls: type[T]) -> type[T]:
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
+    # Every call of a compiled function takes its arguments apart here.
+    children_of, structure_of = _getter(children), _getter(structure)
+    keys = tuple(map(jax.tree_util.GetAttrKey, children))
+
     def flatten_with_keys(obj):
-        keyed = tuple((jax.tree_util.GetAttrKey(name), getattr(obj, name)) for name in children)
-        return keyed, tuple(getattr(obj, name) for name in structure)
+        return tuple(zip(keys, children_of(obj), strict=True)), structure_of(obj)
 
     def flatten(obj):
-        return tuple(getattr(obj, name) for name in children), tuple(getattr(obj, name) for name in structure)
+        return children_of(obj), structure_of(obj)
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
-        for name, value in zip(children, values, strict=True):
-            object.__setattr__(obj, name, value)
-        for name, value in zip(structure, aux, strict=True):
-            object.__setattr__(obj, name, value)
+        obj.__dict__.update(zip(children, values, strict=True))
+        obj.__dict__.update(zip(structure, aux, strict=True))
         return obj
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
+
+
+def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
+    """A function of an object that returns these attributes."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    return (lambda obj: (getattr(obj, names[0]),)) if names else lambda obj: ()
 
 
 def layers(part: Any) -> list[Any]:
