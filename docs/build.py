@@ -93,7 +93,7 @@ def main() -> int:
 
     jax.config.update("jax_enable_x64", True)
     assemble()
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", str(SOURCE), str(SITE / "html")]
+    command = [sys.executable, "-m", "sphinx", "-q", "-j", "auto", "-W", "--keep-going", "-b", "html", str(SOURCE), str(SITE / "html")]
     code = subprocess.run(command, check=False).returncode
     wrong = links.faults(SITE / "html")
     print("\n".join(wrong))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import runpy
 import shutil
 import signal
 import sys
@@ -17,8 +18,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "0")
 # Where in Python an operation was written stands in no program that is compiled, and costs a tenth of the tracing.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
-# Tracing makes millions of objects that live as long as the process: at Python's own setting a tenth of its time is a search for garbage.
-gc.set_threshold(50_000, 20, 20)
+# Python is told to look for garbage less often: this process here, those that it starts by what they find on their path.
+STARTUP = ROOT / "tests" / "startup"
+if str(STARTUP) not in os.environ.get("PYTHONPATH", ""):
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(STARTUP), *filter(None, [os.environ.get("PYTHONPATH")])])
+runpy.run_path(str(STARTUP / "sitecustomize.py"))
 
 import hypothesis
 import jax
@@ -52,11 +56,11 @@ XLA_FLAGS = " ".join(
     ]
 )
 """Half of the tests' time was the compilers', spent on making loops faster that run for milliseconds.  XLA is asked for the same programs;
-it writes the machine's code plainly, operation by operation and on one thread, and does not check itself after each pass.  So does the
-compiler of kernels (`plain_compiler`).  `test_users_settings.py` runs tests as users compile; so do the release tests, and all of them with
-TEST_AS_USERS=1 in the environment."""
+it writes the machine's code plainly, operation by operation and on one thread, and does not check itself after each pass.  The compiler
+of kernels does not optimise either (`plain_compiler`).  `test_users_settings.py` runs tests as users compile; so do the release tests, and
+all of them with TEST_AS_USERS=1 in the environment."""
 
-MEMORY = 3 * 2**30
+MEMORY = 4 * 2**30
 """Bytes of a process from which what it has compiled is let go after a test: what is needed again is compiled again."""
 
 

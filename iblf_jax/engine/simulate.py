@@ -60,8 +60,8 @@ def simulate(
         x' = rate(t, x),   x = (q, q', state of the law, state of the observer)                 (closed_loop)
 
     Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate `run.metrics` or any array by the leaves of the scenario.
-    New values of leaves do not recompile, but for which numbers of an arm's geometry are 0, 1, -1 or equal; a new structure, number of
-    steps or method does.
+    New values of leaves do not recompile, but for which numbers of an arm's geometry are 0, 1, -1 or equal; a new structure or method
+    does.  Another number of steps, or `record_every`, compiles hardly anything, but for a long step that runs as plain JAX.
 
     Args:
       scenario: what to run, of n joints.
