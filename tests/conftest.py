@@ -57,10 +57,10 @@ XLA_FLAGS = " ".join(
 )
 """Half of the tests' time was the compilers', spent on making loops faster that run for milliseconds.  XLA is asked for the same programs;
 it writes the machine's code plainly, operation by operation and on one thread, and does not check itself after each pass.  The compiler
-of kernels does not optimise either (`plain_compiler`).  `test_users_settings.py` runs tests as users compile; so do the release tests, and
+of kernels does not optimise either (`quick_compiler`).  `test_users_settings.py` runs tests as users compile; so do the release tests, and
 all of them with TEST_AS_USERS=1 in the environment."""
 
-MEMORY = 4 * 2**30
+MEMORY = 3 * 2**30
 """Bytes of a process from which what it has compiled is let go after a test: what is needed again is compiled again."""
 
 
@@ -88,7 +88,7 @@ def pytest_configure(config):
     plain = config.option.markexpr != "release" and not os.environ.get("TEST_AS_USERS")
     os.environ["XLA_FLAGS"] = f"{XLA_FLAGS if plain else ''} {own}".strip()  # read at the first program, and the last of two flags wins
     if compiler:
-        os.environ["CXX"] = str(ROOT / "tests" / "plain_compiler") if plain else compiler
+        os.environ["CXX"] = str(ROOT / "tests" / "quick_compiler") if plain else compiler
     if "not slow" in config.option.markexpr:
         jax.config.update("jax_numpy_dtype_promotion", "strict")
 

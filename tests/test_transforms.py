@@ -276,6 +276,7 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
 def test_a_new_structure_does_recompile(paper, monkeypatch):
     """So that the test above can fail."""
     traces = []
+    execute._before_steps.clear_cache()
     monkeypatch.setattr(execute, "begin", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         ij.simulate(paper, **SHORT, metrics=(ij.metrics.Torque(),))
@@ -293,6 +294,33 @@ def test_another_length_compiles_the_steps_alone(paper, backend):
     assert [new - old for new, old in zip(compiled(), before, strict=True)] == [0, 1, 0]
     again = ij.simulate(paper, **SHORT, backend=backend)
     np.testing.assert_array_equal(longer.q[:150], again.q[:450:3])
+
+
+@pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path, monkeypatch):
+    """With one warning if it was asked for, without one if it was not; another length is not tried again, another structure is."""
+    broken = tmp_path / "g++"
+    broken.write_text('#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho "error: no" >&2\nexit 1\n')
+    broken.chmod(0o755)
+    short = {"duration": 0.1, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
+    expected = ij.simulate(paper, **short)
+    monkeypatch.setattr(execute, "_told", set())
+    monkeypatch.setattr(execute, "_failed", set())
+    for part in (execute._before_steps, execute._steps):
+        part.clear_cache()
+    native.kernel.cache_clear()
+    native._turner.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setenv("CXX", str(broken))
+        with pytest.warns(execute.BackendWarning, match="native backend is not available .*g.. failed"):
+            found = ij.simulate(paper, **short, backend="native")
+        np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            ij.simulate(paper, **short | {"duration": 0.11}, backend="native")
+            np.testing.assert_allclose(ij.simulate(paper, **short).q, expected.q, rtol=1e-12)
+    execute._failed.clear()
+    np.testing.assert_array_equal(ij.simulate(paper, **short, backend="native").q, expected.q)
 
 
 def test_the_same_run_twice_is_bit_identical(paper, short_run):

@@ -35,7 +35,7 @@ def test_the_testers_own_flags_come_last():
     flags, own = os.environ["XLA_FLAGS"], os.environ["TESTER_XLA_FLAGS"]
     as_users = bool(os.environ.get("TEST_AS_USERS"))
     assert flags == f"{'' if as_users else conftest.XLA_FLAGS} {own}".strip()
-    assert (os.environ.get("CXX") == str(ROOT / "tests" / "plain_compiler")) == bool(os.environ["TESTER_CXX"] and not as_users)
+    assert (os.environ.get("CXX") == str(ROOT / "tests" / "quick_compiler")) == bool(os.environ["TESTER_CXX"] and not as_users)
 
 
 @pytest.mark.slow

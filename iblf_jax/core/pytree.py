@@ -92,8 +92,10 @@ def component(cls: type[T]) -> type[T]:
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
-        obj.__dict__.update(zip(children, values, strict=True))
-        obj.__dict__.update(zip(structure, aux, strict=True))
+        for name, value in zip(children, values, strict=True):
+            object.__setattr__(obj, name, value)
+        for name, value in zip(structure, aux, strict=True):
+            object.__setattr__(obj, name, value)
         return obj
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, Run, TimeStep
 from iblf_jax.lowering.packed import Shapes
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import Program, UnsupportedError
-from iblf_jax.lowering.toolchain import ToolchainError, stop_compilers
+from iblf_jax.lowering.toolchain import StoppedError, ToolchainError, stop_compilers
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 
@@ -51,7 +51,7 @@ _told: set[str] = set()
 def _tell(text: str) -> None:
     if text not in _told:
         _told.add(text)
-        warnings.warn(text, BackendWarning, stacklevel=4)
+        warnings.warn(text, BackendWarning, stacklevel=5)
 
 
 def automatic() -> tuple[str, str | None]:
@@ -73,17 +73,21 @@ def _asked_for(backend: str) -> tuple[str, ...]:
     return plan.executors_for(backend, platform)
 
 
-def _first_that_can(names: list[str], run_on: Callable, on_scan: Callable, tell: Callable[[str], None]) -> Any:
-    """`run_on` the first name of a list that can, or `on_scan()`; what cannot is taken out of the list."""
-    while names:
+def _first_that_can(names: Sequence[str], run_on: Callable, on_scan: Callable, tell: Callable[[str], None]) -> Any:
+    """`run_on` the first of some names that can, or `on_scan()`."""
+    for name in names:
         try:
-            return run_on(names[0])
+            return run_on(name)
         except ToolchainError as error:
-            tell(f"The {names.pop(0)} backend is not available ({error}): running on xla.")
+            tell(f"The {name} backend is not available ({error}): running on xla.")
         except UnsupportedError as reason:
-            tell(f"This scenario runs on the vmap backend, several times slower: {reason}.")
-            names.clear()
+            tell(_slower(reason))
+            break
     return on_scan()
+
+
+def _slower(reason: object) -> str:
+    return f"This scenario runs on the vmap backend, several times slower: {reason}."
 
 
 def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
@@ -97,7 +101,7 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
     Raises:
       ValueError: an unknown backend.
     """
-    return _first_that_can(list(_asked_for(backend)), run_on, on_scan, _tell)
+    return _first_that_can(_asked_for(backend), run_on, on_scan, _tell)
 
 
 def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: Any = None) -> Inputs:
@@ -219,7 +223,8 @@ def run_batch(
 def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
     """One run; do not batch or differentiate it from outside.
 
-    Where it is lowered it is compiled in three parts: what comes before the steps and after them is the same for any number of them.
+    Where it is lowered it is compiled in three parts, and only the one in the middle depends on the number of steps and what is recorded.
+    A structure whose kernel could not be built is not tried again in this process.
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
@@ -228,18 +233,33 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
       noise: key of a sampled loop's noise.
     """
     leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, run, noise))
-    program = run._replace(steps=min(run.steps, plan.NATIVE_FEW + 1), record_every=run.record_every and 1)  # as far as it decides
-    names, shape = _way_of_one(backend, program, structure, tuple((x.shape, x.dtype) for x in leaves))
+    shapes = tuple((x.shape, x.dtype) for x in leaves)
+    decisive = run._replace(steps=plan.NATIVE_FEW if run.steps >= plan.NATIVE_FEW else 0, record_every=run.record_every and 1)
+    around = run._replace(steps=0, record_every=None)
+    names, shape, unsupported = _way_of_one(backend, decisive, automatic(), structure, shapes)
 
     def in_parts(name):
         way = Way(name, structure, shape)
-        with _compilers_stop_with_it():
-            carry, at_start = _before_steps(way, run._replace(steps=0, record_every=None), leaves)
-            carry, records = _steps(way, run, leaves, carry)
-            return _after_steps(way, run._replace(steps=0, record_every=None), leaves, carry, at_start)._replace(records=records)
+        try:
+            with _compilers_stop_with_it():
+                carry, at_start = _before_steps(way, around, leaves)
+                carry, records = _steps(way, run, leaves, carry)
+                return _after_steps(way, around, leaves, carry, at_start)._replace(records=records)
+        except ToolchainError as error:
+            if not isinstance(error, StoppedError):
+                _failed.add((name, structure, shapes))
+            raise
 
     tell = _tell if backend in plan.COMPILED.values() else lambda text: None
+    if unsupported:
+        tell(_slower(unsupported))
+    if _failed:
+        names = tuple(name for name in names if (name, structure, shapes) not in _failed)
     return _first_that_can(names, in_parts, lambda: _one_by_scan(structure, run, leaves), tell)
+
+
+_failed: set[tuple] = set()
+"""Executor, structure and shapes of the runs whose kernels could not be built."""
 
 
 class Way(NamedTuple):
@@ -256,34 +276,38 @@ class Way(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def _way_of_one(backend: str, run: Run, structure: Any, shapes: tuple) -> tuple[list[str], plan.Shape]:
-    """The executors that one run is lowered for, best first and without what has failed, and its shape; the first one's kernel is begun.
+def _way_of_one(
+    backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple
+) -> tuple[tuple[str, ...], plan.Shape, str | None]:
+    """The executors that one run is lowered for, best first; its shape; why it does not lower.  The first one's kernel is begun.
 
-    It depends on structure and shapes alone, and the trace takes longer than many a run.
+    All of it depends on structure and shapes, and the trace takes longer than many a run.  Of the run's length and record it counts whether
+    there are few steps and whether there is a record.
     """
-    names: list[str] = []
 
     def trace(leaves):
         inputs = jax.tree.unflatten(structure, leaves)
         platform, size = jax.default_backend(), operations(inputs)
         shape = plan.lowered_shape(platform, size, 1, nested=False)
-        batch = _alone(inputs, run, shape)
-        if backend in plan.COMPILED.values():
-            names.extend(_asked_for(backend))
-        else:
-            compiled = backend == "auto" and not native.unavailable()
-            name = plan.executor_of_one_run(compiled, platform, size)
-            with contextlib.suppress(UnsupportedError):
-                if name and plan.lowers_one_run(name, _nodes(name, _program(batch, run))):
-                    names.append(name)
-        if names[:1] == ["native"]:
-            with contextlib.suppress(UnsupportedError, ToolchainError):
-                _build_ahead(batch, run, _program(batch, run))
-        found.append(shape)
+        asked = backend in plan.COMPILED.values()
+        best = plan.executor_of_one_run(backend == "auto" and not native.unavailable(), platform, size)
+        names = _asked_for(backend) if asked else (best,) if best else ()
+        if names:
+            try:
+                batch = _alone(inputs, run, shape)
+                program = _program(batch, run)
+                if not asked and not plan.lowers_one_run(names[0], _nodes(names[0], program)):
+                    names = ()
+                if names[:1] == ("native",):
+                    _build_ahead(batch, run, program)
+            except UnsupportedError as error:
+                found.append(((), shape, str(error)))
+                return
+        found.append((names, shape, None))
 
-    found: list[plan.Shape] = []
+    found: list[tuple[tuple[str, ...], plan.Shape, str | None]] = []
     jax.eval_shape(trace, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    return names, found[0]
+    return found[0]
 
 
 def _alone(inputs: Inputs, run: Run, shape: plan.Shape) -> Batch:

@@ -61,7 +61,7 @@ def simulate(
 
     Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate `run.metrics` or any array by the leaves of the scenario.
     New values of leaves do not recompile, but for which numbers of an arm's geometry are 0, 1, -1 or equal; a new structure or method
-    does.  Another number of steps, or `record_every`, compiles hardly anything, but for a long step that runs as plain JAX.
+    does.  Another number of steps, or `record_every`, compiles the steps alone, unless they run as plain JAX.
 
     Args:
       scenario: what to run, of n joints.

@@ -1,4 +1,4 @@
-"""What every Python that the tests start does first: notebooks, benchmarks and commands trace as much as the tests do (`conftest.py`)."""
+"""What a Python that the tests start does first: notebooks, benchmarks and commands trace as much as the tests do (`conftest.py`)."""
 
 import gc
 
