@@ -298,7 +298,7 @@ def test_another_length_compiles_the_steps_alone(paper, backend):
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path, monkeypatch):
-    """With one warning if it was asked for, without one if it was not; another length is not tried again, another structure is."""
+    """With one warning if it was asked for, without one if it was not; another length is not tried again."""
     broken = tmp_path / "g++"
     broken.write_text('#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho "error: no" >&2\nexit 1\n')
     broken.chmod(0o755)

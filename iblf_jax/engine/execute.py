@@ -290,7 +290,7 @@ def _way_of_one(
         platform, size = jax.default_backend(), operations(inputs)
         shape = plan.lowered_shape(platform, size, 1, nested=False)
         asked = backend in plan.COMPILED.values()
-        best = plan.executor_of_one_run(backend == "auto" and not native.unavailable(), platform, size)
+        best = plan.executor_of_one_run(backend == "auto" and available[0] == "native", platform, size)
         names = _asked_for(backend) if asked else (best,) if best else ()
         if names:
             try:
