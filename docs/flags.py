@@ -1,14 +1,23 @@
-"""The page "Why did my run fail?": a run for every status flag, its picture, and what to do."""
+"""The page "Why did my run fail?": a run for every status flag, its picture, and what to do.
+
+The tests make the sections with `section`, which keeps them in `out/site/flags`; `docs/build.py` takes them from there, and makes what is
+missing or older than this file.
+"""
 
 from __future__ import annotations
 
+import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gallery
+
 import iblf_jax as ij
 from iblf_jax import plotting
+
+MADE = gallery.ROOT / "out" / "site" / "flags"
 
 
 class Case(NamedTuple):
@@ -138,6 +147,33 @@ CASES: dict[str, Case] = {
 """Flag -> a run that raises it."""
 
 
+def section(name: str) -> str:
+    """Runs the case of a flag and writes its section, the picture beside it; raises if the run does not raise the flag."""
+    MADE.mkdir(parents=True, exist_ok=True)
+    case = CASES[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run = case.run()
+    lines = [f"<!-- {gallery.digest(Path(__file__))} -->", f"## {name}", "", case.says, "", f"**What to do.** {case.mend}", ""]
+    if run is not None:
+        if isinstance(run, ij.Rollout) and not int(run.status) & int(ij.Status[name]):
+            raise ValueError(f"the run of {name} has {ij.Status(int(run.status))!r}")
+        case.draw(run).savefig(MADE / f"flag_{name.lower()}.png", dpi=100)
+        lines += [f"![{name}](flag_{name.lower()}.png)", ""]
+    text = "\n".join(lines)
+    _file(name).write_text(text)
+    return text
+
+
+def _file(name: str) -> Path:
+    return MADE / f"{name.lower()}.md"
+
+
+def _is_made(name: str) -> bool:
+    """Whether the section, as this file is now, is there."""
+    return _file(name).exists() and gallery.digest(Path(__file__)) in _file(name).read_text()
+
+
 def write(folder: Path) -> None:
     """Writes the page; raises if a run does not raise its flag, or a flag has no run."""
     missing = {flag.name for flag in ij.Status if flag} - set(CASES)
@@ -149,14 +185,7 @@ def write(folder: Path) -> None:
         "A run, a batch and a study carry status flags, `ij.Status`. Each section has a run that raises its flag.",
     ]
     lines += ["", "```python", "run.ok, ij.Status(int(run.status))", "```", ""]
-    for name, case in CASES.items():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            run = case.run()
-        lines += [f"## {name}", "", case.says, "", f"**What to do.** {case.mend}", ""]
-        if run is not None:
-            if isinstance(run, ij.Rollout) and not int(run.status) & int(ij.Status[name]):
-                raise ValueError(f"the run of {name} has {ij.Status(int(run.status))!r}")
-            case.draw(run).savefig(folder / f"flag_{name.lower()}.png", dpi=100)
-            lines += [f"![{name}](flag_{name.lower()}.png)", ""]
+    lines += [_file(name).read_text() if _is_made(name) else section(name) for name in CASES]
+    for picture in MADE.glob("*.png"):
+        shutil.copy(picture, folder)
     (folder / "why_did_my_run_fail.md").write_text("\n".join(lines))

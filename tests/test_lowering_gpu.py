@@ -133,7 +133,7 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
 @pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
 def test_records_agree_with_the_reference(on_cpu, monkeypatch, written_out):
     monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
-    found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
+    found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "xla"))
     assert_same(found, expected, 1e-9)
 
 
@@ -146,7 +146,7 @@ def test_one_run_is_the_run(on_cpu, paper, sampled):
         sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
         soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
         paper = ij.with_parts(soft, sampling=ij.Sampling(2e-3, delay=1.3e-3), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=600.0))
-    timing = {"duration": 0.15, "dt": 1e-3, "record_every": 10, "seed": 3}
+    timing = {"duration": 0.06, "dt": 4e-4, "record_every": 10, "seed": 3}
     one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "xla"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 

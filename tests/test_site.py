@@ -60,6 +60,12 @@ def test_every_flag_has_a_section():
     assert {flag.name for flag in ij.Status if flag} == set(flags.CASES)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", flags.CASES)
+def test_a_run_raises_its_flag(name):
+    assert f"## {name}" in flags.section(name)
+
+
 def test_every_public_name_is_in_the_reference():
     listed = {name for _, names in reference.PAGES.values() for name in names.split()} | set(reference.FAMILIES)
     classes = {name for name in dir(ij) if not name.startswith("_")}

@@ -113,14 +113,23 @@ class StyledFigure(Figure):
         engine = self.get_layout_engine()
         labels = [(axes, text) for axes in self.axes for text in (axes.title, axes.xaxis.label, axes.yaxis.label) if text.get_text()]
         words = [text.get_text() for _, text in labels]
-        for counted in (False, True, True):
+
+        def laid_out(counted: bool) -> list[tuple[float, float]]:
+            """The length of every label and the room that it has."""
             for _, text in labels:
                 text.set_in_layout(counted)
             if engine is not None:
                 engine.execute(self)
-            for (axes, text), whole in zip(labels, words, strict=True):
+            found = []
+            for axes, text in labels:
                 upright, box, extent = text is axes.yaxis.label, axes.get_window_extent(renderer), text.get_window_extent(renderer)
-                length, room = (extent.height, box.height) if upright else (extent.width, box.width)
+                found.append((extent.height, box.height) if upright else (extent.width, box.width))
+            return found
+
+        if all(length <= room for length, room in laid_out(counted=True)):
+            return
+        for counted in (False, True, True):
+            for (_, text), whole, (length, room) in zip(labels, words, laid_out(counted), strict=True):
                 if length > room > 0:
                     most = int(max(map(len, text.get_text().split("\n"))) * room / length)
                     text.set_text("\n".join(wrapped(line, max(6, most)) for line in whole.split("\n")))

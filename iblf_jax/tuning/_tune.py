@@ -355,9 +355,14 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, first: Value) -> np.ndarr
     if first.valid[0] and first.margin[0] > 0 and not problem.too_slow(z[0]):
         return z
     points, seen, broken = look_around(problem, seed, z)
-    slow = np.array([problem.too_slow(point) for point in points])
-    order = np.lexsort((seen.objective, broken, slow, ~seen.valid))
-    return points[order[: len(z)]]
+    order, best = np.lexsort((seen.objective, broken)), list[int]()
+    for group in (order[seen.valid[order]], order[~seen.valid[order]]):
+        slow = list[int]()
+        for i in group:
+            if len(best) < len(z):
+                (slow if problem.too_slow(points[i]) else best).append(i)
+        best += slow
+    return points[best[: len(z)]]
 
 
 def look_around(problem: Problem, seed: int, z: np.ndarray) -> tuple[np.ndarray, Value, np.ndarray]:
