@@ -161,17 +161,12 @@ def section(name: str) -> str:
         case.draw(run).savefig(MADE / f"flag_{name.lower()}.png", dpi=100)
         lines += [f"![{name}](flag_{name.lower()}.png)", ""]
     text = "\n".join(lines)
-    _file(name).write_text(text)
+    _kept(name).write_text(text)
     return text
 
 
-def _file(name: str) -> Path:
+def _kept(name: str) -> Path:
     return MADE / f"{name.lower()}.md"
-
-
-def _is_made(name: str) -> bool:
-    """Whether the section, as this file is now, is there."""
-    return _file(name).exists() and gallery.digest(Path(__file__)) in _file(name).read_text()
 
 
 def write(folder: Path) -> None:
@@ -185,7 +180,7 @@ def write(folder: Path) -> None:
         "A run, a batch and a study carry status flags, `ij.Status`. Each section has a run that raises its flag.",
     ]
     lines += ["", "```python", "run.ok, ij.Status(int(run.status))", "```", ""]
-    lines += [_file(name).read_text() if _is_made(name) else section(name) for name in CASES]
+    lines += [_kept(name).read_text() if gallery.is_of(_kept(name), Path(__file__)) else section(name) for name in CASES]
     for picture in MADE.glob("*.png"):
         shutil.copy(picture, folder)
     (folder / "why_did_my_run_fail.md").write_text("\n".join(lines))

@@ -36,10 +36,14 @@ def digest(source: Path) -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in files if file.exists())).hexdigest()[:16]
 
 
+def is_of(page: Path, source: Path) -> bool:
+    """Whether the page is there, and was made from the source as it is now."""
+    return page.exists() and digest(source) in page.read_text()
+
+
 def is_made(script: Path) -> bool:
     """Whether the page of this script, as it is now, is there."""
-    page = MADE / f"{script.stem}.md"
-    return page.exists() and digest(script) in page.read_text()
+    return is_of(MADE / f"{script.stem}.md", script)
 
 
 def page(script: Path) -> list[Path]:

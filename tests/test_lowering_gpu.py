@@ -133,7 +133,7 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
 @pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
 def test_records_agree_with_the_reference(on_cpu, monkeypatch, written_out):
     monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
-    found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "xla"))
+    found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
     assert_same(found, expected, 1e-9)
 
 

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import islice
 from typing import Any
 
 import jax
@@ -355,14 +356,12 @@ def way_in(problem: Problem, seed: int, z: np.ndarray, first: Value) -> np.ndarr
     if first.valid[0] and first.margin[0] > 0 and not problem.too_slow(z[0]):
         return z
     points, seen, broken = look_around(problem, seed, z)
-    order, best = np.lexsort((seen.objective, broken)), list[int]()
+    order, ranked = np.lexsort((seen.objective, broken)), list[int]()
     for group in (order[seen.valid[order]], order[~seen.valid[order]]):
-        slow = list[int]()
-        for i in group:
-            if len(best) < len(z):
-                (slow if problem.too_slow(points[i]) else best).append(i)
-        best += slow
-    return points[best[: len(z)]]
+        # The map of a point takes long to look at: no more of them than it takes.
+        fast = list(islice((i for i in group if not problem.too_slow(points[i])), max(len(z) - len(ranked), 0)))
+        ranked += [*fast, *(i for i in group if i not in fast)]
+    return points[ranked[: len(z)]]
 
 
 def look_around(problem: Problem, seed: int, z: np.ndarray) -> tuple[np.ndarray, Value, np.ndarray]:
