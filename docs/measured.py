@@ -29,6 +29,7 @@ PLOTS = {
     "throughput": Plot(
         ("row", "type"), "steps/s a core", "Many runs of the paper's loop at once; more is better.", {"loop": "paper", "runs": 4096}
     ),
+    "gpu": Plot(("row", "device"), "steps/s", "Many runs of the paper's loop on a GPU, and on its machine's processor; more is better."),
     "arm": Plot(("row", "type"), "steps/s a core", "Seven joints, beside what a user would take instead; more is better."),
     "export": Plot(("law", "type"), "cycles", "One call of a law in C, as `ij.export` writes it; less is better."),
     "constraints": Plot(("law",), "us a step", "What keeps which constraints, and the processor time of a step; less is better."),

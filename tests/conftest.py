@@ -13,6 +13,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 os.environ.setdefault("MPLBACKEND", "Agg")
+# On a machine with a GPU, too.  `JAX_PLATFORMS=cuda,cpu` runs test_lowering_gpu.py on it.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # In the environment, for notebooks, benchmarks and commands too, which are processes of their own.  Few programs are met twice, and to keep
 # what is compiled takes longer (15 to 25 % of a test file's time) than to compile these few again.
 os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "0")
@@ -50,7 +52,7 @@ SHORT = {"duration": 0.5, "dt": 1e-3}
 XLA_FLAGS = " ".join(
     [
         "--xla_backend_optimization_level=0",
-        "--xla_cpu_use_fusion_emitters=false",
+        *(["--xla_cpu_use_fusion_emitters=false"] if jax.version.__version_info__ < (0, 11) else []),
         "--xla_cpu_parallel_codegen_split_count=1",
         "--xla_disable_hlo_passes=hlo-verifier",
     ]

@@ -1,4 +1,9 @@
-"""The gpu backend without a GPU: the kernel's logic on a CPU, its source through NVRTC, and what happens where there is no device."""
+"""The gpu backend: the kernel on a GPU or, without one, its logic on a CPU; its source through NVRTC; and what happens without a device.
+
+    JAX_PLATFORMS=cuda,cpu python -m pytest tests/test_lowering_gpu.py
+
+runs on a GPU what elsewhere runs on the CPU.
+"""
 
 from __future__ import annotations
 
@@ -40,6 +45,9 @@ def _has_nvrtc() -> bool:
 
 
 pytestmark = pytest.mark.filterwarnings("error::iblf_jax.engine.execute.BackendWarning")
+ON_A_GPU = jax.default_backend() == "gpu"
+needs_a_cpu = pytest.mark.skipif(ON_A_GPU, reason="what happens without a GPU")
+run_program = gpu.run if ON_A_GPU else gpu_on_cpu.run
 needs_nvrtc = pytest.mark.skipif(not _has_nvrtc(), reason="no NVRTC")
 
 
@@ -73,19 +81,20 @@ def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
 def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
     varied = {"initial.q": [[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]], "plant.mass[1]": [0.9, 0.7, 0.8]}
     program, shared, lane, carry = step_of(with_member(family, name, getattr(ij, family).MEMBERS[name]), varied)
-    (floats, ints), _ = gpu_on_cpu.run(program, shared, lane, carry, 5, None, flags=("-O1",))
+    (floats, ints), _ = run_program(program, shared, lane, carry, 5, None, **({} if ON_A_GPU else {"flags": ("-O1",)}))
     layout, expected = Layout.of(program), stepped(program, shared, lane, carry, 5)
     np.testing.assert_allclose(floats, expected[layout.floats], rtol=1e-10, atol=1e-10)
     np.testing.assert_array_equal(ints, expected[layout.ints])
 
 
 @pytest.fixture
-def on_cpu(monkeypatch):
-    """The gpu backend runs here, in blocks of 32 threads and stretches of 64 steps."""
-    monkeypatch.setattr(gpu, "run", gpu_on_cpu.run)
+def runs_here(monkeypatch):
+    """The gpu backend runs here, in stretches of 64 steps, on a CPU in blocks of 32 threads."""
     monkeypatch.setattr(plan, "GPU_STRETCH", 64)
-    monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
     monkeypatch.setattr(execute, "_told", set())
+    if not ON_A_GPU:
+        monkeypatch.setattr(gpu, "run", gpu_on_cpu.run)
+        monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
 
 
 def outcome(dtype, backend, values, steps=200, record_every=None):
@@ -109,7 +118,7 @@ def spoiled(runs):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_a_batch_agrees_with_the_reference(dtype, on_cpu):
+def test_a_batch_agrees_with_the_reference(dtype, runs_here):
     """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not full."""
     good = draws(37)
     found, expected = outcome(dtype, "gpu", good), outcome(dtype, "vmap", good)
@@ -118,7 +127,7 @@ def test_a_batch_agrees_with_the_reference(dtype, on_cpu):
 
 
 @needs_compiler
-def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
+def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(runs_here):
     values = spoiled(37)
     found, good, expected = outcome("float64", "gpu", values), outcome("float64", "gpu", draws(37)), outcome("float64", "vmap", values)
     np.testing.assert_array_equal(found.status, expected.status)
@@ -131,7 +140,7 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(on_cpu):
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
-def test_records_agree_with_the_reference(on_cpu, monkeypatch, written_out):
+def test_records_agree_with_the_reference(runs_here, monkeypatch, written_out):
     monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
     found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
     assert_same(found, expected, 1e-9)
@@ -140,7 +149,7 @@ def test_records_agree_with_the_reference(on_cpu, monkeypatch, written_out):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
-def test_one_run_is_the_run(on_cpu, paper, sampled):
+def test_one_run_is_the_run(runs_here, paper, sampled):
     """A law that is sampled and delayed too, with the noise of its sensor: its branches are calls in the kernel."""
     if sampled:
         sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
@@ -158,13 +167,14 @@ def test_forward_sensitivities(paper):
     along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
     inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), Run(60, "euler")
-    executor, numbers = lowered_on(gpu_on_cpu.run), {path: np.reshape(x, shape) for path, shape, x in along.items}
+    executor, numbers = lowered_on(run_program), {path: np.reshape(x, shape) for path, shape, x in along.items}
     pushed = jax.jit(lambda v: run_with_tangents(executor, Batch.of(inputs, v), along, run))(varied)
     expected = jax.jit(lambda v: execute.run_batch_jvp(scenario, v, numbers, inputs.folds, dt, run, backend="vmap"))(varied)
     for x, y in zip(pushed, expected, strict=True):
         assert_same(jax.tree.map(np.asarray, x), jax.tree.map(np.asarray, y), 1e-10)
 
 
+@needs_a_cpu
 @needs_compiler
 def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkeypatch):
     monkeypatch.setattr(plan, "GPU_STRETCH", 4)
@@ -180,6 +190,7 @@ def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkey
     np.testing.assert_array_equal(ints, carry.ints)
 
 
+@needs_a_cpu
 @needs_compiler
 def test_what_the_driver_refuses_is_an_error_of_jax(paper):
     program, shared, lane, carry = step_of(paper, draws(2))
@@ -197,6 +208,7 @@ def test_threads_in_a_block(runs, threads):
     assert plan.gpu_threads(runs, 132) == threads
 
 
+@needs_a_cpu
 def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setattr(execute, "_told", set())
     called = []
@@ -208,6 +220,7 @@ def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
     assert called == ["xla"] * 2
 
 
+@needs_a_cpu
 @needs_compiler
 def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     told = repr(ij.explain(paper))
@@ -217,6 +230,7 @@ def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     assert "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told and "derivatives of simulate: by plain JAX: it needs" in told
 
 
+@needs_a_cpu
 def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     def missing(*_):
         raise ToolchainError("there is no NVRTC")
@@ -231,6 +245,24 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
     assert execute.automatic() == ("gpu", None)
+
+
+@needs_a_cpu
+@needs_compiler
+def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
+    """Where JAX computes on a GPU, a user may compute on the processor: runs and studies take its backend and its devices."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    perturbations = {"plant.mass[1]": ij.value(ij.uniform(0.7, 0.9))}
+    with pytest.raises(ValueError, match=r"platform that JAX computes on, gpu.*jax\.default_device"):
+        ij.monte_carlo(paper, perturbations, runs=3, duration=0.05, devices=jax.devices("cpu"))
+    monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert execute.automatic() == ("native", None)
+        run = ij.simulate(paper, duration=0.05, dt=1e-3)
+        study = ij.monte_carlo(paper, perturbations, runs=600, duration=0.05, dt=1e-3)
+    assert study.backend == "native"
+    assert run.ok
+    assert not study.status.any()
 
 
 @pytest.mark.parametrize(
@@ -283,6 +315,7 @@ def test_what_nvrtc_refuses_is_reported_in_one_line():
         assert "\n" not in str(error.value)
 
 
+@needs_a_cpu
 @needs_nvrtc
 @needs_compiler
 def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper, monkeypatch):
@@ -295,7 +328,7 @@ def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper,
     assert "every = 10 : i64, steps = 20001 : i64, threads = 32 : i64" in text
 
 
-@pytest.mark.skipif(jax.default_backend() != "gpu", reason="no GPU")
+@pytest.mark.skipif(not ON_A_GPU, reason="no GPU")
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_on_a_gpu_it_agrees_with_the_reference(dtype):
     values = spoiled(1000)

@@ -20,6 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.devices import default, platform
+
 F = TypeVar("F", bound=Callable)
 
 MOST_STEPS = 2**31 - 1
@@ -357,9 +359,12 @@ def listed(name: str, value: Any, example: str) -> list[Any]:
 def devices(name: str, value: Any) -> list[jax.Device]:
     """A user's devices, all of this process if there are none given, or a ValueError."""
     if value is None:
-        return list(jax.local_devices())
+        return default()
     if not isinstance(value, list | tuple) or not value or not all(isinstance(x, jax.Device) for x in value):
         raise fail(name, value, "a list of at least one device", "jax.devices() lists them; leave it out for all of them.")
+    if {device.platform for device in value} != {platform()}:
+        remedy = "Put the call into `with jax.default_device(device):` to compute on another one."
+        raise fail(name, value, f"devices of the platform that JAX computes on, {platform()}", remedy)
     return list(value)
 
 

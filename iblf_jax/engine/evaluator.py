@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from iblf_jax.core import devices
 from iblf_jax.engine import plan, vector_math
 from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.program import Node, Program, needed
@@ -140,7 +141,7 @@ class Evaluator:
 
 def on_cpu() -> bool:
     """Whether arrays live on CPU."""
-    return jax.default_backend() == "cpu"
+    return devices.platform() == "cpu"
 
 
 def as_function(f):

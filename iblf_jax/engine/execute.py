@@ -3,7 +3,7 @@
     scan     the step as it is: any scenario, any device; a user calls it "vmap"
     xla      the step's scalar program, one (batch,) array a number: any device, nothing needed but jax
     native   the same program as C, built by the system's compiler, SIMD over runs and threads: CPU
-    gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs (not yet measured on one)
+    gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs
 
 All give the same results.  What a scalar program cannot express runs on scan, and what has no compiler, or is for another device, on xla;
 a `BackendWarning` says why, once.
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, devices
 from iblf_jax.engine import gpu, native, plan, xla
 from iblf_jax.engine.batch import Batch, Executor, begin, carry_shapes, end, run_all
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
@@ -56,9 +56,9 @@ def _tell(text: str) -> None:
 
 def automatic() -> tuple[str, str | None]:
     """The backend that "auto" takes for what lowers, and why it is not a compiled one, in one line (None if it is)."""
-    best = plan.executors_for("auto", jax.default_backend())[0]
+    best = plan.executors_for("auto", devices.platform())[0]
     if best == "xla":
-        return best, f"no kernels are compiled for {jax.default_backend()}"
+        return best, f"no kernels are compiled for {devices.platform()}"
     reason = EXECUTORS[best].unavailable()
     return ("xla", reason) if reason else (best, None)
 
@@ -66,7 +66,7 @@ def automatic() -> tuple[str, str | None]:
 def _asked_for(backend: str) -> tuple[str, ...]:
     """The executors that lower a step, best first, for what the user asked for on this platform."""
     checks.one_of("backend", backend, plan.BACKENDS)
-    platform = jax.default_backend()
+    platform = devices.platform()
     if backend in plan.COMPILED.values() and plan.COMPILED.get(platform) != backend:
         _tell(f"The {backend} backend is not for the default device, {platform}: running on xla.")
         backend = "xla"
@@ -122,7 +122,7 @@ def _nodes(name: str, program: Program) -> int:
 
 
 def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, nested: bool = False) -> Batch:
-    shape = plan.lowered_shape(jax.default_backend(), operations(inputs), len(next(iter(varied.values()))), nested)
+    shape = plan.lowered_shape(devices.platform(), operations(inputs), len(next(iter(varied.values()))), nested)
     return Batch.of(inputs, varied, shape, run.mechanism)
 
 
@@ -169,7 +169,7 @@ def operations(inputs: Inputs) -> int:
 
 def _shape(inputs: Inputs, runs: int | None, nested: bool) -> plan.Shape:
     """How the scan executor runs them."""
-    return plan.scan_shape(jax.default_backend(), operations(inputs), runs, nested)
+    return plan.scan_shape(devices.platform(), operations(inputs), runs, nested)
 
 
 def _scanned(inputs: Inputs, varied: Mapping[str, jax.Array] | None, nested: bool, run: Callable) -> Any:
@@ -228,8 +228,8 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
-      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", which is native where there is a compiler.  What
-        is long or does not lower is, on "auto" and "xla", on scan, without a warning.
+      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", the one of the first two that is for this platform,
+        where it can be built.  What is long or does not lower is, on "auto" and "xla", on scan, without a warning.
       noise: key of a sampled loop's noise.
     """
     leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, run, noise))
@@ -287,10 +287,11 @@ def _way_of_one(
 
     def trace(leaves):
         inputs = jax.tree.unflatten(structure, leaves)
-        platform, size = jax.default_backend(), operations(inputs)
+        platform, size = devices.platform(), operations(inputs)
         shape = plan.lowered_shape(platform, size, 1, nested=False)
         asked = backend in plan.COMPILED.values()
-        best = plan.executor_of_one_run(backend == "auto" and available[0] == "native", platform, size)
+        compiled = available[0] if backend == "auto" and available[0] in plan.COMPILED.values() else None
+        best = plan.executor_of_one_run(compiled, platform, size)
         names = _asked_for(backend) if asked else (best,) if best else ()
         if names:
             try:

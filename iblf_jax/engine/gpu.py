@@ -5,8 +5,8 @@ runs.  NVRTC compiles it for the GPU at hand; the system's C++ compiler builds t
 (`c/launch.h`), so neither nvcc nor CUDA's headers are needed.  Long rollouts are launched in stretches of steps, whose signals of
 time another kernel tabulates first.
 
-Not yet run on a GPU: the tests run the same source and the same launcher on a CPU, against a driver that loops over the threads, and
-compile it for GPUs where NVRTC is installed.
+The tests run on a GPU where there is one; elsewhere the same source and the same launcher run on a CPU, against a driver that loops over
+the threads, and are compiled for GPUs where NVRTC is installed.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from functools import lru_cache
 import jax
 import numpy as np
 
+from iblf_jax.core import devices
 from iblf_jax.engine import plan
 from iblf_jax.lowering import nvrtc
 from iblf_jax.lowering.emit_c import CUDA, header, sizes, source
@@ -30,13 +31,13 @@ _registered: set[str] = set()
 
 def architecture() -> str:
     """What NVRTC calls this process's GPUs, as in "sm_90"; ToolchainError if they are none that it can compile for."""
-    devices = jax.local_devices()
-    found = {str(getattr(device, "compute_capability", "")) for device in devices}
+    places = devices.default()
+    found = {str(getattr(device, "compute_capability", "")) for device in places}
     if len(found) > 1:
         raise ToolchainError(f"the GPUs differ: compute capabilities {', '.join(sorted(found))}")
     match = re.fullmatch(r"(\d+)\.(\d)", found.pop())
     if not match:
-        raise ToolchainError(f"it needs an NVIDIA GPU, not {devices[0].device_kind}")
+        raise ToolchainError(f"it needs an NVIDIA GPU, not {places[0].device_kind}")
     return f"sm_{match[1]}{match[2]}"
 
 
@@ -104,5 +105,5 @@ def run(
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs; arguments and results as `native.run`."""
     name = kernel(program, shared.size, lane.shape[0], architecture())
-    processors = getattr(jax.local_devices()[0], "core_count", plan.GPU_PROCESSORS)
+    processors = getattr(devices.default()[0], "core_count", plan.GPU_PROCESSORS)
     return call(name, program, shared, lane, carry, steps, every, plan.gpu_threads(carry.floats.shape[1], processors))

@@ -18,6 +18,7 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
+from iblf_jax.core import devices
 from iblf_jax.engine.plan import LARGEST_ARRAY, LARGEST_REDUCED, LONGEST_FUNCTION
 
 REFUSED = frozenset(
@@ -65,7 +66,7 @@ def machine_function(function: Callable) -> Callable:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         call = jaxpr_as_fun(closed)
         operations = list(_operations(closed.jaxpr))
-        if jax.default_backend() == "cpu" and len(operations) <= LONGEST_FUNCTION and all(map(_is_trusted, operations)):
+        if devices.platform() == "cpu" and len(operations) <= LONGEST_FUNCTION and all(map(_is_trusted, operations)):
             call = set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(call))
         return jax.tree.unflatten(jax.tree.structure(shapes), call(*jax.tree.leaves(args)))
 

@@ -72,10 +72,11 @@ def simulate(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
       backend: "native": generated code, built by the system's compiler once for a structure and kept on disk; "xla": the same program
-        without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native where there is a
-        compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside your own `jit` or `vmap` a run
-        is plain JAX; where it is differentiated by numbers of the scenario, it and its first and second derivatives are the kernel's if
-        there is one, but for "xla".  Derivatives are of all that is recorded, so record little where only metrics matter.
+        without a compiler, twice as slow; "gpu": the same as one kernel on an NVIDIA GPU; "auto": native, or gpu if that is
+        JAX's default device, where there is a compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on "xla".  Inside
+        your own `jit` or `vmap` a run is plain JAX; where it is differentiated by numbers of the scenario, it and its first and second
+        derivatives are the kernel's if there is one, but for "xla".  Derivatives are of all that is recorded, so record little where only
+        metrics matter.
       seed: fixes the noise of a sensor; the run is number 0 of a study with this seed.
 
     Returns:

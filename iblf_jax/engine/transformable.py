@@ -21,7 +21,7 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, devices
 from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
@@ -67,7 +67,7 @@ def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *
 def _plain(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
-    shape = plan.scan_shape(jax.default_backend(), execute.operations(inputs), None, nested=True)
+    shape = plan.scan_shape(devices.platform(), execute.operations(inputs), None, nested=True)
     return run_all(scan, Batch.of(inputs, None, shape), runs.run)
 
 

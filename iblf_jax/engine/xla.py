@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from iblf_jax.core import devices
 from iblf_jax.engine import plan
 from iblf_jax.engine.evaluator import Entry, Evaluator, Table, on_cpu
 from iblf_jax.engine.machine_function import machine_function
@@ -34,7 +35,7 @@ def run(
     """
     program = compilable(program)
     runs = carry.floats.shape[1]
-    width = plan.xla_width(jax.default_backend(), len(program.nodes), runs)
+    width = plan.xla_width(devices.platform(), len(program.nodes), runs)
     blocks = -(-runs // width)
 
     def apart(rows):

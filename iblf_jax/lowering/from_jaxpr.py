@@ -89,9 +89,17 @@ def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
     return interpret(b, inner, consts, operands)
 
 
+def _parts(params: dict[str, Any]) -> tuple[int, int]:
+    """How many operands of a scan are constants, and how many its carry."""
+    if "num_consts" in params:  # before jax 0.11
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
 def _scan(b: Builder, eqn, operands, used):
     params = eqn.params
-    length, n_const, n_carry = params["length"], params["num_consts"], params["num_carry"]
+    length, (n_const, n_carry) = params["length"], _parts(params)
     if length > b.limits.scan:
         raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})")
     const, carry, xs = operands[:n_const], operands[n_const : n_const + n_carry], operands[n_const + n_carry :]

@@ -165,11 +165,21 @@ def _square(b: Builder, eqn, x: Ids) -> Ids:
     return each(b, "mul", eqn, x, x)
 
 
+def _one_minus_square(b: Builder, eqn, x: Ids) -> Ids:
+    """As (1 + x) (1 - x), which is exact where |x| is close to 1."""
+    one = np.full(x.shape, b.constant(1, "f"))
+    return each(b, "mul", eqn, each(b, "add", eqn, one, x), each(b, "sub", eqn, one, x))
+
+
+def _log2(b: Builder, eqn, x: Ids) -> Ids:
+    return each(b, "div", eqn, each(b, "log", eqn, x), np.full(x.shape, b.constant(np.log(2.0), "f")))
+
+
 RULES: dict[str, Callable] = {
     **{name: _elementwise(op) for op, row in OPERATIONS.items() for name in ((op,) if row.primitives is None else row.primitives)},
     **STRUCTURE,
     "square": _square, "pow": _pow, "integer_pow": _integer_pow, "round": _round, "select_n": _select_n, "clamp": _clamp,
-    "convert_element_type": _convert,
+    "convert_element_type": _convert, "one_minus_square": _one_minus_square, "log2": _log2,  # the last two since jax 0.11
     "stop_gradient": _stop, "optimization_barrier": _stop, "copy": _stop, "copy_p": _stop, "reduce_precision": _stop,
     "reduce_sum": _reduce("add"), "reduce_prod": _reduce("mul"), "reduce_max": _reduce("max"), "reduce_min": _reduce("min"),
     "reduce_and": _reduce("and"), "reduce_or": _reduce("or"), "argmin": _arg_extreme("lt"), "argmax": _arg_extreme("gt"),

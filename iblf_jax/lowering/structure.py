@@ -44,6 +44,10 @@ def _stack(b: Builder, eqn, *operands: Ids) -> Ids:
     return np.stack(operands, axis=eqn.params.get("axis", eqn.params.get("dimension", 0)))
 
 
+def _unstack(b: Builder, eqn, x: Ids):
+    return list(np.moveaxis(x, eqn.params["axis"], 0))
+
+
 def _split(b: Builder, eqn, x: Ids):
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"])
 
@@ -193,6 +197,7 @@ def _scatter(op: str | None) -> Callable:
 STRUCTURE: dict[str, Callable] = {
     "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "broadcast_in_dim": _broadcast_in_dim, "transpose": _transpose,
     "slice": _slice, "concatenate": _concatenate, "stack": _stack, "split": _split, "rev": _rev, "pad": _pad, "iota": _iota,
+    "unstack": _unstack,  # since jax 0.11
     "gather": _gather, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "scatter": _scatter(None),
     "scatter-add": _scatter("add"), "scatter_add": _scatter("add"), "scatter_mul": _scatter("mul"), "scatter-mul": _scatter("mul"),
 }  # fmt: skip

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.devices import chosen, default, platform
 from iblf_jax.core.status import Status, flag
 from iblf_jax.engine import plan
 from iblf_jax.engine.execute import chosen_backend, run_batch
@@ -60,7 +61,7 @@ class Results(NamedTuple):
 
 def block_size() -> int:
     """Runs in a block on the devices of this process."""
-    return plan.study_block(jax.default_backend())
+    return plan.study_block(platform())
 
 
 def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
@@ -134,7 +135,7 @@ def run_blocks(
     *,
     chunk: int | None = None,
     memory: float = plan.STUDY_MEMORY,
-    devices: Sequence[jax.Device] | None = None,
+    devices: list[jax.Device] | None = None,
     record_every: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Runs blocks and yields (block, its results on the host), in order.
@@ -151,7 +152,7 @@ def run_blocks(
     if not blocks:
         return
     size = block_size()
-    places = list(jax.local_devices() if devices is None else devices)[: len(blocks)]
+    places, chosen_device = (devices or default())[: len(blocks)], chosen()
     call = partial(_execute, study_run=study_run, record_every=record_every)
     copies = [jax.device_put(shared, place) for place in places]
     if len(places) > 1:
@@ -161,7 +162,8 @@ def run_blocks(
         """Those of block `blocks[k]`, on the host, and how many bytes it took."""
         place = k % len(places)
         lanes = jax.device_put(lanes_of(np.arange(blocks[k] * size, (blocks[k] + 1) * size)), places[place])
-        out = call(copies[place], lanes)
+        with jax.default_device(chosen_device):  # which is a thread's own
+            out = call(copies[place], lanes)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
 
     first, each = results(0)  # alone: what is compiled is compiled once, and what a block takes is known after it

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from iblf_jax.core import devices
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.lowering.toolchain import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
@@ -89,7 +90,7 @@ def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
         "backend": study_run.backend,
-        "platform": jax.default_backend(),
+        "platform": devices.platform(),
         **({"kernel": built_for()} if study_run.backend == "native" else {}),
         "block": block_size(),
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__, "jaxlib": jaxlib.__version__},

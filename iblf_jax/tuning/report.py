@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, devices
 from iblf_jax.core.status import Status
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import fresh_together
@@ -294,7 +294,7 @@ def make_report(
 
     def made(scenarios: tuple[Scenario, ...], runs: int, dt: float) -> list[_Sample]:
         steps = runs * len(scenarios) * checks.whole_steps(timing["duration"], dt)
-        at_once = fresh_together(jax.default_backend(), steps, together)
+        at_once = fresh_together(devices.platform(), steps, together)
         return _run(scenarios, tuned, objective, perturbations, runs, seed, timing | {"dt": dt}, backend, at_once)
 
     samples = made((before, after), runs if perturbations else 0, timing["dt"])
