@@ -162,6 +162,11 @@ CASES = {
     "updates": (lambda x: x.at[1, 0].set(7.0).at[0, 1:].add(2.0).at[1].mul(3.0), X),
     "powers": (lambda x: x**7 + x**-2 + jnp.abs(x) ** 1.5 + jnp.float_power(2.0, x), X),
     "elementary": (lambda y: jnp.tanh(y) + jnp.arctan2(y, 1 - y) + jnp.log1p(y) + jax.scipy.special.erf(y) + jax.nn.sigmoid(y), Y),
+    "derivatives": (
+        lambda y: jax.jvp(lambda y: jnp.tanh(y) + jnp.arcsin(y) + jnp.arctanh(y) + jnp.log2(y), (y,), (y,))[1] + jnp.log2(y),
+        Y,
+    ),
+    "unstack": (lambda x: sum(jnp.unstack(x, axis=1)), X),
     "pad and stack": (lambda x: jnp.stack([jnp.pad(x, 1), jnp.pad(x, ((0, 2), (1, 1)))]), X),
     "own index": (lambda x, k: x[:, k[1]] + jax.lax.dynamic_slice(x, (k[0], k[1]), (1, 1))[0, 0], X, K),
     "table": (lambda k: jnp.asarray(TABLE)[:, 90 * k[2]] * jax.lax.dynamic_slice(jnp.asarray(TABLE), (1, 70 * k[1]), (1, 2))[0], K),
