@@ -255,6 +255,37 @@ def test_mjcf_that_includes_another_file(file):
         ij.robots.load(file(main), tip="ee")
 
 
+def including(name: str) -> str:
+    return MJCF.format(finger="").replace("<worldbody>", f'<include file="{name}"/><worldbody>')
+
+
+def test_an_include_in_a_folder_below_is_read(file, tmp_path):
+    (tmp_path / "parts").mkdir()
+    file("<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>", "parts/more.xml")
+    assert ij.robots.load(file(including("parts/more.xml")), tip="ee").n == 3
+    assert ij.robots.load(file(including("./parts/../parts/more.xml")), tip="ee").n == 3
+
+
+@pytest.mark.parametrize("leads", ["up", "absolute", "link", "linked folder", "deep"])
+def test_an_include_outside_the_folder_of_the_file_is_refused(leads, tmp_path):
+    (tmp_path / "arm" / "parts").mkdir(parents=True)
+    outside = tmp_path / "more.xml"
+    outside.write_text("<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>")
+    (tmp_path / "arm" / "link.xml").symlink_to(outside)
+    (tmp_path / "arm" / "folder").symlink_to(tmp_path)
+    name = {
+        "up": "../more.xml",
+        "absolute": str(outside),
+        "link": "link.xml",
+        "linked folder": "folder/more.xml",
+        "deep": "parts/../../more.xml",
+    }[leads]
+    path = tmp_path / "arm" / "arm.xml"
+    path.write_text(including(name))
+    with pytest.raises(ValueError, match=r"arm\.xml: <include>: file: got .*, expected a file in the folder of the.*Copy"):
+        ij.robots.load(path, tip="ee")
+
+
 # ----------------------------------------------------------------------------------------------------------------- bad files
 
 PLAIN = (link("base", ""), link("a"), link("b"))
@@ -352,6 +383,60 @@ def test_bad_files_are_refused_by_name(name, file):
     with pytest.raises(ValueError, match=message):
         ij.robots.load(path)
     assert time.perf_counter() - start < 1.0
+
+
+STRANGE_NUMBERS = [
+    "2_5",
+    "1_000.0",
+    "\u0661\u0662",
+    "\uff11.5",
+    "infinity",
+    "-inf",
+    "nan",
+    "NaN",
+    "0x10",
+    "1e",
+    "1,5",
+    "1f",
+    "--1",
+    "1\u00a0",
+]
+PLACES = {
+    "link 'a': mass": SOLID.replace('"1.5"', '"{}"'),
+    "link 'a': inertia iyy": SOLID.replace('"0.03"', '"{}"'),
+    "link 'a': inertial: origin xyz": SOLID.replace("0 0 0.1", "0 {} 0.1"),
+}
+
+
+@pytest.mark.parametrize("text", STRANGE_NUMBERS)
+def test_numbers_that_are_not_decimal_are_refused_with_file_element_and_attribute(text, file):
+    for place, inside in PLACES.items():
+        path = file(robot(link("base", ""), link("a", inside.format(text)), joint("ja", "base", "a")))
+        with pytest.raises(ValueError, match=f"arm.urdf: {place}: got .*, expected .*finite"):
+            ij.robots.load(path)
+    path = file(robot(link("base", ""), link("a"), joint("ja", "base", "a", inside=LIMIT.replace('"2"', f'"{text}"'))))
+    with pytest.raises(ValueError, match=r"arm.urdf: joint 'ja': limit upper: got .*, expected .*finite"):
+        ij.robots.load(path)
+    path = file(mjcf(f'<body name="b" pos="0 {text} 0">{SPHERE}</body>'))
+    with pytest.raises(ValueError, match=r"arm.urdf: body 'b': pos: got .*, expected .*finite"):
+        ij.robots.load(path)
+
+
+@pytest.mark.parametrize("text", ["2.5", "+2.5", "25e-1", "2.5E+0", ".25e1", "\n\t2.5 "])
+def test_decimal_numbers_are_read(text, file):
+    arm = ij.robots.load(file(robot(link("base", ""), link("a", SOLID.replace('"1.5"', f'"{text}"')), joint("ja", "base", "a"))))
+    np.testing.assert_array_equal(arm.mass, [2.5])
+
+
+def test_every_refusal_of_a_field_names_the_file(file):
+    for name, (text, _) in {**BAD, **BAD_MJCF}.items():
+        path = file(text)
+        with pytest.raises(ValueError, match="arm.urdf") as caught:
+            ij.robots.load(path)
+        assert str(caught.value).count(str(path)) == 1, name
+    for arguments in ({"base": "bases"}, {"tip": "tool", "gravity": 9.81}, {"tip": "tool", "locked": {"elbows": 0.0}}):
+        with pytest.raises(ValueError, match="arm.urdf: "):
+            ij.robots.load(file(robot(*GRIPPER)), **arguments)
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,12 @@ def renamed(**names: str) -> Callable[[F], F]:
 
 def inside(where: str | os.PathLike, error: Exception) -> ValueError:
     """An error in a file, or in a part of one: the same with a name in front."""
-    return ValueError(f"{line(os.fspath(where), 'field')}: {error}" if where else str(error))
+    if not where:
+        return ValueError(str(error))
+    name, most = os.fspath(where), LONGEST_TEXT["field"]
+    if len(name) > most:  # of a long path the end says more than the beginning
+        name = "..." + name[-(most - 3) :]
+    return ValueError(f"{line(name, 'field')}: {error}")
 
 
 def _is_number_like(value: Any, depth: int = 0) -> bool:

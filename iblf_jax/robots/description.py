@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,10 @@ LARGEST_NUMBER = 1e10
 """No length, mass or inertia of a robot in SI units is beyond."""
 FARTHEST = 1e20
 """A range or a friction may be, where it stands for "none" or "locked"."""
+DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+"""A number of a description.  Python's `float` also accepts "2_5", digits of other scripts, "infinity" and "nan"."""
+SPACES = " \t\r\n"
+"""What separates the numbers of an attribute: the white space of XML."""
 
 
 class Shown(str):
@@ -52,13 +57,24 @@ def read(path: str | os.PathLike) -> ET.Element:
       ValueError: no such file, not a file, too large, too deep, not XML, or XML that declares entities.
     """
     place = checks.file_path("path", path, "a URDF or MJCF file")
-    root = _Reader(place.parent).parse(place)
+    try:
+        root = _Reader(place.parent).parse(place)
+    except ValueError as error:
+        raise of_file(path, error) from error
     if root.tag not in ("robot", "mujoco"):
         expected = "a URDF or MJCF file"
         if root.tag == "sdf":
             raise checks.fail("path", str(path), expected, "It is SDF.")
         raise checks.fail("path", str(path), expected, f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.")
     return root
+
+
+def of_file(path: str | os.PathLike, error: ValueError) -> ValueError:
+    """The error with the file's name in front, unless its message names the file already."""
+    text = str(error)
+    if text.startswith(f"{path}: ") or repr(str(path)) in text:
+        return error
+    return checks.inside(path, error)
 
 
 class _Reader:
@@ -120,10 +136,25 @@ class _Reader:
                 file = element.get("file")
                 if not file:
                     raise checks.fail("<include>", Shown("no file"), 'file="..."')
-                children = list(self.parse(self.folder / file, nesting + 1))
+                children = list(self.parse(self._included(file), nesting + 1))
                 at = list(parent).index(element)
                 parent[at : at + 1] = children
         return root
+
+    def _included(self, file: str) -> Path:
+        """The path of an included file, which must be in the main file's folder or below it.
+
+        Symbolic links are followed before the comparison, so that a link cannot lead out of the folder.
+        """
+        folder = os.path.realpath(self.folder)
+        expected = f"a file in the folder of the description, {folder}, or in a folder below it"
+        remedy = "Copy the file into that folder and name it by a relative path."
+        if "\0" in file or os.path.isabs(file):
+            raise checks.fail("<include>: file", file, expected, remedy)
+        target = os.path.realpath(os.path.join(folder, file))
+        if os.path.commonpath([folder, target]) != folder:
+            raise checks.fail("<include>: file", file, expected, remedy)
+        return Path(target)
 
     def _bytes(self, path: Path) -> bytes:
         data = contents("path", path, self.bytes_left, "the path of a URDF or MJCF file")
@@ -154,14 +185,14 @@ def label(element: ET.Element) -> str:
 
 def floats(where: str, text: str, count: int | None = None, *, most: float = LARGEST_NUMBER, longest: int = 100) -> list[float]:
     """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as expected, finite and below `most`."""
-    words = text.split()
+    words = [word for word in re.split(f"[{SPACES}]+", text.strip(SPACES)) if word]
     expected = f"{count} numbers" if count and count > 1 else "one number" if count else "numbers"
     if (count is not None and len(words) != count) or not 1 <= len(words) <= longest:
         raise checks.fail(where, text, expected)
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        raise checks.fail(where, text, expected) from None
+    if not all(DECIMAL.fullmatch(word) for word in words):
+        remedy = "Write decimal numbers such as 0.25, -3 or 1.5e-3, separated by spaces."
+        raise checks.fail(where, text, f"{expected}, finite, in decimal notation and in SI units", remedy)
+    values = [float(word) for word in words]
     if not all(math.isfinite(x) and abs(x) < most for x in values):
-        raise checks.fail(where, text, f"{expected}, finite and in SI units")
+        raise checks.fail(where, text, f"{expected}, finite and in SI units", f"Its size must be below {most:g}.")
     return values

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,18 +74,40 @@ def load(
     base, tip = (None if x is None else checks.word(what, x, "the name of a link") for what, x in (("base", base), ("tip", tip)))
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
     root, repairs = description.read(path), Repairs(checks.flag("repair", repair))
-    if root.tag == "robot":
-        file = urdf.checked(root)
-        tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
-        chain = _Chain.picked(tree, base, tip, dict(locked), repairs).following(file, repairs)
-        arm = chain.arm(gravity, {}, repairs, file.speeds)
-    else:
-        model = mjcf.checked(root, Path(path).parent)
-        tree = Tree.compiled(model.text, str(path), "world", model.taken_out)
-        arm = _Chain.picked(tree, base, tip, dict(locked), repairs).arm(gravity, model.tendons, repairs, {})
+    picked = _Request(base, tip, dict(locked), gravity, repairs)
+    try:
+        arm = _from_urdf(root, path, picked) if root.tag == "robot" else _from_mjcf(root, path, picked)
+    except ValueError as error:
+        raise description.of_file(path, error) from error
     if arm.repaired:
         warnings.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".", stacklevel=2)
     return arm
+
+
+class _Request(NamedTuple):
+    """What the caller wants of a file."""
+
+    base: str | None
+    tip: str | None
+    locked: dict[str, float]
+    gravity: Any
+    repairs: Repairs
+
+
+def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+    """The arm of a URDF whose root element has been read."""
+    file = urdf.checked(root)
+    tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
+    chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
+    return chain.following(file, request.repairs).arm(request.gravity, {}, request.repairs, file.speeds)
+
+
+def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+    """The arm of an MJCF whose root element has been read."""
+    model = mjcf.checked(root, Path(path).parent)
+    tree = Tree.compiled(model.text, str(path), "world", model.taken_out)
+    chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
+    return chain.arm(request.gravity, model.tendons, request.repairs, {})
 
 
 class _Chain(NamedTuple):
