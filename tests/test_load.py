@@ -385,22 +385,10 @@ def test_bad_files_are_refused_by_name(name, file):
     assert time.perf_counter() - start < 1.0
 
 
-STRANGE_NUMBERS = [
-    "2_5",
-    "1_000.0",
-    "\u0661\u0662",
-    "\uff11.5",
-    "infinity",
-    "-inf",
-    "nan",
-    "NaN",
-    "0x10",
-    "1e",
-    "1,5",
-    "1f",
-    "--1",
-    "1\u00a0",
-]
+STRANGE_NUMBERS = (
+    *("2_5", "1_000.0", "\u0661\u0662", "\uff11.5", "1\u00a0", "infinity", "-inf", "nan", "NaN"),
+    *("0x10", "1e", "1,5", "1f", "--1"),
+)
 PLACES = {
     "link 'a': mass": SOLID.replace('"1.5"', '"{}"'),
     "link 'a': inertia iyy": SOLID.replace('"0.03"', '"{}"'),
@@ -431,11 +419,11 @@ def test_decimal_numbers_are_read(text, file):
 def test_every_refusal_of_a_field_names_the_file(file):
     for name, (text, _) in {**BAD, **BAD_MJCF}.items():
         path = file(text)
-        with pytest.raises(ValueError, match="arm.urdf") as caught:
+        with pytest.raises(ValueError, match=r"arm\.urdf") as caught:
             ij.robots.load(path)
         assert str(caught.value).count(str(path)) == 1, name
     for arguments in ({"base": "bases"}, {"tip": "tool", "gravity": 9.81}, {"tip": "tool", "locked": {"elbows": 0.0}}):
-        with pytest.raises(ValueError, match="arm.urdf: "):
+        with pytest.raises(ValueError, match=r"arm\.urdf: "):
             ij.robots.load(file(robot(*GRIPPER)), **arguments)
 
 
