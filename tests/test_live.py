@@ -1,4 +1,4 @@
-"""The live page: its sliders, and its curves against `simulate`, in a browser where there is one."""
+"""The live page: its sliders, and its curves against `simulate`, in Node.js and in a browser where there is one."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import json
 import re
 import shutil
 import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,9 @@ from iblf_jax.deployment import live
 from iblf_jax.lowering.toolchain import ToolchainError
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+NODE = shutil.which("node")
+LAWS = {"integral": {"K2": 20.0}, "log": {"K2": 12.0, "q": 0.6}}
+"""Law -> where it starts on the page with two laws."""
 MOVE = """<script>
 const moved = document.querySelector('input[name="controller.K2"]');
 moved.value = Math.log(30); moved.dispatchEvent(new Event("input"));
@@ -25,6 +30,119 @@ moved.value = Math.log(30); moved.dispatchEvent(new Event("input"));
 @pytest.fixture(scope="module")
 def page():
     return ij.explore(ij.presets.zhang_yan_2024(), duration=2.0)
+
+
+@pytest.fixture(scope="module")
+def two_laws():
+    """A page with two laws of the same names of parameters, with other numbers."""
+    changed = {"controller.K2": 12.0, "initial.q[0]": 0.6}
+    laws = {"integral": ij.presets.zhang_yan_2024(), "log": ij.with_parameters(ij.presets.zhang_yan_2024(law="log"), changed)}
+    return ij.explore(laws, duration=0.25, dt=5e-4)
+
+
+def in_node(page, tmp_path: Path, actions: list, address: str = "") -> list[dict]:
+    """What the page shows after each action: its run, the words and the places of its sliders."""
+    if NODE is None:
+        pytest.skip("Node.js is not installed")
+    (tmp_path / "page.html").write_text(page.text, encoding="utf-8")
+    (tmp_path / "actions.json").write_text(json.dumps(actions), encoding="utf-8")
+    command = [NODE, str(Path(__file__).with_name("live_page.js")), "page.html", "actions.json", address]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.strip().split("\n")]  # not splitlines: a name may hold U+2028
+
+
+def simulated(law: str, **changed: float):
+    """The run that belongs to sliders of these numbers."""
+    values = {"controller.K2": LAWS[law]["K2"], "initial.q[0]": LAWS[law].get("q", 0.8)} | changed
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(law=law), values)
+    return np.asarray(ij.simulate(scenario, duration=0.25, dt=5e-4).q).T
+
+
+def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
+    actions = [
+        {},
+        {"move": "controller.K2", "to": np.log(37.0)},
+        {"move": "initial.q[0]", "to": 0.7},
+        {"law": "log"},
+        {"move": "initial.q[0]", "to": 0.5},
+        {"law": "integral"},
+        {"law": "log"},
+    ]
+    found = in_node(two_laws, tmp_path, actions)
+    assert [one["law"] for one in found] == ["integral"] * 3 + ["log"] * 2 + ["integral", "log"]
+    for one in found:
+        K2, start = np.exp(one["places"]["controller.K2"]), one["places"]["initial.q[0]"]
+        assert one["shown"]["controller.K2"].startswith(f"{K2:.3g}"[:4].rstrip("."))
+        assert one["shown"]["initial.q[0]"].startswith(f"{start:.3f}"[:4])
+        np.testing.assert_allclose(one["q"][0][0], start, atol=1.5e-3)
+        expected = simulated(one["law"], **{"controller.K2": K2, "initial.q[0]": one["q"][0][0]})
+        np.testing.assert_allclose(one["q"], expected, atol=1e-3)
+    np.testing.assert_array_equal(found[5]["q"], found[2]["q"])  # a law keeps its own numbers
+    np.testing.assert_array_equal(found[6]["q"], found[4]["q"])
+    assert np.abs(np.subtract(found[2]["q"], found[0]["q"])).max() > 1e-2
+
+
+def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_path):
+    address = "?law=log&controller.K2=130&initial.q[0]=0.55&observer.kf=many&initial.q[1]="
+    begin, other, back = in_node(two_laws, tmp_path, [{}, {"law": "integral"}, {"law": "log"}], address)
+    assert (begin["law"], other["law"]) == ("log", "integral")
+    for one in (begin, other, back):
+        np.testing.assert_allclose(np.exp(one["places"]["controller.K2"]), 130.0)  # beyond the usual end of the slider
+        assert one["shown"]["controller.K2"].startswith("130 ")
+        assert one["q"][0][0] == 0.55
+        assert "NaN" not in str(one["shown"])
+    np.testing.assert_array_equal(begin["q"], back["q"])
+    np.testing.assert_allclose(begin["q"], simulated("log", **{"controller.K2": 130.0, "initial.q[0]": 0.55}), atol=1e-9)
+    assert in_node(two_laws, tmp_path, [{}], "?law=constructor")[0]["law"] == "integral"
+
+
+def test_gains_that_differ_between_joints_are_all_shown_until_the_slider_is_moved(tmp_path):
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": [20.0, 33.0]})
+    page = ij.explore(scenario, duration=0.1, dt=2e-3)
+    before, after = in_node(page, tmp_path, [{}, {"move": "controller.K2", "to": np.log(20.0)}])
+    assert before["shown"]["controller.K2"].startswith("20.0, 33.0 ")
+    assert after["shown"]["controller.K2"].startswith("20.0 ")
+    assert before["q"] != after["q"]
+
+
+class Scripts(HTMLParser):
+    """The scripts and comments of a page, as an HTML parser finds them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.comments: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+
+    def handle_comment(self, data):
+        self.comments.append(data)
+
+
+NAMES = ["<!--<script>", "</script><img src=x> & b", "\u2028\u2029", "constructor", 'say "no" \\u003c $x ${y} `z`']
+
+
+def test_names_cannot_end_or_change_the_script_of_a_page(two_laws, tmp_path):
+    scenario = ij.presets.zhang_yan_2024()
+    page = ij.explore(dict.fromkeys(NAMES, scenario), duration=0.02, dt=2e-3)
+    data = re.search(r"const LOOPS = (.*);", page.text)[1]
+    assert not set(data) & set("<>&\u2028\u2029")
+    assert list(json.loads(data)) == NAMES
+    found, plain = Scripts(page.text), Scripts(two_laws.text)
+    assert found.tags == plain.tags and found.comments == plain.comments
+    last = in_node(page, tmp_path, [{}, {"law": NAMES[0]}, {"law": "constructor"}])[-1]
+    assert last["laws"] == NAMES and last["law"] == "constructor"
+
+
+def test_names_of_scenarios_are_words(monkeypatch):
+    monkeypatch.setattr(live, "export", None)  # nothing is built before the names are checked
+    scenario = ij.presets.zhang_yan_2024()
+    for bad in ({}, {1: scenario}, {"__proto__": scenario}, {"a": 3}, {"a": scenario, "b": None}, [scenario], None):
+        with pytest.raises(ValueError, match=r"scenario: got .*, expected .*cenario"):
+            ij.explore(bad)
 
 
 def test_gains_starts_and_bounds_have_sliders(page):

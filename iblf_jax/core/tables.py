@@ -1,9 +1,14 @@
-"""Tables of words, as text in columns and as HTML for notebooks."""
+"""Tables of words, as text in columns and as HTML for notebooks; data for a script of a page."""
 
 from __future__ import annotations
 
 import html
+import json
 from collections.abc import Collection, Iterable, Sequence
+from typing import Any
+
+UNSAFE_IN_SCRIPT = "<>&\u2028\u2029"
+"""Characters that can end or change a script element or a line of it, wherever they stand in the script."""
 
 
 def as_text(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> list[str]:
@@ -35,3 +40,26 @@ def as_html(heading: Sequence[str], rows: Iterable[Sequence[str]], bold: Collect
         weight = ' style="font-weight:bold"' if i in bold else ""
         body.append(f"<tr{weight}>" + "".join(f'<td style="text-align:left">{html.escape(x)}</td>' for x in row) + "</tr>")
     return f"<table><tr>{head}</tr>{''.join(body)}</table>"
+
+
+def as_script_data(value: Any) -> str:
+    r"""A value as JSON that may stand inside a script element of an HTML page, whatever its strings hold.
+
+    A browser looks for "</script" and "<!--" before it reads the script, inside strings too, so no such character may be there
+    as it is.  JSON.parse and JavaScript read the escaped text as the same value.
+
+    Args:
+      value: numbers, strings, lists and dicts.
+
+    Returns:
+      JSON in ASCII, with each of `UNSAFE_IN_SCRIPT` written as \uXXXX.
+
+    Raises:
+      ValueError: the value holds a NaN or an infinity, which JSON has no word for.
+
+    Source: the HTML standard, section 4.12.1.3 (restrictions for contents of script elements).
+    """
+    text = json.dumps(value, allow_nan=False)
+    for character in UNSAFE_IN_SCRIPT:
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text

@@ -116,8 +116,8 @@ def _film_writer(path: str | Path) -> Callable:
     return partial(film_run, path=film_path(path, "film"))
 
 
-def check_single(scenario: Scenario) -> None:
-    """Raises ValueError for what is no scenario, a batch of them, or one of traced values."""
+def check_single(scenario: Scenario) -> Scenario:
+    """The scenario; ValueError for what is no scenario, a batch of them, or one of traced values."""
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
     if np.ndim(scenario.initial.q) != 1:
@@ -126,6 +126,7 @@ def check_single(scenario: Scenario) -> None:
         )
     if not checks.is_concrete(scenario):
         raise checks.fail("scenario", "traced values", "numbers", "Call this outside of jit, vmap and grad.")
+    return scenario
 
 
 def with_period(scenario: Scenario, period: float | None) -> Scenario:

@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, tables
 from iblf_jax.core.status import FAILED, WORDS
+from iblf_jax.deployment.cosimulate import check_single
 from iblf_jax.deployment.export import export
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.reports import card
+from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import sign_at
 from iblf_jax.simulation.scenario import Scenario
 
@@ -57,7 +59,7 @@ def explore(scenario: Scenario | Mapping[str, Scenario], *, duration: float = 10
     scenario's table and figure instead.
 
     Args:
-      scenario: what runs; or several by name, to choose from.
+      scenario: what runs; or several by name, to choose from.  Each keeps its own sliders.
       duration: of a run [s].
       dt, method: as in `simulate`.
 
@@ -69,18 +71,39 @@ def explore(scenario: Scenario | Mapping[str, Scenario], *, duration: float = 10
 
     Source: design of this package.
     """
-    several = scenario if isinstance(scenario, Mapping) else {"": scenario}
     steps = checks.whole_steps(duration, dt)
-    if not several:
-        raise checks.fail("scenario", scenario, "a scenario, or some by name")
+    tableau(method)
+    several = _by_name(scenario)
     try:
         loops = {name: _loop(each, dt, method) for name, each in several.items()}
     except ToolchainError as error:
         first = next(iter(several.values()))
         return Page("", f"<p>{html.escape(str(error))}; without it nothing moves.</p>{card(first)}")
-    page = Template((files("iblf_jax.deployment") / "page" / "live.html").read_text())
-    values = {"title": "iblf_jax", "loops": json.dumps(loops).replace("</", "<\\/"), "steps": steps, "every": max(1, steps // POINTS)}
-    return Page(page.substitute(values))
+    values = {
+        "title": "iblf_jax",
+        "loops": tables.as_script_data(loops),
+        "steps": steps,
+        "every": max(1, steps // POINTS),
+        "state": _file("loops.js"),
+    }
+    return Page(Template(_file("live.html")).substitute(values))
+
+
+def _by_name(scenario: Any) -> dict[str, Scenario]:
+    """The scenarios of a page by name; one without a name has an empty one."""
+    if not isinstance(scenario, Mapping):
+        return {"": check_single(scenario)}
+    expected = "a scenario, or a mapping from names to scenarios"
+    if not scenario or not all(isinstance(name, str) for name in scenario):
+        raise checks.fail("scenario", scenario, expected, 'Such as {"integral": first, "log": second}.')
+    if "__proto__" in scenario:
+        raise checks.fail("scenario", "__proto__", expected, "JavaScript reserves this name: take another one.")
+    return {name: check_single(each) for name, each in scenario.items()}
+
+
+def _file(name: str) -> str:
+    """The text of one of the page's files."""
+    return (files("iblf_jax.deployment") / "page" / name).read_text(encoding="utf-8")
 
 
 def _loop(scenario: Scenario, dt: float, method: str) -> dict[str, Any]:

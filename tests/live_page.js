@@ -1,0 +1,57 @@
+// Runs the script of a live page with the least of a document that it needs.
+// Called as: node live_page.js PAGE.html ACTIONS.json; prints one line of JSON for each action.
+// An action is {"law": name}, which chooses a law, or {"move": path, "to": number}, which moves a slider; {} does nothing.
+"use strict";
+const fs = require("fs");
+const text = fs.readFileSync(process.argv[2], "utf8"), actions = JSON.parse(fs.readFileSync(process.argv[3], "utf8"));
+// A browser ends a script element at the first "</script", and one that holds "<!--<script" later than that.
+const script = text.slice(text.indexOf("<script>") + 8, text.indexOf("</script"));
+
+class Element {
+  constructor(tag) { Object.assign(this, {tag, children: [], listeners: {}, dataset: {}, textContent: "", className: ""}); }
+  append(...parts) { this.children.push(...parts.filter(part => part instanceof Element)); }
+  replaceChildren() { this.children = []; }
+  addEventListener(kind, does) { this.listeners[kind] = does; }
+  getContext() { return new Proxy({}, {get: () => () => undefined, set: () => true}); }
+  all(tag) { return [...(this.tag === tag ? [this] : []), ...this.children.flatMap(child => child.all(tag))]; }
+}
+class Range extends Element {  // as a browser does, it keeps its value within its ends and on one of its places
+  set value(x) {
+    const low = Number(this.min), high = Number(this.max), step = Number(this.step);
+    const inside = Math.min(Math.max(Number(x), low), high);
+    this.kept = String(Math.min(low + Math.round((inside - low) / step) * step, high));
+  }
+  get value() { return this.kept; }
+}
+const made = {};
+globalThis.document = {
+  body: new Element("body"),
+  getElementById: id => made[id] ??= new Element(id),
+  createElement: tag => tag === "input" ? new Range(tag) : new Element(tag),
+};
+globalThis.Option = class extends Element {
+  constructor(words, value) { super("option"); Object.assign(this, {textContent: words, value}); }
+};
+globalThis.location = {search: process.argv[4] || ""};
+globalThis.devicePixelRatio = 1;
+globalThis.addEventListener = () => undefined;
+(0, eval)(script);
+
+const sliders = made.sliders;
+for (const action of actions) {
+  if ("law" in action) {
+    const choice = sliders.all("select")[0];
+    choice.value = action.law;
+    choice.listeners.change();
+  }
+  if ("move" in action) {
+    const input = sliders.all("input").find(x => x.name === action.move);
+    input.value = action.to;
+    input.listeners.input();
+  }
+  const shown = sliders.all("label").map(label => [label.all("input")[0].name, label.all("span")[0].textContent]);
+  const places = sliders.all("input").map(input => [input.name, Number(input.value)]);
+  const laws = sliders.all("option").map(option => option.value);
+  console.log(JSON.stringify({...JSON.parse(document.body.dataset.run), shown: Object.fromEntries(shown),
+    places: Object.fromEntries(places), laws}));
+}
