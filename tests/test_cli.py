@@ -64,11 +64,30 @@ def test_reproduce(command, tmp_path):
     report = strict_json(tmp_path / "out" / "metrics.json")
     assert [claim["held"] for claim in report["claims"]] == [True] * 8
     assert report["runs"]["integral BLF"]["metrics"]["first_violation_time"]["value"] is None
+    assert "masses 2 / 0.85 kg, lengths 0.35 / 0.31 m" in report["assumed"]
     settling = report["runs"]["log-BLF"]["metrics"]["settling_time"]
     np.testing.assert_allclose(settling["value"], [1.077, 0.837], atol=2e-3)
     assert settling["unit"] == "s"
     data = ij.load_rollouts(tmp_path / "out" / "rollouts.nc")
     assert data["integral BLF"].sizes["time"] == 20_001
+
+
+def test_reproduce_states_that_the_arm_is_assumed(command, tmp_path, monkeypatch, short_run):
+    made = {"integral BLF": short_run, "log-BLF": short_run}, {"first": 1.0, "again": 0.5}
+    monkeypatch.setattr("iblf_jax.cli.reproduce._simulate_both", lambda args: made)
+    monkeypatch.setattr("iblf_jax.cli.reproduce._draw", lambda folder, runs: None)
+    code, out, err = command("reproduce", "--out", "out")
+    assert code == 0, err
+    report = strict_json(tmp_path / "out" / "metrics.json")
+    for text in (" ".join(out.split()), report["assumed"]):
+        assert "the paper prints no masses, lengths" in text and "ASSUME" in text
+        assert "masses 2 / 0.85 kg, lengths 0.35 / 0.31 m" in text and "g = 9.81 m/s^2" in text
+
+
+def test_the_assumed_numbers_are_those_of_the_runs(paper):
+    heavier = ij.with_parameters(paper, {"robot.mass": [2.5, 0.75]})
+    run = ij.simulate(heavier, duration=0.01, dt=1e-3)
+    assert "masses 2.5 / 0.75 kg, lengths 0.35 / 0.31 m" in _claims.assumed({"a": run})
 
 
 def test_claims_can_fail(paper, short_run):

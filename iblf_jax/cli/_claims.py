@@ -191,6 +191,28 @@ def theorem_1(runs: Pair) -> PaperClaim:
     return PaperClaim("Theorem 1 holds along the run: xi^2/2 <= V1 <= xi^2/(1 - xi^2).", broken == 0, detail, numbers)
 
 
+def assumed(runs: Pair) -> str:
+    """What these runs assume because the paper does not print it: the numbers of the arm."""
+    arm = next(iter(runs.values())).scenario.plant
+    numbers = (
+        ("masses", arm.mass, "kg"),
+        ("lengths", arm.length, "m"),
+        ("centres of mass", arm.centre, "m"),
+        ("moments of inertia", arm.inertia, "kg m^2"),
+    )
+    values = ", ".join(f"{name} {_all_digits(value)} {unit}" for name, value, unit in numbers)
+    return (
+        "the paper prints no masses, lengths, centres of mass or inertias of its arm. These runs ASSUME the numbers that are customary "
+        f"in this literature: {values}, g = {float(arm.g):g} m/s^2. Torques, errors and times depend on them and need not be those of "
+        "the paper's figures."
+    )
+
+
+def _all_digits(values: Any) -> str:
+    """Numbers of the joints as text, with the digits that they were given."""
+    return " / ".join(f"{x:.6g}" for x in np.ravel(np.asarray(values, float)))
+
+
 def remark(runs: Pair) -> str:
     """What the comparison rests on: the two barriers differ by a factor of two, here confirmed along the run."""
     from iblf_jax.barriers import Integral, Log

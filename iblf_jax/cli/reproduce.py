@@ -25,7 +25,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "reproduce",
         help="reproduce the paper's simulation and its six figures",
         description="Run the paper's law (integral barrier) and its comparison (log barrier), write the six figures, an animation of the "
-        "arm, the data and the metrics, and say which of the paper's claims held.",
+        "arm, the data and the metrics, and say which of the paper's claims held. The paper prints no masses and lengths of its arm: those "
+        "of the runs are assumed, and the output says which.",
         epilog="Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.",
     )
     parser.add_argument("--out", required=True, metavar="DIR", help="write everything into this folder")
@@ -42,7 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._claims import paper_claims, remark
+    from iblf_jax.cli._claims import assumed, paper_claims, remark
     from iblf_jax.core.status import FAILED, describe
 
     begin = time.perf_counter()
@@ -50,10 +51,12 @@ def run(args: argparse.Namespace) -> int:
     runs, seconds = _simulate_both(args)
     print(f"Zhang & Yan 2024, section 4, as {args.reading}: {args.duration:g} s, dt = {args.dt:g} s, rk4, float64")
     print("; ".join(f"{name}: {describe(int(one.status))}" for name, one in runs.items()) + "\n")
+    assumption = assumed(runs)
+    print(textwrap.fill(f"Assumed: {assumption}", 118) + "\n")
     print(metrics_table(runs) + "\n")
     claims, note = paper_claims(runs), remark(runs)
     _print_claims(claims, note)
-    _write_data(folder, args, runs, claims, note, seconds)
+    _write_data(folder, args, runs, {"assumed": assumption, "claims": claims, "remark": note}, seconds)
     _draw(folder, runs)
     print(f"\nsimulations: {seconds['first']:.2f} s with compilation, {seconds['again']:.2f} s for the two runs alone; ", end="")
     print(f"all in {time.perf_counter() - begin:.1f} s")
@@ -89,7 +92,11 @@ def _print_claims(claims: list[PaperClaim], note: str) -> None:
 
 
 def _write_data(
-    folder: Path, args: argparse.Namespace, runs: dict[str, Rollout], claims: list[PaperClaim], note: str, seconds: dict[str, float]
+    folder: Path,
+    args: argparse.Namespace,
+    runs: dict[str, Rollout],
+    findings: dict[str, Any],
+    seconds: dict[str, float],
 ) -> None:
     import jax
 
@@ -102,8 +109,9 @@ def _write_data(
         "run": {"reading": args.reading, "duration": args.duration, "dt": args.dt, "method": "rk4"},
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__},
         "runs": {name: verdict(one) for name, one in runs.items()},
-        "claims": [claim._asdict() for claim in claims],
-        "remark": note,
+        "assumed": findings["assumed"],
+        "claims": [claim._asdict() for claim in findings["claims"]],
+        "remark": findings["remark"],
         "seconds": {"with compilation": seconds["first"], "the two runs alone": seconds["again"]},
     }
     write_json(folder / "metrics.json", report)
