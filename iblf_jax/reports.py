@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.core import checks, tables
+from iblf_jax.core import checks, notices, tables
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
@@ -207,6 +207,7 @@ def card(result: Any) -> str:
     return f"<div>{''.join(text)}</div>"
 
 
+@notices.each_warning_once
 def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     """Writes a result as one HTML file that needs nothing else: words, tables, figures, the scenario and the versions.
 

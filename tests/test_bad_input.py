@@ -6,6 +6,7 @@ import dataclasses
 import warnings
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -297,6 +298,200 @@ def test_every_parameter_can_be_written_back_by_its_path(paper):
     table = {p.path: p.value for p in ij.parameters(paper)}
     again = ij.with_parameters(paper, table)
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(paper), strict=True))
+
+
+# --------------------------------------------------------------------------------------- every function, before it does anything
+
+WEAK = ij.presets.zhang_yan_2024()
+DRAWN = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
+TRACKING = ij.objectives.tracking()
+NO_FOLDER = "/proc" if Path("/proc/self").exists() else "/dev/null"
+"""A folder in which nobody can make a file."""
+
+GOOD = {
+    "simulate": lambda **x: ij.simulate(**({"scenario": WEAK, **SHORT} | x)),
+    "compare": lambda **x: ij.compare(**({"scenario": WEAK, "laws": ["integral"], **SHORT} | x)),
+    "certify": lambda **x: ij.certify(**({"scenario": WEAK, **SHORT} | x)),
+    "monte_carlo": lambda **x: ij.monte_carlo(**({"scenario": WEAK, "perturbations": DRAWN, "runs": 2, **SHORT} | x)),
+    "sweep": lambda **x: ij.sweep(**({"scenario": WEAK, "grid": {"controller.K2": [10.0, 20.0]}, **SHORT} | x)),
+    "sensitivity": lambda **x: ij.sensitivity(**({"scenario": WEAK, "perturbations": DRAWN, "points": 2, **SHORT} | x)),
+    "tune": lambda **x: ij.tune(**({"scenario": WEAK, "parameters": ["controller.K2"], "objective": TRACKING, **SHORT} | x)),
+    "falsify": lambda **x: ij.falsify(**({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)),
+    "pareto": lambda **x: ij.pareto(
+        **({"scenario": WEAK, "parameters": ["controller.K2"], "objectives": (TRACKING, ij.objectives.effort()), **SHORT} | x)
+    ),
+    "identify": lambda **x: ij.identify(**({"scenario": WEAK, "log": {}, "paths": ["plant.mass"]} | x)),
+    "excitation": lambda **x: ij.excitation(**({"scenario": WEAK, "paths": ["plant.mass"]} | x)),
+    "export": lambda **x: ij.export(**({"scenario": WEAK, "folder": "never", "period": 1e-3} | x)),
+    "export-loop": lambda **x: ij.export(**({"scenario": WEAK, "folder": "never", "target": "wasm"} | x)),
+    "cosimulate": lambda **x: ij.cosimulate(**({"scenario": WEAK, "plant": "never.xml", "period": 1e-3, "duration": 0.01} | x)),
+    "explain": lambda **x: ij.explain(**({"scenario": WEAK} | x)),
+    "explore": lambda **x: ij.explore(**({"scenario": WEAK} | x)),
+    "report": lambda **x: ij.report(**({"result": WEAK, "path": "never.html"} | x)),
+    "recommended_dt": lambda **x: ij.recommended_dt(**({"scenario": WEAK} | x)),
+    "recommended_period": lambda **x: ij.recommended_period(**({"scenario": WEAK} | x)),
+    "load": lambda **x: robots.load(**({"path": "never.urdf"} | x)),
+    "Sampling": lambda **x: ij.Sampling(**({"period": 1e-3} | x)),
+    "tunable": lambda **x: ij.tunable(**({"path": "controller.K2", "low": 1.0, "high": 2.0} | x)),
+    "factor": lambda **x: ij.factor(**({"distribution": ij.uniform(0.9, 1.1)} | x)),
+    "with_parts": lambda **x: ij.with_parts(WEAK, **x),
+    "save_scenario": lambda **x: ij.save_scenario(**({"scenario": WEAK, "path": "never.toml"} | x)),
+}
+"""Function -> a call of it that is fine, but for what a case replaces."""
+
+NO_WORDS = (None, [], {}, 3, b"rk4", ["rk4"], np.asarray(["rk4", "x"]), "nope", True, float("nan"))
+NO_TIMES = (None, "x", [], True, 0.0, -1.0, float("nan"), np.inf, 5e-324, 3e-300, 1e300, 4e9, 10**30, 1j, np.ones(2))
+NO_SEEDS = (None, "x", [], True, -1, 1.5, float("nan"), 2**32, 10**30, np.ones(2))
+NO_COUNTS = (None, "x", [], True, 0, -3, 1.5, float("nan"), np.inf, 10**30, 7 * 10**29, np.ones(2))
+NO_FLAGS = ("yes", 1, 0.0, [], np.ones(2))
+NO_PATHS = (3, "a\0b", b"x", [], {}, 1.5, True, "n" * 300, f"new/{'m' * 270}/x", "/dev/null/x")
+LONG_NAME = "a" * 300
+
+REFUSED = {
+    # function and argument: values, words of the message besides the argument's name
+    "simulate backend": ((*NO_WORDS, "vmap"), ["'auto'"]),
+    "simulate method": (NO_WORDS, ["'rk4'"]),
+    "simulate record_every": (NO_COUNTS, ["whole number"]),
+    "simulate seed": (NO_SEEDS, ["whole number"]),
+    "simulate throw": (NO_FLAGS, ["True or False"]),
+    "compare equal_effort": (NO_FLAGS, ["True or False"]),
+    "compare laws": ((None, [], {}, 3, "nope", ["nope"]), []),
+    "compare record_every": (NO_COUNTS, ["whole number"]),
+    "certify method": (NO_WORDS, ["'rk4'"]),
+    "monte_carlo backend": (NO_WORDS, ["'auto'", "'native'"]),
+    "monte_carlo chunk": (NO_COUNTS[1:], ["whole number"]),
+    "monte_carlo memory": ((None, "x", [], 0, -1, 5e-324, 1e300, 10**30, np.inf), ["bytes"]),
+    "monte_carlo runs": (NO_COUNTS, ["whole number"]),
+    "monte_carlo seed": (NO_SEEDS, ["whole number"]),
+    "sweep backend": (NO_WORDS, ["'auto'"]),
+    "sweep unit": (NO_COUNTS[1:], ["whole number"]),
+    "sweep store": (NO_PATHS[:7], ["path of a folder"]),
+    "sensitivity backend": (NO_WORDS, ["'auto'"]),
+    "sensitivity output": ((None, [], 3, "nope", "", LONG_NAME), []),
+    "tune objective": ((None, [], "rmse", "x", 3, {}, ij.objectives.tracking), ["ij.objectives.tracking() + 0.1 * ij.objectives.effort()"]),
+    "tune parameters": ((None, [], {}, "controller.K2", [None], [3], [["controller.K2"]]), []),
+    "tune backend": (NO_WORDS, ["'auto'"]),
+    "tune report_seed": (NO_SEEDS[1:], ["whole number"]),
+    "tune patience": (NO_COUNTS, ["whole number"]),
+    "tune iterations": (NO_COUNTS, ["whole number"]),
+    "tune tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300, 10**30), ["from 0 to 1"]),
+    "tune learning_rate": ((None, "x", 0.0, -1.0, float("nan"), 5e-324, 1e300, 10**30), ["number"]),
+    "tune checkpoint": ((*NO_PATHS, f"{NO_FOLDER}/state.npz"), []),
+    "tune mode": (NO_WORDS, ["'forward'"]),
+    "tune optimiser": (NO_WORDS, ["'newton'"]),
+    "tune risk": (NO_WORDS, ["'cvar'"]),
+    "tune resample": (NO_FLAGS, ["True or False"]),
+    "falsify starts": (NO_COUNTS, ["whole number"]),
+    "falsify iterations": (NO_COUNTS, ["whole number"]),
+    "falsify seed": (NO_SEEDS, ["whole number"]),
+    "falsify backend": (NO_WORDS, ["'auto'"]),
+    "pareto points": (NO_COUNTS, []),
+    "pareto tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300), ["from 0 to 1"]),
+    "identify window": (NO_TIMES, []),
+    "identify iterations": (NO_COUNTS, ["whole number"]),
+    "identify delay": (([], "x", np.ones(2), float("nan"), 1e300), []),
+    "identify loss": (NO_WORDS, ["'huber'"]),
+    "excitation duration": (NO_TIMES, []),
+    "excitation waypoints": (NO_COUNTS[1:], ["whole number"]),
+    "excitation iterations": (NO_COUNTS, ["whole number"]),
+    "export folder": ((None, *NO_PATHS, "/dev/null", f"{NO_FOLDER}/new/folder"), ["folder"]),
+    "export name": ((LONG_NAME, "b" * 64, "", "1a", "a b", "int", 3, []), ["C identifier"]),
+    "export period": (NO_TIMES[1:], []),
+    "export dt": (NO_TIMES, []),
+    "export method": (NO_WORDS, ["'rk4'"]),
+    "export seed": (NO_SEEDS, ["whole number"]),
+    "export target": (NO_WORDS, ["'wasm'"]),
+    "export-loop dt": (NO_TIMES, []),
+    "export-loop method": (NO_WORDS, ["'rk4'"]),
+    "export-loop folder": ((None, *NO_PATHS), ["folder"]),
+    "cosimulate period": (NO_TIMES[1:], []),
+    "cosimulate plant": ((None, 3, [], "", "a\0b", LONG_NAME), []),
+    "cosimulate integrator": (NO_WORDS[1:], ["'RK4'"]),
+    "explain method": (NO_WORDS, ["'rk4'"]),
+    "explore method": (NO_WORDS, ["'rk4'"]),
+    "report path": ((None, *NO_PATHS, f"{NO_FOLDER}/page.html"), []),
+    "report title": ((3, [], True), []),
+    "recommended_dt duration": (NO_TIMES, []),
+    "recommended_dt method": (NO_WORDS, ["'rk4'"]),
+    "recommended_dt seed": (NO_SEEDS, ["whole number"]),
+    "recommended_dt perturbations": ((0, "", [], False, 3, "x", np.ones(2)), ["mapping"]),
+    "recommended_period duration": (NO_TIMES, []),
+    "recommended_period radius": ((None, "x", 0.0, -1.0, float("nan"), 5e-324, 1e300), ["number"]),
+    "recommended_period margin": ((None, "x", 0.5, float("nan"), 1e300, 10**30), ["number"]),
+    "load path": ((None, 3, [], "a\0b", LONG_NAME), []),
+    "load repair": (NO_FLAGS, ["True or False"]),
+    "Sampling period": ((1e300, 5e-324, 0.0, -1.0, "x", None), []),
+    "Sampling delay": ((1e300, 5e-324, -1.0, "x"), []),
+    "tunable low": (([], float("nan"), "x"), []),
+    "tunable high": (([], float("nan"), "x"), []),
+    "factor shared": (NO_FLAGS, []),
+    "save_scenario path": ((None, *NO_PATHS, f"{NO_FOLDER}/scenario.toml"), []),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_arguments_of_every_function(case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function, argument = case.split()
+    values, words = REFUSED[case]
+    for value in values:
+        with pytest.raises(ValueError, match=r"(?s)\w+.*: got .*, expected .+") as caught:
+            GOOD[function](**{argument: value})
+        message = str(caught.value)
+        named = message.split(": got")[0]
+        assert argument in named, (value, message)
+        assert len(message) < 1500, value
+        for word in words:
+            assert word in message, (value, message)
+    assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def test_a_duration_that_no_step_can_be_tried_on_is_refused(monkeypatch):
+    from iblf_jax.engine import step_size
+
+    monkeypatch.setattr(step_size, "run_one", None)  # nothing is run
+    monkeypatch.setattr(step_size, "side_by_side", None)
+    refuses(lambda: ij.recommended_dt(WEAK, duration=3e7), "duration", "at most")
+    sampled = dataclasses.replace(WEAK, sampling=ij.Sampling(period=1e-3))
+    refuses(lambda: ij.recommended_dt(sampled, duration=3e7), "duration", "at most")
+
+
+def test_misspelt_parts_and_fields_get_a_suggestion():
+    refuses(lambda: ij.with_parts(WEAK, contoller=WEAK.controller), "part", "'contoller'", "Did you mean controller?")
+    refuses(lambda: ij.with_parts(WEAK, velocity_bound=None), "Did you mean velocity_bounds?")
+    refuses(lambda: ij.with_parts(WEAK, zzz=None), "'zzz'", "robot, plant")
+    refuses(lambda: dataclasses.replace(WEAK, refrence=WEAK.reference), "Scenario", "Did you mean reference?")
+    refuses(lambda: controllers.Backstepping(2.0, K2=20.0, barier=barriers.Log()), "Backstepping", "Did you mean barrier")
+
+
+def test_constructors_name_the_field_that_is_missing():
+    for call, *words in (
+        (lambda: ij.sensors.Encoder(), "Encoder.velocity", "nothing", "a Velocity", "Encoder(velocity=...)"),
+        (lambda: ij.Sampling(), "Sampling.period", "nothing", "[s]"),
+        (lambda: ij.Scenario(plant=WEAK.plant), "Scenario.reference", "a Reference"),
+        (lambda: controllers.Backstepping(2.0), "Backstepping.K2", "number"),
+        (lambda: controllers.Backstepping(2.0, 20.0, k1=3.0), "Backstepping.k1", "two values"),
+        (lambda: barriers.Log(1, 2, 3, 4, 5), "Log", "5 positional arguments"),
+    ):
+        refuses(call, *words)
+        with pytest.raises(TypeError):  # what Python itself raises, so that programs that expect it go on
+            call()
+
+
+def test_a_component_with_a_constructor_of_its_own_keeps_its_errors():
+    @ij.component
+    class Own:
+        k: float
+
+        def __init__(self, twice: float) -> None:
+            object.__setattr__(self, "k", 2.0 * twice)
+
+    assert float(Own(3.0).k) == 6.0
+    with pytest.raises(TypeError, match="twice"):
+        Own()
+
+
+# ------------------------------------------------------------------------------------------------------------------ warnings
 
 
 def test_a_warning_points_at_the_callers_line(paper):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -16,7 +15,7 @@ from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed, grid
 from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.engine.plan import CERTIFY_RECORDED
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.robots import joint_names
@@ -26,6 +25,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 WORST = 16
 
 
+@notices.each_warning_once
 def certify(
     scenario: Scenario,
     run: Any = None,
@@ -141,8 +141,7 @@ def _sampled(run: Rollout) -> Certificate:
     """That of a run whose law is sampled: nothing is claimed of it, and it is held against the continuous run instead."""
     scenario, (every, steps) = run.scenario, grid(run)
     ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SimulationWarning)
+    with notices.muted(SimulationWarning):
         continuous = simulate(ideal, duration=steps * float(run.dt), dt=float(run.dt), method=run.method, record_every=every)
     beside = jax.tree.map(np.asarray, continuous)
     certificate = _one(beside)

@@ -13,13 +13,14 @@ import os
 import platform
 import stat
 import time
-import warnings
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+from iblf_jax.core import notices
 
 LIMIT = 2 * 2**30
 """Bytes."""
@@ -70,7 +71,7 @@ def keep_programs() -> None:
     except OSError:
         return
     if stranger is not None:
-        warnings.warn(f"compiled programs are not kept: {top} holds {stranger!r}, a link or of another user; remove it.", stacklevel=2)
+        notices.warn(f"compiled programs are not kept: {top} holds {stranger!r}, a link or of another user; remove it.")
     elif os.access(folder, os.W_OK | os.X_OK):
         config.update("jax_compilation_cache_dir", str(folder))
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

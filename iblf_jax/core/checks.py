@@ -7,12 +7,14 @@ points work under `jit`, `vmap` and `grad`.  What can only be known inside a run
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import errno
 import functools
 import numbers
 import os
 import re
-from collections.abc import Callable, Hashable, Mapping
+import tempfile
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -33,11 +35,26 @@ LIMITS = ("limit", "positive limit")
 LONGEST_TEXT = {"field": 200, "value": 160, "words": 800, "message": 1400}
 """Characters of an error message's parts, and of all that the command line prints of one: what a user typed may be of any length."""
 
+SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e9
+"""[s].  No run, step, period or delay of a robot is shorter or longer."""
+
+LONGEST_NAME = 220
+"""Bytes of the name of a file: file systems allow 255, and the names of temporary files are longer than those that they replace."""
+
 MOST_JOINTS = 10_000
 """More than any robot has."""
 
 DEEPEST = 32
 """Lists inside each other that can be an array."""
+
+
+class Words(str):
+    """Words in place of a value in an error message: `shown` quotes them as they are."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
 
 
 def is_concrete(value: Any) -> bool:
@@ -98,6 +115,71 @@ def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
     return ValueError(f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}." + (f" {line(remedy)}" if remedy else ""))
 
 
+def nearest(name: Any, known: Iterable[str]) -> str:
+    """The remedy for a misspelt word, "Did you mean ...?"; nothing where no known word is near."""
+    words = [str(word) for word in known]
+    close = difflib.get_close_matches(str(name)[: LONGEST_TEXT["value"]], words, n=2, cutoff=0.6)
+    return f"Did you mean {' or '.join(close)}?" if close else ""
+
+
+def did_you_mean(name: Any, known: Iterable[str]) -> str:
+    """The remedy for a misspelt word: the nearest known ones, or all of them."""
+    words = [str(word) for word in known]
+    everything = f"There are: {', '.join(words)}." if words else ""
+    return nearest(name, words) or everything
+
+
+def with_article(noun: str) -> str:
+    """A noun with its indefinite article, by the letter that it begins with: "an Actuator", "a Controller".
+
+    Names of classes with an initial that is spoken as a consonant, such as "Uniform", have "a".
+    """
+    spoken_as_consonant = re.match(r"(?i)(uni(?!n|m[^o])|us[ei]|eu|one([^a-z]|$))", noun)
+    begins_with_vowel = noun[:1].lower() in tuple("aeiou")
+    return f"an {noun}" if begins_with_vowel and not spoken_as_consonant else f"a {noun}"
+
+
+class ArgumentError(TypeError, ValueError):
+    """Arguments that do not fit a constructor: a refusal like every other, and the TypeError that Python itself would raise."""
+
+
+def check_arguments(owner: str, fields: Iterable[dataclasses.Field], args: tuple, kwargs: Mapping[str, Any]) -> None:
+    """Raises ArgumentError where the arguments of a constructor are too many, unknown, given twice or missing.
+
+    Args:
+      owner: name of the class.
+      fields: its fields, in order.
+      args, kwargs: as they were given.
+    """
+    fields = [field for field in fields if field.init]
+    names = [field.name for field in fields]
+    positional = [field.name for field in fields if not field.kw_only]
+    call = f"{owner}({', '.join(f'{name}=...' for name in names)})"
+    if len(args) > len(positional):
+        got, expected = Words(f"{len(args)} positional arguments"), f"at most {len(positional)}"
+        raise ArgumentError(fail(owner, got, expected, f"Write {call}."))
+    for name in kwargs:
+        if name not in names:
+            got, expected = Words(f"an unknown argument {name!r}"), f"fields of {owner}"
+            raise ArgumentError(fail(owner, got, expected, did_you_mean(name, names)))
+        if name in positional[: len(args)]:
+            raise ArgumentError(fail(f"{owner}.{name}", Words("two values"), "one", f"Write {call}."))
+    for field in fields:
+        has_default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+        if not has_default and field.name not in kwargs and field.name not in positional[: len(args)]:
+            expected = _kind_of(field)
+            remedy = f"Write {owner}({field.name}=...); help({owner}) says what it means."
+            raise ArgumentError(fail(f"{owner}.{field.name}", Words("nothing"), expected, remedy))
+
+
+def _kind_of(field: dataclasses.Field) -> str:
+    """What a field holds, in words."""
+    if field.metadata.get("leaf"):
+        return f"a number or an array of numbers [{field.metadata['unit']}]"
+    kind = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
+    return with_article(kind)
+
+
 def renamed(**names: str) -> Callable[[F], F]:
     """Of a function whose keywords have new names, old=new: who uses an old one is told the new one (ValueError)."""
 
@@ -151,6 +233,8 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
         return value
     array = as_floats(name, value)
     if declared:
+        if array.size == 0:
+            raise fail(name, value, "at least one number", f"Its shape is {array.shape}.")
         if field.metadata["shape"] == "scalar" and array.ndim != 0:
             raise fail(name, value, "one number", f"Its shape is {array.shape}.")
         if field.metadata["shape"] == "joint" and array.ndim > 1:
@@ -287,6 +371,26 @@ def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> flo
     return number
 
 
+def number_between(name: str, value: Any, least: float, most: float, unit: str, remedy: str = "") -> float:
+    """A finite Python float from `least` to `most` from a user's argument, or a ValueError."""
+    expected = f"a number from {least:g} to {most:g} [{unit}]"
+    try:
+        number = positive_number(name, value, unit, zero=True)
+    except ValueError:
+        raise fail(name, value, expected, remedy) from None
+    if not least <= number <= most:
+        raise fail(name, value, expected, remedy)
+    return number
+
+
+def time_span(name: str, value: Any, zero: bool = False) -> float:
+    """A duration, period or delay [s] from a user's argument, between the shortest and the longest of a robot, or a ValueError."""
+    seconds = positive_number(name, value, "s", zero)
+    if seconds == 0.0 or SHORTEST_TIME <= seconds <= LONGEST_TIME:
+        return seconds
+    raise fail(name, value, f"a time from {SHORTEST_TIME:g} to {LONGEST_TIME:g} s", "Times are in seconds.")
+
+
 def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
     """A Python int from `least` on, at most `most`, from a user's argument, or a ValueError."""
     expected = f"a whole number >= {least}" + (f" and <= {most}" if most is not None else "")
@@ -302,10 +406,10 @@ class NoSuchEntryError(IndexError, ValueError):
     """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's own protocols look for."""
 
 
-def seed(value: Any) -> int:
+def seed(value: Any, name: str = "seed") -> int:
     """A seed as a Python int in [0, 2^32), or a ValueError."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer) or not 0 <= value < 2**32:
-        raise fail("seed", value, "a whole number from 0 to 2**32 - 1")
+        raise fail(name, value, "a whole number from 0 to 2**32 - 1")
     return int(value)
 
 
@@ -389,6 +493,8 @@ def file_path(name: str, value: Any, what: str = "a file") -> Path:
         if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
             raise
         raise fail(name, text, expected, f"{error.strerror}.") from None
+    if any(len(os.fsencode(part)) > LONGEST_NAME for part in Path(text).parts):
+        raise fail(name, text, expected, f"A name in it is longer than {LONGEST_NAME} bytes.")
     return Path(text)
 
 
@@ -402,14 +508,47 @@ def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
     return path
 
 
+class UnwritableError(OSError, ValueError):
+    """A path at which nothing can be written: a refusal like every other, and an OSError, which programs that write files expect."""
+
+
 def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
     """A path where a file can be written, or a ValueError; FileNotFoundError where its folder is not there."""
     path = file_path(name, value, what)
     if path.is_dir():
         raise fail(name, str(path), f"the path of {what}", "It is a folder.")
-    if not path.parent.is_dir():
+    if not path.parent.exists():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    if path.exists() and not path.is_file():  # a device, such as /dev/null
+        return path
+    _can_be_written(name, path, path.parent, f"the path of {what} in a folder that can be written")
     return path
+
+
+def folder_to_write(name: str, value: Any) -> Path:
+    """The path of a folder that is there or can be made, in which files can be written; a ValueError where that is not so."""
+    path = file_path(name, value, "a folder")
+    expected = "the path of a folder that can be written"
+    nearest = next((place for place in (path, *path.parents) if place.exists()), Path())
+    _can_be_written(name, path, nearest, expected)
+    return path
+
+
+def _can_be_written(name: str, path: Path, folder: Path, expected: str) -> None:
+    """Raises UnwritableError unless a file can be made in `folder`, which is there.
+
+    It is tried: neither the permissions nor the user's rank say whether a file system is read-only.
+    """
+    if not folder.is_dir():
+        raise UnwritableError(fail(name, str(path), expected, f"{folder} is not a folder."))
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        if error.errno == errno.ENOSPC:  # a full disk is no fault of the path; what is written later says so
+            return
+        remedy = f"{folder} cannot be written ({error.strerror}): choose another place."
+        raise UnwritableError(fail(name, str(path), expected, remedy)) from None
 
 
 def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
@@ -428,5 +567,8 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
 
 
 def recorded_every(value: Any, steps: int) -> int:
-    """Every how many steps to record, as the compiled loops count it: in int32, and past the last step is as good as any further."""
-    return min(positive_integer("record_every", value), steps + 1, MOST_STEPS)
+    """Every how many steps to record, as the compiled loops count it: in int32, and past the last step is as good as any further.
+
+    A number beyond that of the steps which any run can have is a slip, and refused.
+    """
+    return min(positive_integer("record_every", value, most=MOST_STEPS), steps + 1, MOST_STEPS)

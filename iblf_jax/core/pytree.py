@@ -57,6 +57,7 @@ def component(cls: type[T]) -> type[T]:
     """
     if not isinstance(cls, type):
         raise checks.fail("component", cls, "a class", "Write @iblf_jax.component above it.")
+    has_own_init = "__init__" in vars(cls)
     try:
         cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
     except (TypeError, ValueError) as error:
@@ -68,7 +69,12 @@ def component(cls: type[T]) -> type[T]:
 
     @functools.wraps(plain_init)
     def checked_init(self, *args, **kwargs):
-        plain_init(self, *args, **kwargs)
+        try:
+            plain_init(self, *args, **kwargs)
+        except TypeError:
+            if not has_own_init:
+                checks.check_arguments(cls.__name__, fields, args, kwargs)
+            raise
         for field in fields:
             value = getattr(self, field.name)
             if field.metadata.get("static"):

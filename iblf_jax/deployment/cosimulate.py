@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.actuators import Ideal
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
 from iblf_jax.disturbances import Nothing
@@ -33,6 +33,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import SIGNALS
 
 
+@notices.each_warning_once
 def cosimulate(
     scenario: Scenario,
     plant: Any,
@@ -94,7 +95,7 @@ def cosimulate(
     robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
     sampling: Any = scenario.sampling
     own = float(sampling.period) / max(1, math.ceil(float(sampling.period) / robot.timestep - NEARLY))
-    dt = own if dt is None else checks.positive_number("dt", dt, "s")
+    dt = own if dt is None else checks.time_span("dt", dt)
     check_step(scenario, dt)
     steps = checks.whole_steps(duration, dt, dt_is_free=False)
     record_every = checks.recorded_every(record_every, steps)
@@ -135,7 +136,7 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
         if scenario.sampling is None:
             raise checks.fail("period", None, "the period of the law [s]", "Outside of the package a law is sampled: period=1e-3.")
         return scenario
-    period = checks.positive_number("period", period, "s")
+    period = checks.time_span("period", period)
     if scenario.sampling is None:
         return dataclasses.replace(scenario, sampling=Sampling(period))
     queue = max(scenario.sampling.queue, under_way(float(scenario.sampling.delay), period))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.deployment.c_names import FILES, RESERVED
@@ -38,6 +37,10 @@ VECTORS_DURATION = 20.0
 DECIMALS = 9
 LONGEST_STEP = 1e-3
 """Seconds of that run's steps, at most."""
+SHORTEST_PERIOD, LONGEST_PERIOD = 1e-6, 1e3
+"""[s].  With a period outside of them the run of the self-test would be too long."""
+LONGEST_IDENTIFIER = 63
+"""Characters of a name that every C compiler tells apart (C99, 5.2.4.1); the names of files begin with it too."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Exported:
         return "\n".join([*lines, f"parameters: {', '.join(self.parameters)}"])
 
 
+@notices.each_warning_once
 def export(
     scenario: Scenario,
     folder: str | Path,
@@ -106,10 +110,10 @@ def export(
     checks.one_of("target", target, TARGETS)
     checks.one_of("dtype", dtype, tuple(TYPES))
     checks.one_of("reference", reference, ("inside", "told"))
+    tableau(method)
+    dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     is_loop = target in ("fmu-loop", "wasm")
-    name = ("iblf_loop" if is_loop else "iblf_law") if name is None else name
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in RESERVED or name.lower() in FILES:
-        raise checks.fail("name", name, "a C identifier that is no word of C, its headers or CMake", 'Such as name="arm_law".')
+    name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
     if target.startswith("fmu") and dtype != "double":
         raise checks.fail("dtype", dtype, '"double" for an FMU', "FMI's own numbers are.")
     if is_loop and reference == "told":
@@ -118,7 +122,9 @@ def export(
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
     scenario = canonical(astype(scenario, _available(dtype)))
-    folder = Path(folder)
+    if not is_loop:
+        _check_period(float(scenario.sampling.period))  # type: ignore[union-attr]
+    folder = checks.folder_to_write("folder", folder)
     try:
         if is_loop:
             return _loop(scenario, folder, target, name, dt, method, seed)
@@ -141,8 +147,6 @@ def _law(scenario: Scenario, folder: Path, target: str, name: str, is_told: bool
 
 
 def _loop(scenario: Scenario, folder: Path, target: str, name: str, dt: float, method: str, seed: int) -> Exported:
-    tableau(method)
-    dt, seed = checks.positive_number("dt", dt, "s"), checks.seed(seed)
     check_step(scenario, dt)
     loop = loop_program(scenario, method)
     made = loop_files(scenario, loop, name, method, tuple(getattr(scenario.plant, "joints", ())))
@@ -155,6 +159,24 @@ def _loop(scenario: Scenario, folder: Path, target: str, name: str, dt: float, m
     width = loop.step.dtype.itemsize
     sizes = {"state": width * loop.size + 8, "parameters": width * made.parameters.size}
     return Exported(folder, target, files, operations_of(loop.step), sizes, tuple(field.path for field in made.parameters.fields))
+
+
+def checked_name(name: Any, default: str) -> str:
+    """What begins every name in the code, or a ValueError."""
+    if name is None:
+        return default
+    expected = f"a C identifier of at most {LONGEST_IDENTIFIER} characters that is no word of C, its headers or CMake"
+    is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
+    if not is_identifier or len(name) > LONGEST_IDENTIFIER or name in RESERVED or name.lower() in FILES:
+        raise checks.fail("name", name, expected, 'Such as name="arm_law".')
+    return name
+
+
+def _check_period(period: float) -> None:
+    """Raises ValueError for a period with which the simulated run of the self-test would be too long."""
+    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+        expected = f"a period of the law from {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
+        raise checks.fail("period", period, expected, "The self-test holds a simulated run with it.")
 
 
 def _available(dtype: str) -> str:
@@ -187,15 +209,13 @@ def vectors(scenario: Scenario, told_reference: bool) -> Vectors:
     period = float(scenario.sampling.period)  # type: ignore[union-attr]
     steps = max(1, math.ceil(period / LONGEST_STEP - 1e-9))
     samples = max(2, round(VECTORS_DURATION / period))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with notices.muted():
         run = simulate(scenario, duration=samples * period, dt=period / steps, record_every=steps)
     status = int(run.status)
     if status & int(FAILED | Status.SAMPLING_TOO_SLOW):
-        warnings.warn(
+        notices.warn(
             f"the simulated run with this law every {period:g} s: {describe(status)}. What is written is that law; "
-            "ij.recommended_period(scenario) says how long a period may be.",
-            stacklevel=3,
+            "ij.recommended_period(scenario) says how long a period may be."
         )
     dtype = run.q.dtype
     t = jnp.asarray(np.arange(samples) * period, dtype)

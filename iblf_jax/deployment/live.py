@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.core import checks, tables
+from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.status import FAILED, WORDS
 from iblf_jax.deployment.cosimulate import check_single
 from iblf_jax.deployment.export import export
@@ -52,6 +52,7 @@ class Page:
         return f'<iframe srcdoc="{html.escape(self.text, quote=True)}" style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
 
 
+@notices.each_warning_once
 def explore(scenario: Scenario | Mapping[str, Scenario], *, duration: float = 10.0, dt: float = 1e-3, method: str = "rk4") -> Page:
     """A page on which gains, start and bounds are moved by sliders, and the run follows while they move.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.robots.description import Shown, read
 from iblf_jax.robots.load import locked_position
 from iblf_jax.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unknown
@@ -170,7 +169,7 @@ def _specification(mujoco: Any, plant: Any) -> Any:
         return plant.copy()
     if not isinstance(plant, str | os.PathLike):
         raise checks.fail("plant", plant, "the path of an MJCF or URDF, a mujoco.MjSpec or a mujoco.MjModel")
-    root, path = read(plant), Path(plant)
+    root, path = read(plant, "plant"), Path(plant)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
@@ -193,7 +192,7 @@ def _without_missing_meshes(spec: Any, path: Path) -> None:
     missing = {mesh.name for mesh in spec.meshes if not (place / (Path(mesh.file).name if spec.strippath else mesh.file)).exists()}
     shapes = [geom for geom in spec.geoms if geom.meshname in missing]
     if shapes:
-        warnings.warn(f"{path}: {len(shapes)} shapes are left out, as their meshes are not there: these touch nothing.", stacklevel=5)
+        notices.warn(f"{path}: {len(shapes)} shapes are left out, as their meshes are not there: these touch nothing.")
     for geom in shapes:
         spec.delete(geom)
     for mesh in list(spec.meshes):

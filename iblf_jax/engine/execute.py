@@ -12,7 +12,6 @@ a `BackendWarning` says why, once.
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, devices
+from iblf_jax.core import checks, devices, notices
 from iblf_jax.engine import gpu, native, plan, xla
 from iblf_jax.engine.batch import Batch, Executor, begin, carry_shapes, end, run_all
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
@@ -51,7 +50,7 @@ _told: set[str] = set()
 def _tell(text: str) -> None:
     if text not in _told:
         _told.add(text)
-        warnings.warn(text, BackendWarning, stacklevel=5)
+        notices.warn(text, BackendWarning)
 
 
 def automatic() -> tuple[str, str | None]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import automatic, inputs_of
 from iblf_jax.engine.executors import program_of
@@ -60,6 +60,7 @@ class Explanation:
         return "\n".join(lines)
 
 
+@notices.each_warning_once
 def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk4", metrics=None) -> Explanation:
     """What one step of a scenario costs on a compiled backend; where the law is sampled, a step in which it runs and a command arrives.
 

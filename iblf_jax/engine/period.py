@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.engine.step_size import LOOKS, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, sampled
 from iblf_jax.simulation.sampling import Sampling, under_way, with_room
@@ -28,6 +28,10 @@ FACTOR = 2 ** (1 / 3)
 HALVINGS = 8
 MOST_UNDER_WAY = 6
 """Commands under way at the shortest period that is tried."""
+
+
+RADII, MARGINS = (1e-3, 10.0), (1.0, 1000.0)
+"""Spectral radii and margins that a user can mean [1]."""
 
 
 def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
@@ -58,6 +62,7 @@ def _maps(scenario: Scenario, times: jax.Array) -> jax.Array:
     return jax.vmap(at)(jnp.concatenate([zero[None], times]), start_and_along(scenario, times))
 
 
+@notices.each_warning_once
 def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0) -> float:
     """A round period [s] that a law may run at: the loop would still be stable at `margin` times it.
 
@@ -80,10 +85,9 @@ def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: fl
 
     Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapter 3.
     """
-    duration, radius = checks.positive_number("duration", duration, "s"), checks.positive_number("radius", radius, "1")
-    margin = checks.positive_number("margin", margin, "1")
-    if margin < 1.0:
-        raise checks.fail("margin", margin, "a number from 1 on")
+    duration = checks.time_span("duration", duration)
+    radius = checks.number_between("radius", radius, *RADII, "1", "A loop is stable below a spectral radius of 1.")
+    margin = checks.number_between("margin", margin, *MARGINS, "1")
     if isinstance(scenario, Scenario) and scenario.sampling is None:
         scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))
     scenario = with_room(canonical(scenario))

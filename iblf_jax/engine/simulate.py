@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from functools import partial
 
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.bounds import tube_at
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.execute import run_one
@@ -43,6 +42,7 @@ class SimulationWarning(UserWarning):
     """A run whose result needs a second look."""
 
 
+@notices.each_warning_once
 def simulate(
     scenario: Scenario,
     *,
@@ -147,7 +147,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     text = " ".join([heading, *_explanations(result, told | status & ~Status.ALPHA_INFEASIBLE, steps)])
     if throw and failed:
         raise SimulationError(text)
-    warnings.warn(text, SimulationWarning, stacklevel=3)
+    notices.warn(text, SimulationWarning)
 
 
 def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
@@ -182,8 +182,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
     elif status & Status.INACCURATE:
         error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
-        known = checks.is_concrete(result.scenario)
-        dt = f"dt={find_dt(result.scenario, duration=steps * float(result.dt), method=result.method):g}" if known else "a smaller one"
+        dt = _smaller_step(result, steps)
         texts.append(
             f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where {100 * TOLERANCE:g} % are tolerated: "
             f"dt = {float(result.dt):g} s is too large for what drives this loop. Take {dt}."
@@ -214,6 +213,16 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             "further from the bounds, or give the barrier a smaller guard."
         )
     return texts
+
+
+def _smaller_step(result: Rollout, steps: int) -> str:
+    """A step with which this run would be accurate, in words."""
+    if not checks.is_concrete(result.scenario):
+        return "a smaller one"
+    try:
+        return f"dt={find_dt(result.scenario, duration=steps * float(result.dt), method=result.method):g}"
+    except ValueError:  # the run is too long for a step to be tried
+        return "a smaller one"
 
 
 def _called(result: Rollout, joint: int) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.machine_function import machine_function
@@ -174,6 +173,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     if not np.isfinite(mode):
         raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
     dt = for_modes = min(comfortable_dt(mode), round_down(duration))
+    _can_be_tried(duration, dt)
     whole = ravel_pytree(initial_state(scenario))[1]
     while duration / dt <= MOST_TRIED:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
@@ -185,10 +185,9 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
             dt = for_modes = limit
         else:
             dt = smaller(dt, excess if np.isfinite(excess) else np.inf, order)
-    warnings.warn(
+    notices.warn(
         f"No step down to {duration / MOST_TRIED:.1g} s makes this run accurate: the loop may magnify every error, or a signal may be "
-        f"faster than that. {for_modes:g} s is what the loop's modes allow.",
-        stacklevel=3,
+        f"faster than that. {for_modes:g} s is what the loop's modes allow."
     )
     return for_modes
 
@@ -197,6 +196,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
     """As `find_dt` where the law is sampled: the largest part of a period, 1, 2 or 5 times a power of ten of them, that will do."""
     sampling: Any = scenario.sampling
     period, noise = float(sampling.period), jnp.zeros((4,))
+    _can_be_tried(duration, period)
     periods = max(math.ceil(duration / period - 1e-9), 1)
     parts, before, poor_before, coarser = 1, None, 0, period
     while periods * parts <= MOST_TRIED:
@@ -207,8 +207,16 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
         if before is not None and not poor_before and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL:
             return coarser
         before, poor_before, coarser, parts = q, poor, float(dt), _next_round(parts)
-    warnings.warn(f"No step down to {coarser:g} s makes this run accurate: the loop may magnify every error.", stacklevel=4)
+    notices.warn(f"No step down to {coarser:g} s makes this run accurate: the loop may magnify every error.")
     return coarser
+
+
+def _can_be_tried(duration: float, dt: float) -> None:
+    """Raises ValueError where a run is too long for a step to be tried on it."""
+    if duration / dt > MOST_TRIED:
+        expected = f"at most {MOST_TRIED * dt:g} s, which are {MOST_TRIED} steps of {dt:g} s"
+        remedy = "No run of that many steps is tried: give a time after which the motion repeats itself or has settled."
+        raise checks.fail("duration", duration, expected, remedy)
 
 
 def _next_round(parts: int) -> int:

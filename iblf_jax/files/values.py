@@ -5,7 +5,6 @@ Every refusal is a ValueError that names the dotted key, what came, what was exp
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import tomllib
@@ -17,18 +16,10 @@ from typing import Any
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.checks import Words, did_you_mean
 
 NONE = "none"
 """What a file says for a structural field that is None though its default is something else; TOML has no null."""
-
-
-class Words(str):
-    """Words in place of a value in an error message: "got nothing", not "got 'nothing'"."""
-
-    __slots__ = ()
-
-    def __repr__(self) -> str:
-        return str(self)
 
 
 def toml_tables(text: str) -> dict[str, Any]:
@@ -59,15 +50,6 @@ def inline_table(table: dict[str, Any]) -> str:
         return json.dumps(value) if isinstance(value, bool) or type(value) is str else str(value)
 
     return f"{{ {', '.join(f'{key} = {written(value)}' for key, value in table.items())} }}"
-
-
-def did_you_mean(name: Any, known: Iterable[str]) -> str:
-    """The remedy for a misspelt word: the nearest known ones, or all of them."""
-    words = [str(word) for word in known]
-    close = difflib.get_close_matches(str(name), words, n=2, cutoff=0.6)
-    if close:
-        return f"Did you mean {' or '.join(close)}?"
-    return f"There are: {', '.join(words)}." if words else ""
 
 
 def as_table(value: Any, path: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.replay import Place, slopes
 from iblf_jax.identification.coordinates import coordinates, scales
@@ -28,6 +28,8 @@ SPACING = 0.8
 """Time between waypoints, unless their number is given [s]."""
 SAMPLES, DENSE = 25, 8
 """Times at which the motion counts, by waypoint; and how many times as many at which it must be inside."""
+BASIS_COPIES = 8
+"""Matrices of position, velocity and acceleration that are in memory at once, with room for what is computed of them."""
 REST = 1e-4
 MARGIN = 0.1
 """Part of the room between bounds that is kept free on each side, for the errors of the law."""
@@ -56,6 +58,7 @@ class Room(NamedTuple):
     """(n,) [N m]."""
 
 
+@notices.each_warning_once
 def excitation(
     scenario: Scenario, paths: list[str], *, duration: float = 10.0, waypoints: int | None = None, iterations: int = 60, seed: int = 0
 ) -> WaypointSpline:
@@ -81,9 +84,9 @@ def excitation(
 
     Source: J. Swevers et al., IEEE Trans. Robot. Autom. 13 (1997) 730-740, for the idea.
     """
-    duration = checks.positive_number("duration", duration, "s")
-    count = max(6, round(duration / SPACING)) if waypoints is None else checks.positive_integer("waypoints", waypoints, least=4)
-    iterations, seed = checks.positive_integer("iterations", iterations), checks.seed(seed)
+    duration = checks.time_span("duration", duration)
+    count = _waypoints(duration, waypoints)
+    iterations, seed = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS), checks.seed(seed)
     with jax.enable_x64(True):
         dtype = jnp.asarray(scenario.initial.q).dtype if isinstance(scenario, Scenario) else None
         start = canonical(astype(canonical(scenario), "float64"))
@@ -104,6 +107,16 @@ def excitation(
         best = _minimum(price, middle, guess, iterations)
         best = _drawn_together(replayed, dense, room, middle, best)
     return WaypointSpline(times, np.asarray(best, dtype))
+
+
+def _waypoints(duration: float, waypoints: int | None) -> int:
+    """The number of waypoints; ValueError where the matrices of the spline would not fit into the memory."""
+    most = int((checks.memory() / (BASIS_COPIES * 8.0 * DENSE * SAMPLES)) ** 0.5)
+    if waypoints is not None:
+        return checks.positive_integer("waypoints", waypoints, least=4, most=most)
+    if duration / SPACING > most:
+        raise checks.fail("duration", duration, f"at most {most * SPACING:g} s", "Excite the robot by several shorter motions.")
+    return max(6, round(duration / SPACING))
 
 
 def _basis(times: tuple[float, ...], count: int) -> Basis:

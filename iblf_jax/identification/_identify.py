@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.replay import slopes_under
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, coordinates, to_x, to_z, with_widths
@@ -28,6 +28,7 @@ LOSSES = ("squares", "huber")
 TORQUES = ("held", "interpolated")
 
 
+@notices.each_warning_once
 def identify(
     scenario: Scenario,
     log: Any,
@@ -82,12 +83,11 @@ def identify(
     torque = ("interpolated" if _is_continuous(log) else "held") if torque is None else torque
     checks.one_of("torque", torque, TORQUES)
     checks.one_of("loss", loss, LOSSES)
-    window = checks.positive_number("window", window, "s")
-    iterations = checks.positive_integer("iterations", iterations)
+    window = checks.time_span("window", window)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
     limits = {} if limits is None else checks.mapping("limits", limits, '{"plant.mass": (0.1, 5.0)}')
     priors = {} if priors is None else checks.mapping("priors", priors, '{"plant.mass": (2.0, 0.1)}')
-    if delay is not None and not abs(float(checks.as_floats("delay", delay))) <= LARGEST_DELAY:
-        raise checks.fail("delay", delay, f"a time of at most {LARGEST_DELAY:g} s")
+    _check_delay(delay)
     given = canonical(scenario)
     with jax.enable_x64(True):  # noise of 1e-4 rad leaves no room for the rounding of float32
         start = canonical(astype(given, "float64"))
@@ -147,6 +147,15 @@ def identify(
             time.monotonic() - begin,
         )
     return dataclasses.replace(result, scenario=astype(result.scenario, given.initial.q.dtype), start=given)
+
+
+def _check_delay(delay: Any) -> None:
+    """Raises ValueError for a delay of the torque that is no number or too long; None is found from the log."""
+    if delay is None:
+        return
+    number = checks.as_floats("delay", delay)
+    if number.ndim != 0 or not abs(float(number)) <= LARGEST_DELAY:
+        raise checks.fail("delay", delay, f"one number [s], of a size of at most {LARGEST_DELAY:g} s")
 
 
 def _is_continuous(log: Any) -> bool:

@@ -21,7 +21,6 @@ import subprocess
 import tempfile
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -29,6 +28,7 @@ from pathlib import Path
 import jax
 
 from iblf_jax._start import AT_END
+from iblf_jax.core import notices
 from iblf_jax.core.cache import directory, processor
 from iblf_jax.core.drafts import draft, remove_abandoned
 from iblf_jax.core.progress import told
@@ -349,5 +349,5 @@ def threads() -> int:
         return int(number) if wanted else usual
     chosen = MOST_THREADS if number else usual
     expected = f"expected a whole number from 1 to {MOST_THREADS}. Running with {chosen} threads."
-    warnings.warn(f"IBLF_JAX_THREADS: got {wanted[:40]!r}, {expected}", stacklevel=2)
+    notices.warn(f"IBLF_JAX_THREADS: got {wanted[:40]!r}, {expected}")
     return chosen

@@ -38,34 +38,29 @@ SPACES = " \t\r\n"
 """What separates the numbers of an attribute: the white space of XML."""
 
 
-class Shown(str):
-    """Words in place of a value in an error message."""
-
-    __slots__ = ()
-
-    def __repr__(self) -> str:
-        return str(self)
+Shown = checks.Words
 
 
-def read(path: str | os.PathLike) -> ET.Element:
+def read(path: str | os.PathLike, field: str = "path") -> ET.Element:
     """The root element of a description.
 
     Args:
       path: a file, URDF or MJCF.
+      field: what the caller's argument is called in messages.
 
     Raises:
       ValueError: no such file, not a file, too large, too deep, not XML, or XML that declares entities.
     """
-    place = checks.file_path("path", path, "a URDF or MJCF file")
+    place = checks.file_path(field, path, "a URDF or MJCF file")
     try:
-        root = _Reader(place.parent).parse(place)
+        root = _Reader(place.parent, field).parse(place)
     except ValueError as error:
         raise of_file(path, error) from error
     if root.tag not in ("robot", "mujoco"):
         expected = "a URDF or MJCF file"
         if root.tag == "sdf":
-            raise checks.fail("path", str(path), expected, "It is SDF.")
-        raise checks.fail("path", str(path), expected, f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.")
+            raise checks.fail(field, str(path), expected, "It is SDF.")
+        raise checks.fail(field, str(path), expected, f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.")
     return root
 
 
@@ -80,8 +75,9 @@ def of_file(path: str | os.PathLike, error: ValueError) -> ValueError:
 class _Reader:
     """Reads files with one budget of bytes and elements for all of them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, field: str) -> None:
         self.folder = folder
+        self.field = field
         self.bytes_left = LARGEST
         self.elements_left = MOST
 
@@ -157,11 +153,11 @@ class _Reader:
         return Path(target)
 
     def _bytes(self, path: Path) -> bytes:
-        data = contents("path", path, self.bytes_left, "the path of a URDF or MJCF file")
+        data = contents(self.field, path, self.bytes_left, "the path of a URDF or MJCF file")
         self.bytes_left -= len(data)
         if self.bytes_left < 0:
             expected = f"a file of at most {LARGEST >> 20} MiB"
-            raise checks.fail("path", str(path), expected, "A description without meshes is far smaller.")
+            raise checks.fail(self.field, str(path), expected, "A description without meshes is far smaller.")
         return data
 
 

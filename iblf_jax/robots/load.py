@@ -8,7 +8,6 @@ link of the chain that carries it.  The arm's world is the frame of the base.
 from __future__ import annotations
 
 import os
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.robots import description, mjcf, urdf
 from iblf_jax.robots.arm import Arm
 from iblf_jax.robots.description import Shown
@@ -73,14 +72,15 @@ def load(
     """
     base, tip = (None if x is None else checks.word(what, x, "the name of a link") for what, x in (("base", base), ("tip", tip)))
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
-    root, repairs = description.read(path), Repairs(checks.flag("repair", repair))
+    repairs = Repairs(checks.flag("repair", repair))
+    root = description.read(path)
     picked = _Request(base, tip, dict(locked), gravity, repairs)
     try:
         arm = _from_urdf(root, path, picked) if root.tag == "robot" else _from_mjcf(root, path, picked)
     except ValueError as error:
         raise description.of_file(path, error) from error
     if arm.repaired:
-        warnings.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".", stacklevel=2)
+        notices.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".")
     return arm
 
 

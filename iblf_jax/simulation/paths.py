@@ -15,7 +15,6 @@ import dataclasses
 import difflib
 import json
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, tables
+from iblf_jax.core import checks, notices, tables
 from iblf_jax.simulation.scenario import Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
@@ -336,8 +335,7 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
 
 def why_inadmissible(scenario: Scenario, values: Mapping[str, Any]) -> str:
     """Why the scenario with these leaves replaced cannot be run, in words (a start outside its bounds, a negative mass); "" if it can."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # advice on gains
+    with notices.muted():  # advice on gains
         try:
             canonical(with_parameters(scenario, values))
         except ValueError as error:

@@ -59,6 +59,9 @@ class Sampling:
         """Raises ValueError for an unknown step of the observer or a queue that is too short."""
         checks.one_of("Sampling.observer", self.observer, OBSERVER_STEPS)
         concrete = checks.is_concrete(self)
+        if concrete:
+            checks.time_span("Sampling.period", self.period)
+            checks.time_span("Sampling.delay", self.delay, zero=True)
         least = self.needed if concrete else 0
         if self.queue is None:
             if not concrete:

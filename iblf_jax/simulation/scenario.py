@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import warnings
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from iblf_jax.actuators import Actuator
 from iblf_jax.actuators import Ideal as IdealActuator
 from iblf_jax.bounds import Bounds, speed_limits_at, tube_at
 from iblf_jax.controllers import Controller, Setting
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
@@ -188,7 +187,8 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     names = [field.name for field in dataclasses.fields(Scenario)]
     for name in parts:
         if name not in (*names, "robot"):
-            raise checks.fail("part", name, f"the name of a part: robot, {', '.join(names)}", "Leaves change by ij.with_parameters.")
+            remedy = f"{checks.nearest(name, ('robot', *names))} Leaves change by ij.with_parameters.".strip()
+            raise checks.fail("part", name, f"the name of a part: robot, {', '.join(names)}", remedy)
     if "robot" in parts:
         for name in ("plant", "model"):
             if name in parts:
@@ -273,7 +273,7 @@ def canonical(scenario: Scenario) -> Scenario:
         if scenario.sampling is not None:
             advice += getattr(scenario.sensor, "advice", lambda period: [])(scenario.sampling.period)
         for text in advice:
-            warnings.warn(text, stacklevel=3)
+            notices.warn(text)
     return scenario
 
 

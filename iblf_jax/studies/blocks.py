@@ -64,10 +64,15 @@ def block_size() -> int:
     return plan.study_block(platform())
 
 
+MOST_MEMORY = 2.0**60
+"""Bytes.  No machine has more."""
+
+
 def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
     """A user's arguments of `run_blocks` that say how and change no number, checked; they may be None (all devices, `memory` rules)."""
-    chunk = None if chunk is None else checks.positive_integer("chunk", chunk)
-    return {"chunk": chunk, "memory": checks.positive_number("memory", memory, "bytes"), "devices": checks.devices("devices", devices)}
+    chunk = None if chunk is None else checks.positive_integer("chunk", chunk, most=checks.MOST_STEPS)
+    memory = checks.number_between("memory", memory, 1.0, MOST_MEMORY, "bytes", "Such as memory=4e9.")
+    return {"chunk": chunk, "memory": memory, "devices": checks.devices("devices", devices)}
 
 
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from iblf_jax.controllers import KEEPERS, LAWS, Controller, Saturated, law_by_name
 from iblf_jax.controllers.systems import observer_of
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status, describe
 from iblf_jax.engine.simulate import simulate
@@ -44,6 +43,7 @@ NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
 
 
+@notices.each_warning_once
 def compare(
     scenario: Scenario,
     laws: Laws = LAWS,
@@ -144,8 +144,7 @@ def _limited_as(controller: Controller, law: Controller) -> Controller:
 
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; a failure is named in the table, not warned of."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
+    with notices.muted(UserWarning):
         return simulate(scenario, metrics=(*standard(), *watched(scenario), AboveGravity()), **options)
 
 

@@ -213,6 +213,7 @@ class Perturbation:
                 f"{self.kind}(...)", self.distribution, "a distribution", f"Write ij.{self.kind}(ij.uniform(low, high)), for example."
             )
         checks.one_of("Perturbation.kind", self.kind, KINDS)
+        object.__setattr__(self, "shared", checks.flag("Perturbation.shared", self.shared))
 
     def apply(self, nominal: jax.Array, u: jax.Array) -> jax.Array:
         """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the shape of `nominal`."""

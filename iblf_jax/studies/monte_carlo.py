@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
@@ -31,6 +31,7 @@ from iblf_jax.studies.setup import prepare
 from iblf_jax.studies.study import Study
 
 
+@notices.each_warning_once
 def monte_carlo(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],

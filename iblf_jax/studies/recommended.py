@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from iblf_jax.core import checks, notices
 from iblf_jax.core.status import Status
 from iblf_jax.engine import step_size
 from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import block_size, run_blocks
 from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.setup import prepare
 
 TOO_LARGE = Status.STEP_TOO_LARGE | Status.INACCURATE
@@ -22,6 +23,7 @@ TOO_LARGE = Status.STEP_TOO_LARGE | Status.INACCURATE
 MOST_TRIES = 8
 
 
+@notices.each_warning_once
 def recommended_dt(
     scenario: Scenario,
     *,
@@ -51,6 +53,12 @@ def recommended_dt(
     Raises:
       ValueError: bad scenario, duration, method, perturbations or seed.
     """
+    tableau(method)
+    seed, duration = checks.seed(seed), checks.time_span("duration", duration)
+    perturbations = {} if perturbations is None else perturbations
+    checks.mapping("perturbations", perturbations, '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}')
+    if perturbations:  # refused here, before a step is looked for
+        targets_of(canonical(scenario), perturbations)
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
@@ -89,8 +97,7 @@ def tell_of_step(status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: 
     needed = needed_dt(status, modes, errors, dt, method)
     if needed is not None:
         late = int(np.sum(status & int(TOO_LARGE) != 0))
-        warnings.warn(
+        notices.warn(
             f"The time step dt = {dt:g} s is too large for {late} of {status.size} runs, which are unstable or inaccurate. "
-            f"Take dt={needed:g}; ij.recommended_dt(scenario, perturbations=..., duration=...) looks for one beforehand.",
-            stacklevel=3,
+            f"Take dt={needed:g}; ij.recommended_dt(scenario, perturbations=..., duration=...) looks for one beforehand."
         )

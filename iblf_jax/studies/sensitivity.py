@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax.core import checks, tables
+from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.progress import bar
 from iblf_jax.core.status import FAILED
 from iblf_jax.engine import plan
@@ -82,6 +82,7 @@ class Sensitivity:
         return "\n".join([f"Sensitivity of {self.output} ({self.runs} runs, {self.failed} failed and part of it)", *tables.as_text(rows)])
 
 
+@notices.each_warning_once
 def sensitivity(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
@@ -134,6 +135,8 @@ def sensitivity(
         raise checks.fail("perturbations", perturbations, "at least one perturbation")
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
     setup = prepare(scenario, perturbations, 1, checks.seed(seed), metrics=metrics, backend=backend, **timing)
+    if isinstance(output, str):
+        checks.one_of("output", output, sorted(setup.shapes.metrics))
     shapes = sample_size(setup.study_run.targets, setup.shared.cases.perturbations)
     names = [path + "".join(f"[{i}]" for i in place) for path, shape in shapes.items() for place in np.ndindex(shape)]
     checks.fits("points", points, (len(names) + 2) * (setup.bytes_a_case + 3 * 8.0 * len(names)))

@@ -13,6 +13,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.sampling import check_step
@@ -82,6 +83,7 @@ def prepare(
 ) -> StudySetup:
     """Checks the arguments that studies share and puts together what their blocks need."""
     tableau(method)
+    checks.one_of("backend", backend, BACKENDS)
     steps = checks.whole_steps(duration, dt)
     seed, scenario = checks.seed(seed), canonical(scenario)
     check_step(scenario, dt)

@@ -13,7 +13,6 @@ A run whose start was drawn on or outside its bounds has violated them at t = 0,
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.core.status import VIOLATED as LEFT
 from iblf_jax.engine.simulate import SimulationWarning, simulate_unchecked
@@ -280,6 +279,7 @@ class Study:
 
         return plotting.study_overview(self, **options)
 
+    @notices.each_warning_once
     def replay(self, index: int, *, record_every: int = 1) -> Rollout:
         """Makes one run again, with its whole trajectory.
 
@@ -308,7 +308,7 @@ class Study:
         ((_, again),) = run_blocks(self.setup.study_run, self.setup.shared, self.setup.lanes, [block])
         again = jax.tree.map(lambda x: x[place], again)
         if not all(np.array_equal(x, self.metrics[name][i], equal_nan=True) for name, x in again.metrics.items()):
-            warnings.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.", stacklevel=2)
+            notices.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.")
         study_run, shared = self.setup.study_run, self.setup.shared
         run = simulate_unchecked(
             paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
@@ -330,12 +330,11 @@ class Study:
         unit = next(unit for unit, margins in first.items() if not np.min(margins) > 0)
         worst, plant = int(np.argmin(first[unit])), self.scenario.plant
         name = in_words(self.scenario.regions[worst], plant) if unit == "m" else joint_names(plant, self.scenario.n)[worst]
-        warnings.warn(
+        notices.warn(
             f"Run {i} started outside its bounds: {name} was drawn {-first[unit][worst]:.3g} {unit} beyond one at t = 0. "
             "That violation is the draw's, not the law's: narrow the perturbations of the start, or leave such runs out "
             "(study.started_outside).",
             SimulationWarning,
-            stacklevel=3,
         )
 
     def __repr__(self) -> str:

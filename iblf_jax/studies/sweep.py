@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.engine import plan
 from iblf_jax.simulation.accuracy import RELATIVE
@@ -47,6 +46,7 @@ class _How(NamedTuple):
     progress: bool | None
 
 
+@notices.each_warning_once
 def sweep(
     scenario: Scenario,
     grid: Mapping[str, Any],
@@ -119,7 +119,7 @@ def sweep(
         raise checks.fail("runs", runs, "1 without perturbations", "Without any all runs at a point are the same.")
     if not perturbations and isinstance(grid, Mapping) and not grid:
         raise checks.fail("grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate.")
-    unit = None if unit is None else checks.positive_integer("unit", unit)
+    unit = None if unit is None else checks.positive_integer("unit", unit, most=checks.MOST_STEPS)
     store = None if store is None else checks.file_path("store", store, "a folder")
     where = make_points(canonical(scenario), grid, design, points, checks.seed(seed))
     options: dict[str, Any] = {"metrics": metrics, "backend": backend, "sampler": sampler, "replicates": replicates, "points": where.values}
@@ -218,9 +218,8 @@ def _into_store(setup: StudySetup, config: dict[str, Any], how: _How, path: str 
     size = store.unit
     pending, damaged = store.pending()
     if damaged:
-        warnings.warn(
-            f"{path}: {len(damaged)} units are damaged (their data do not fit their checksums) and are computed again: {damaged[:10]}.",
-            stacklevel=3,
+        notices.warn(
+            f"{path}: {len(damaged)} units are damaged (their data do not fit their checksums) and are computed again: {damaged[:10]}."
         )
     mine = distributed.share(pending)
     done, longest, begin = 0, 0.0, time.monotonic()

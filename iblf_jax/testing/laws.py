@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from typing import Any
 
 import jax
@@ -12,6 +11,7 @@ import numpy as np
 
 from iblf_jax.bounds import Bounds, Constant
 from iblf_jax.controllers import Command, Controller
+from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import simulate
@@ -126,8 +126,7 @@ def _at_the_wall(findings: Findings, scenario: Scenario) -> None:
 def _closed_loop(findings: Findings, scenario: Scenario) -> None:
     """A short run in float32, where a state that changes its type is an error."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with notices.muted():
             run = simulate(scenario, duration=SHORT_RUN, dt=1e-3, record_every=10, metrics=())
     except (TypeError, ValueError) as error:
         findings.add(f"it does not run in a closed loop ({type(error).__name__}: {str(error).splitlines()[0]})")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.engine.derivatives import Outer
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import folded
@@ -167,8 +166,7 @@ def _second_order(findings: Findings, quantity: Any, moving: dict[str, jax.Array
 def _on_a_run(findings: Findings, objective: Objective, scenario: Scenario, duration: float) -> None:
     """A run gives finite numbers, and every term its scale."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with notices.muted():
             metrics = simulate(scenario, duration=duration, dt=1e-3, record_every=1000, metrics=(Quantities(objective.quantities),)).metrics
     except (TypeError, ValueError) as error:
         findings.add(f"it cannot be had from a run ({type(error).__name__}: {str(error).splitlines()[0]})")

@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
@@ -42,6 +42,7 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
+from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.parameters import Box
@@ -100,6 +101,7 @@ class Attack:
         return "\n".join(lines)
 
 
+@notices.each_warning_once
 @checks.renamed(sets="perturbations")
 def falsify(
     scenario: Scenario,
@@ -145,7 +147,8 @@ def falsify(
     checks.one_of("backend", backend, BACKENDS)
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     check_step(scenario, dt)
-    starts, iterations = checks.positive_integer("starts", starts), checks.positive_integer("iterations", iterations)
+    starts = checks.positive_integer("starts", starts, most=MOST_RUNS)
+    iterations, seed = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS), checks.seed(seed)
     checks.fits("iterations", iterations, 8 * starts)
     cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
@@ -155,7 +158,6 @@ def falsify(
     check_needs("margin", peak, scenario)
     run, unit = Run(steps, method, mechanism=mechanism_of(scenario)), DEFICITS[peak.signal]
     push = partial(_push, cube, astype(peak, dtype), jnp.asarray(dt, dtype), run=run, backend=backend)
-    seed = checks.seed(seed)
     searcher = Newton(Box(np.full(cube.size, 0.5), np.zeros(cube.size), np.ones(cube.size)), TOLERANCE, FIRST_RADIUS)
     state, best, history = searcher.init(cube.admissible_points(starts, [seed, 3])), None, []
 

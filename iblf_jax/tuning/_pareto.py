@@ -29,11 +29,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.engine.plan import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning._tune import Problem, build, look_around, make_method
 from iblf_jax.tuning.objectives import Objective
@@ -108,6 +109,7 @@ def non_dominated(points: np.ndarray) -> np.ndarray:
     return order[points[order, 1] < best]
 
 
+@notices.each_warning_once
 def pareto(
     scenario: Scenario,
     parameters: Sequence[str | Tunable],
@@ -147,9 +149,9 @@ def pareto(
     Source: head of this module.
     """
     began = time.perf_counter()
-    points, seed = checks.positive_integer("points", points, least=2), checks.seed(seed)
+    points, seed = checks.positive_integer("points", points, least=2, most=MOST_RUNS), checks.seed(seed)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
-    tolerance, pair = checks.positive_number("tolerance", tolerance, "1", zero=True), _pair(objectives)
+    tolerance, pair = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1"), _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, levels=True)
     if not differentiates_forward(len(problem.box.z)):

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.plan import BACKENDS, differentiates_forward, values_together
@@ -49,6 +49,9 @@ from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk, as_risk
 
 OPTIMISERS = ("auto", "newton", "lbfgs", "adam")
+MODES = ("auto", "forward", "reverse")
+LEARNING_RATES = (1e-12, 1e3)
+"""Between which a learning rate must lie [1]."""
 SPREAD = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a factor e for gains."""
 MOST_SHARPENINGS = 60
@@ -61,6 +64,7 @@ SCREENED = 32
 """Points of the whole box that are looked at where the first start leaves its bounds, and for the ends of a front."""
 
 
+@notices.each_warning_once
 def tune(
     scenario: Scenario,
     parameters: Sequence[str | Tunable],
@@ -141,17 +145,19 @@ def tune(
         checks.positive_integer("starts", starts),
     )
     patience, report_runs = (
-        checks.positive_integer("patience", patience),
+        checks.positive_integer("patience", patience, most=checks.MOST_STEPS),
         checks.positive_integer("report_runs", report_runs, most=MOST_RUNS),
     )
     sharpenings = checks.positive_integer("sharpenings", sharpenings, least=0, most=MOST_SHARPENINGS)
-    tolerance = checks.positive_number("tolerance", tolerance, "1", zero=True)
-    learning_rate = checks.positive_number("learning_rate", learning_rate, "1")
+    tolerance = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1")
+    learning_rate = checks.number_between("learning_rate", learning_rate, *LEARNING_RATES, "1")
     confidence, resample, seed = check_confidence(confidence), checks.flag("resample", resample), checks.seed(seed)
-    report_seed = (seed + 1) % 2**32 if report_seed is None else checks.seed(report_seed)
+    report_seed = (seed + 1) % 2**32 if report_seed is None else checks.seed(report_seed, "report_seed")
     checkpoint = None if checkpoint is None else checks.file_to_write("checkpoint", checkpoint)
     if callback is not None and not callable(callback):
         raise checks.fail("callback", callback, "a function that is called with the loop after each step")
+    checks.one_of("mode", mode, MODES)
+    checks.one_of("optimiser", optimiser, OPTIMISERS)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, objective, perturbations, runs, seed, risk, timing)
     mode, optimiser = choose(mode, optimiser, len(problem.box.z), resample)
@@ -278,6 +284,7 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
     tableau(timing["method"])
     checks.one_of("backend", timing.get("backend", "auto"), BACKENDS)
     steps = checks.whole_steps(timing["duration"], timing["dt"])
+    goal, risk = checked(objective), as_risk(risk)
     seed, runs, scenario = checks.seed(seed), checks.positive_integer("runs", runs, most=MOST_RUNS), canonical(scenario)
     check_step(scenario, float(timing["dt"]))
     dtype = scenario.initial.q.dtype
@@ -286,7 +293,6 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
         raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
     blocks, box = layout(scenario, parameters, float(timing["dt"]), timing["method"])
     checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
-    goal = checked(objective)
     check_signals(goal, scenario)
     fit_joints(goal, scenario.n, "objective")
     ones = complete(goal, np.ones(len(goal.terms)))
@@ -294,9 +300,7 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
     backend, mechanism = timing.get("backend", "auto"), mechanism_of(scenario)
     pieces = piece_counts(ones, scenario, float(timing["duration"]))
-    formulation = Formulation(
-        blocks, targets, steps, timing["method"], as_risk(risk), shares, levels, backend, mechanism=mechanism, pieces=pieces
-    )
+    formulation = Formulation(blocks, targets, steps, timing["method"], risk, shares, levels, backend, mechanism=mechanism, pieces=pieces)
     inputs = ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step)
     again = {"duration": timing["duration"], "method": timing["method"], "perturbations": perturbations, "seed": seed}
     problem = Problem(formulation, inputs, box, runs, partial(recommended_dt, scenario, **again))
@@ -308,8 +312,6 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
 
 def choose(mode: str, optimiser: str, size: int, resample: bool) -> tuple[str, str]:
     """Mode and optimiser, where the user left them open."""
-    checks.one_of("mode", mode, ("auto", "forward", "reverse"))
-    checks.one_of("optimiser", optimiser, OPTIMISERS)
     if mode == "auto":
         mode = "forward" if optimiser == "newton" or differentiates_forward(size) else "reverse"
     if optimiser == "auto":

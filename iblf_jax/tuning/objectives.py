@@ -151,13 +151,29 @@ class Objective:
         return jnp.stack(found) if found else jnp.zeros((0,), smooth.dtype)
 
 
+WHAT_IT_IS = (
+    "an objective with at least one term: a sum of terms of ij.objectives (tracking, effort, torque_rate, settle, peak_torque, margin, "
+    "metric and others), each with a weight, to which requirements can be added"
+)
+
+
 def checked(objective: Any) -> Objective:
     """The objective that the user composed, if it is one; ValueError otherwise."""
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
     if not isinstance(objective, Objective) or not objective.terms:
-        raise checks.fail("objective", objective, "an objective with at least one term", "Such as ij.objectives.tracking().")
+        raise checks.fail("objective", objective, WHAT_IT_IS, _remedy(objective))
     return objective
+
+
+def _remedy(given: Any) -> str:
+    """How an objective is written, for what a user gave in its place."""
+    example = "Such as ij.objectives.tracking() + 0.1 * ij.objectives.effort()."
+    if isinstance(given, str):
+        return f"A name is none; a metric is made a term by ij.objectives.metric(fold, {given!r}). {example}"
+    if isinstance(given, type) or callable(given):
+        return f"Terms are made by a call, with brackets. {example}"
+    return example
 
 
 def is_complete(objective: Objective) -> bool:

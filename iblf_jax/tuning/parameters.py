@@ -57,6 +57,19 @@ class Box(NamedTuple):
     """What set the lower and the upper end of each coordinate, in words."""
 
 
+def _own_limit(path: str, side: str, value: Any) -> jax.Array | None:
+    """A limit of a parameter as an array; None where there is none of the user's own."""
+    if value is None:
+        return None
+    name = f"tunable({path!r}): {side}"
+    limit = checks.as_floats(name, value)
+    if limit.size == 0:
+        raise checks.fail(name, value, "at least one number")
+    if bool(jnp.any(jnp.isnan(limit))):
+        raise checks.fail(name, value, "numbers", "Replace the NaN entries.")
+    return limit
+
+
 def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False, scale: str | None = None) -> Tunable:
     """A leaf to tune, with limits of one's own.
 
@@ -79,7 +92,7 @@ def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False,
     if scale is not None:
         checks.one_of("tunable: scale", scale, ("log", "linear"))
     paths.parse(path)
-    low, high = (None if x is None else checks.as_floats(f"tunable({path!r}): {name}", x) for name, x in (("low", low), ("high", high)))
+    low, high = _own_limit(path, "low", low), _own_limit(path, "high", high)
     if low is not None and high is not None:
         try:
             below = bool(jnp.all(low < high))
@@ -88,6 +101,16 @@ def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False,
         if not below:
             raise checks.fail(f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them.")
     return Tunable(path, low, high, checks.flag("tunable: tied", tied), scale)
+
+
+def _as_tunable(place: int, given: Any) -> Tunable:
+    """An entry of a user's list of parameters."""
+    if isinstance(given, Tunable):
+        return given
+    if not isinstance(given, str):
+        remedy = 'Such as "controller.K2" or ij.tunable("controller.K2", 5.0, 50.0).'
+        raise checks.fail(f"parameters[{place}]", given, "the path of a leaf, or ij.tunable(path, low, high)", remedy)
+    return Tunable(given)
 
 
 def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple[tuple[Block, ...], Box]:
@@ -102,7 +125,7 @@ def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple
       ValueError: an unknown or overlapping path, limits that exclude the start or are not admissible.
     """
     given = checks.listed("parameters", parameters, '["controller.k1", "controller.K2"]')
-    wanted = [x if isinstance(x, Tunable) else Tunable(x) for x in given]
+    wanted = [_as_tunable(i, x) for i, x in enumerate(given)]
     check_paths(scenario, [x.path for x in wanted], "parameters")
     starts = [_start_of(scenario, item) for item in wanted]
     open_ended = {item.path: value for item, (value, _, _) in zip(wanted, starts, strict=True) if item.high is None}

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import mechanism_of
@@ -199,6 +199,7 @@ class TuneResult:
         """Before and after, requirement by requirement: on fresh draws where something is perturbed, else on the one nominal run."""
         return self.check()
 
+    @notices.each_warning_once
     def check(self, runs: int | None = None, seed: int | None = None) -> Report:
         """The report with another number of fresh runs, or another seed.
 
