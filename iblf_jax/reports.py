@@ -11,6 +11,7 @@ import datetime
 import html
 import io
 import platform
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -58,6 +59,14 @@ class Shown(NamedTuple):
     on_card: int = 1
 
 
+def _described(result: Any) -> list[str]:
+    """The lines of a result's `repr`, without the name of its class, which the title says already."""
+    first, *rest = repr(result).splitlines()
+    name = type(result).__name__
+    inside = re.fullmatch(rf"{name}(?:\((?P<numbers>.*)\)| of (?P<things>.*))", first)
+    return [inside["numbers"] or inside["things"] if inside else first, *rest]
+
+
 def _parts_of(scenario: Scenario) -> str:
     """What a scenario is made of, as a table."""
     rows = []
@@ -100,7 +109,7 @@ def _rollout(run: Rollout) -> Shown:
     from iblf_jax import plotting
 
     if not checks.is_concrete(run) or run.is_batch:
-        return Shown("Rollout", [repr(run)], {}, {}, None)
+        return Shown("Run", _described(run), {}, {}, None)
     rows = [(name, run.metrics.units.get(name, ""), *(f"{x:.4g}" for x in np.ravel(value))) for name, value in run.metrics.items()]
     rows = [(*row, *[""] * (2 + run.n - len(row)))[: 2 + run.n] for row in rows]
     table = tables.as_html(("metric", "unit", *joint_names(run.scenario.plant, run.n)), rows)
@@ -111,7 +120,7 @@ def _rollout(run: Rollout) -> Shown:
         "Torques": lambda: plotting.torques(run),
         "Uncertain terms": lambda: plotting.uncertain_terms(run),
     }
-    return Shown("Run", [repr(run)], {"Metrics": table}, figures, run.scenario)
+    return Shown("Run", _described(run), {"Metrics": table}, figures, run.scenario)
 
 
 def _perturbation(drawn: Any) -> str:
@@ -126,7 +135,7 @@ def _study(study: Study) -> Shown:
     from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
     if not checks.is_concrete(study):
-        return Shown("Study", [repr(study)], {}, {}, None)
+        return Shown("Monte-Carlo study", _described(study), {}, {}, None)
     quantiles = study.quantiles((0.05, 0.5, 0.95))
     rows = []
     for name in map(str, quantiles.data_vars):
@@ -140,7 +149,7 @@ def _study(study: Study) -> Shown:
     if first == "margin":  # makes some of the runs again
         figures["At a glance"] = lambda: plotting.study_overview(study)
     figures["Every metric"] = lambda: plotting.histograms(study)
-    return Shown("Study", repr(study).splitlines(), {"Metrics": of_metrics, "Perturbed": drawn}, figures, study.scenario)
+    return Shown("Monte-Carlo study", _described(study), {"Metrics": of_metrics, "Perturbed": drawn}, figures, study.scenario)
 
 
 def _certificate(found: Certificate) -> Shown:
@@ -151,13 +160,13 @@ def _certificate(found: Certificate) -> Shown:
 
 def _comparison(found: Comparison) -> Shown:
     first = next(iter(found.rollouts.values())).scenario
-    return Shown("Comparison", [repr(found).splitlines()[0]], found.tables_html(), {"Side by side": found.plot}, first, on_card=2)
+    return Shown("Comparison", _described(found)[:1], found.tables_html(), {"Side by side": found.plot}, first, on_card=2)
 
 
 def _tuning(found: TuneResult) -> Shown:
     rows = [(path, unit_at(found.start, path), _short(get(found.start, path)), _short(value)) for path, value in found.values.items()]
     gains = tables.as_html(("tuned", "unit", "before", "after"), rows)
-    words = [*repr(found).splitlines()[:1], *str(found.report).splitlines()]
+    words = [*str(found.report).splitlines(), f"How it was found: {_described(found)[0]}"]
     return Shown("Tuning", words, {"Gains": gains}, {"The search, and runs before and after": found.plot}, found.scenario)
 
 
@@ -183,7 +192,7 @@ def shown(result: Any) -> Shown:
     if maker is not None:
         return maker(result)
     figures = {"Figure": result.plot} if callable(getattr(result, "plot", None)) else {}
-    return Shown(type(result).__name__, repr(result).splitlines(), {}, figures, getattr(result, "scenario", None))
+    return Shown(type(result).__name__, _described(result), {}, figures, getattr(result, "scenario", None))
 
 
 def _image(figure: Figure, dpi: int, words: str) -> str:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import dataclasses
+import itertools
+import re
+import subprocess
+import sys
 import warnings
 from decimal import Decimal
 from fractions import Fraction
@@ -12,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SHORT
+from conftest import ROOT, SHORT
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax.core import checks, notices
 
 ARM = {"mass": [2.0, 0.85], "length": [0.35, 0.31], "centre": [0.2, 0.15], "inertia": [0.06, 0.02]}
 
@@ -502,3 +509,121 @@ def test_a_warning_points_at_the_callers_line(paper):
     advice = [w for w in caught if "Theorem 2" in str(w.message)]
     assert len(advice) == 1
     assert advice[0].filename == __file__
+
+
+ADVICE = "Sharpen the pencil first."
+NO_LEAF = {"controller.nope": DRAWN["plant.mass"]}
+"""It is refused after the scenario was checked, so that a call takes no time."""
+SAMPLED = dataclasses.replace(WEAK, sampling=ij.Sampling(period=2e-3))
+CALLS_THAT_ADVISE = {
+    "simulate": lambda: ij.simulate(WEAK, **SHORT),
+    "certify": lambda: ij.certify(WEAK, **SHORT),
+    "compare": lambda: ij.compare(WEAK, ["integral"], equal_effort=False, **SHORT),
+    "sweep": lambda: ij.sweep(WEAK, {"controller.k1": [1.0]}, perturbations=NO_LEAF, **SHORT),
+    "monte_carlo": lambda: ij.monte_carlo(WEAK, NO_LEAF, runs=2, **SHORT),
+    "sensitivity": lambda: ij.sensitivity(WEAK, NO_LEAF, points=2, **SHORT),
+    "falsify": lambda: ij.falsify(WEAK, NO_LEAF, **SHORT),
+    "tune": lambda: ij.tune(WEAK, ["controller.nope"], TRACKING, **SHORT),
+    "pareto": lambda: ij.pareto(WEAK, ["controller.nope"], (TRACKING, ij.objectives.effort()), **SHORT),
+    "excitation": lambda: ij.excitation(WEAK, ["controller.nope"], duration=1.0),
+    "identify": lambda: ij.identify(WEAK, {}, ["controller.nope"]),
+    "export": lambda: ij.export(SAMPLED, "/dev/null/below"),
+    "explore": lambda: ij.explore({"a": WEAK, "b": WEAK}),
+    "recommended_dt": lambda: ij.recommended_dt(WEAK, duration=0.1, perturbations=NO_LEAF),
+    "recommended_period": lambda: ij.recommended_period(SAMPLED, duration=0.1),
+    "explain": lambda: ij.explain(WEAK, varied=["controller.nope"]),
+}
+"""Function -> a call that checks its scenario, most of them more than once."""
+
+
+@pytest.mark.parametrize("name", CALLS_THAT_ADVISE)
+def test_every_function_gives_a_warning_once_at_the_callers_line(name, monkeypatch):
+    from iblf_jax.certificates import _certify
+    from iblf_jax.deployment import live
+
+    monkeypatch.setattr(controllers.Backstepping, "advice", lambda *_: [ADVICE], raising=False)
+    monkeypatch.setattr(_certify, "_one", lambda run: run)  # what comes after the run warns of nothing, and takes long
+    monkeypatch.setattr(live, "_loop", lambda scenario, *_: {"rows": ij.simulate(scenario, **SHORT).t.size})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with contextlib.suppress(ValueError):
+            CALLS_THAT_ADVISE[name]()
+    assert [str(w.message) for w in caught].count(ADVICE) == 1
+    assert all(w.filename == __file__ for w in caught)
+
+
+def test_a_second_call_warns_again_and_what_is_muted_does_not_count(monkeypatch):
+    monkeypatch.setattr(controllers.Backstepping, "advice", lambda *_: [ADVICE], raising=False)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            ij.simulate(WEAK, **SHORT)
+        with notices.muted():
+            ij.simulate(WEAK, **SHORT)
+    assert len(caught) == 2
+
+    @notices.each_warning_once
+    def inner():
+        with notices.muted():
+            notices.warn("same")
+        notices.warn("same")
+        notices.warn("same")
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        inner()
+    assert len(caught) == 1
+
+
+def test_a_warning_shows_no_line_of_the_package(tmp_path):
+    """In a process of its own, as a user sees it: the text is there once, with the user's line below."""
+    script = tmp_path / "mine.py"
+    script.write_text(
+        "import iblf_jax as ij\n"
+        "from iblf_jax.core import notices\n"
+        "@notices.each_warning_once\n"
+        "def work():\n"
+        "    for _ in range(3):\n"
+        "        notices.warn('Look at this.')\n"
+        "work()\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stderr.count("Look at this.") == 2, "the message, and the line of the user's that gave it"
+    assert "mine.py:6: UserWarning" in done.stderr and "warn_explicit" not in done.stderr
+
+
+# ----------------------------------------------------------------------------------------------------------------- grammar
+
+
+@pytest.mark.parametrize(
+    ("noun", "expected"),
+    [
+        *(("Actuator", "an Actuator"), ("Encoder", "an Encoder"), ("Ideal", "an Ideal"), ("Observer", "an Observer")),
+        *(("Controller", "a Controller"), ("Uniform", "a Uniform"), ("user", "a user"), ("Universal", "a Universal")),
+        *(("unit", "a unit"), ("unimportant part", "an unimportant part"), ("hinge", "a hinge"), ("one-sided", "a one-sided")),
+    ],
+)
+def test_the_article_of_a_noun(noun, expected):
+    assert checks.with_article(noun) == expected
+
+
+def test_no_message_has_a_fixed_article_before_a_name_that_varies():
+    """An f-string with "a " or "an " right before a value, unless the value is one of those words that are known."""
+    known = {"kind", "'number >= 0' if zero else 'positive number'", "noun"}
+    found = []
+    for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            pairs = itertools.pairwise(node.values) if isinstance(node, ast.JoinedStr) else ()
+            for before, after in pairs:
+                has_article = isinstance(before, ast.Constant) and re.search(r"(?i)\ban? $", str(before.value))
+                if has_article and isinstance(after, ast.FormattedValue) and ast.unparse(after.value) not in known:
+                    found.append(f"{path.name}:{after.lineno}: {ast.unparse(after.value)}")
+    assert not found
+
+
+def test_the_checker_of_an_actuator_speaks_of_an_actuator():
+    class Bare:
+        pass
+
+    with pytest.raises(Exception, match=r"the contract of an Actuator"):
+        ij.testing.check_actuator(Bare())

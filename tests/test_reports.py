@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax import reports
+from iblf_jax.studies.statistics import probability
+from iblf_jax.tuning.report import Change, Report, Verdict
 
 SHORT = {"duration": 0.2, "dt": 2e-3}
 
@@ -69,6 +72,52 @@ def test_numbers_are_those_of_the_result(results):
     worst = np.quantile(np.asarray(study.metrics.margin), 0.5, axis=0).min()
     row = re.search(r"<td[^>]*>margin</td>.*?</tr>", study._repr_html_())[0]
     assert f"{worst:.4g}" in row
+
+
+def test_a_title_does_not_repeat_the_name_of_the_class(results):
+    """Of every kind: the heading, then the numbers, without the class's name around them."""
+    for kind, result in results.items():
+        if kind == "TuneResult":  # its report takes long: the test below looks at it
+            continue
+        parts = reports.shown(result)
+        assert f"{kind}(" not in " ".join(parts.words), kind
+        assert not parts.words[0].startswith(parts.title), kind
+    study = reports.shown(results["Study"])
+    assert study.title == "Monte-Carlo study"
+    assert study.words[0].startswith("16 runs of 0.2 s, dt = 0.002 s, seed 0")
+    assert reports.shown(results["Comparison"]).words == ["2 laws, 0.2 s, dt = 0.002 s, rk4; worst joint"]
+
+
+def made_up_report(violated: int, verdicts: list[str], seed: int | None = 3) -> Report:
+    def of(count):
+        return probability(np.arange(100) < count, np.ones(100, bool), 0.95, "independent", 1)
+
+    made = [Verdict(f"{verdict} one", 0.1, of(0), of(20 if verdict == "fail" else 0), verdict) for verdict in verdicts]
+    changes = (Change("objective (mean)", 1.0, 0.5, -0.6, -0.4), Change("rmse (mean)", 1.0, 0.5, -0.6, -0.4))
+    return Report(100, seed, 0.95, changes, tuple(made), (of(3), of(violated)), (0.1, -0.2), ((1.0,), (2.0,)), (), "half", ("stopped",))
+
+
+@pytest.mark.parametrize("seed", [3, None])
+def test_the_tuning_report_begins_with_bounds_then_requirements_then_the_objective(seed):
+    text = str(made_up_report(7, ["pass", "undecided", "fail", "pass"], seed))
+    first, *rows = text.splitlines()
+    assert first.startswith("Report on")
+    assert rows[0].strip().startswith("bounds violated: ") and "the bounds are not kept" in rows[0]
+    assert rows[1].strip() == "smallest margin: 0.1 -> -0.2 rad"
+    kinds = [row.split()[1] for row in rows if row.strip().startswith("requirement")]
+    assert kinds == ["fail", "undecided", "pass", "pass"]
+    order = ["bounds violated", "requirement fail", "requirement pass", "objective (mean)", "rmse (mean)", "peak torque", "half", "stopped"]
+    places = [text.index(words) for words in order]
+    assert places == sorted(places)
+    assert "not kept" not in str(made_up_report(0, ["pass"], seed))
+
+
+def test_the_page_of_a_tuning_begins_with_its_report(results):
+    first, second, *rest = reports.shown(results["TuneResult"]).words
+    assert first.startswith("Report on one nominal run")
+    assert second.strip() == "bounds violated: 0 -> 0"
+    assert rest[-1].startswith("How it was found: ")
+    assert "TuneResult(" not in rest[-1]
 
 
 def test_names_from_files_are_escaped(tmp_path):

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from iblf_jax.actuators import Ideal
 from iblf_jax.controllers import Backstepping, FullState
+from iblf_jax.core import checks
 from iblf_jax.observers import Momentum, Printed
 from iblf_jax.simulation.scenario import Scenario
 
@@ -77,7 +78,8 @@ def why_no_claim(scenario: Scenario) -> str:
     if not isinstance(observer, Printed | Momentum):
         return f"Theorem 2 needs the observer (3.11), printed or in momentum form; {type(observer).__name__} has no claim of this kind"
     if not isinstance(scenario.actuator, Ideal):
-        return f"Theorem 2 is about a torque that acts as it is commanded; a {type(scenario.actuator).__name__} has no claim of this kind"
+        actuator = checks.with_article(type(scenario.actuator).__name__)
+        return f"Theorem 2 is about a torque that acts as it is commanded; {actuator} has no claim of this kind"
     return ""
 
 

@@ -30,8 +30,8 @@ def run(args: argparse.Namespace) -> int:
     folder = output_folder(args.out) if args.out else None
     given = {name: x for name, x in (("checkpoint", args.checkpoint), ("iterations", args.iterations)) if x is not None}
     result = tune_file(args.file, progress=False if args.quiet else None, **given)
-    print(result)
     print(result.report)
+    print(result)
     if folder is not None:
         from iblf_jax import plotting
         from iblf_jax.files.scenario import save_scenario
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         timing = {"duration": result.setup.duration, "dt": result.setup.dt, "method": result.setup.method}
         save_scenario(result.scenario, folder / "scenario.toml", run=timing)
         result.save(folder / "tuning.json")
-        (folder / "report.txt").write_text(f"{result}\n{result.report}\n", encoding="utf-8")
+        (folder / "report.txt").write_text(f"{result.report}\n{result}\n", encoding="utf-8")
         plotting.save({"tuning": result.plot()}, folder, formats=("png",))
         print(f"\nwritten to {folder}: scenario.toml, tuning.json, report.txt, tuning.png")
     failed = any(v.verdict == "fail" for v in result.report.verdicts) or result.report.changes[0].after > result.report.changes[0].before

@@ -144,7 +144,7 @@ class Scenario:
                 try:
                     jax.eval_shape(lambda r=robot, x=region: x.distance(regions.position_of(r, x.point, jnp.zeros(r.n))))
                 except Exception as error:
-                    what = f"a region for a point of a {type(robot).__name__} of {robot.n} joints"
+                    what = f"a region for a point of {checks.with_article(type(robot).__name__)} of {robot.n} joints"
                     raise checks.fail(name, region, what, f"{type(error).__name__}: {checks.line(str(error))}") from error
 
     @property

@@ -51,7 +51,7 @@ class Findings:
         """Raises ContractError if anything was found so far."""
         if self.problems:
             listed = "\n".join(f"  - {text}" for text in self.problems)
-            raise ContractError(f"{self.name} does not fit the contract of a {self.family}:\n{listed}")
+            raise ContractError(f"{self.name} does not fit the contract of {checks.with_article(self.family)}:\n{listed}")
 
 
 @contextmanager

@@ -101,6 +101,10 @@ class Verdict:
         return text
 
 
+WORST_FIRST = ("fail", "undecided", "pass")
+"""Verdicts in the order of a report."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Report:
     """Changes and verdicts, on fresh runs or on the nominal one; prints as text."""
@@ -137,25 +141,46 @@ class Report:
         return first.after < first.before and first.significant is not False
 
     def __str__(self) -> str:
+        """What matters first: bounds, then requirements, then the objective, then what else there is to know."""
+        rows = [*self._of_bounds(), *self._of_requirements(), *self._of_objective(), *self._of_gains()]
+        return "\n".join([self._heading(), *(f"  {row}" for row in rows)])
+
+    def _heading(self) -> str:
         if self.seed is None:
-            lines = ["Report on one nominal run: no statistics"]
-        else:
-            lines = [f"Report on {self.runs} fresh runs (seed {self.seed}), {self.confidence:.0%} confidence"]
-        lines += [f"  {change}" for change in self.changes]
-        lines += [f"  requirement {verdict}" for verdict in self.verdicts]
-        lines += [f"  smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad"]
-        torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
-        lines += [f"  peak torque{'' if self.seed is None else ' of all runs'}, joint by joint: {torques[0]} -> {torques[1]} N m"]
-        if self.at_limits is not None:
-            lines += [f"  {words}" for words in self.at_limits] or ["  gains at an end of their range: none"]
-        lines += [f"  {words}" for words in (self.halved, *self.notes) if words]
+            return "Report on one nominal run: no statistics"
+        return f"Report on {self.runs} fresh runs (seed {self.seed}), {self.confidence:.0%} confidence"
+
+    def _of_bounds(self) -> list[str]:
+        """How often bounds were violated, and the smallest margin."""
         before, after = (p.count if self.seed is None else p for p in self.violation)
-        lines += [f"  bounds violated: {before} -> {after}"]
-        if self.changes[0].significant is False:
-            lines += ["  The objective's change is not significant: these runs do not show that tuning helped."]
-        elif self.changes[0].after > self.changes[0].before:
-            lines += ["  The objective went up."]
-        return "\n".join(lines)
+        violated = f"bounds violated: {before} -> {after}"
+        if self.violation[1].count:
+            violated += "; WARNING: with the tuned gains the bounds are not kept"
+        return [violated, f"smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad"]
+
+    def _of_requirements(self) -> list[str]:
+        """The requirements, those that failed first."""
+        ordered = sorted(self.verdicts, key=lambda verdict: WORST_FIRST.index(verdict.verdict))
+        return [f"requirement {verdict}" for verdict in ordered]
+
+    def _of_objective(self) -> list[str]:
+        """The objective and its terms, and what their change is worth."""
+        whole = self.changes[0]
+        rows = [str(change) for change in self.changes]
+        if whole.significant is False:
+            rows.append("The objective's change is not significant: these runs do not show that tuning helped.")
+        elif whole.after > whole.before:
+            rows.append("The objective went up.")
+        return rows
+
+    def _of_gains(self) -> list[str]:
+        """Torque, gains at the end of their range, the run at half the step, and how the search ended."""
+        torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
+        of_all = "" if self.seed is None else " of all runs"
+        rows = [f"peak torque{of_all}, joint by joint: {torques[0]} -> {torques[1]} N m"]
+        if self.at_limits is not None:
+            rows += self.at_limits or ["gains at an end of their range: none"]
+        return [*rows, *(words for words in (self.halved, *self.notes) if words)]
 
     __repr__ = __str__
 
