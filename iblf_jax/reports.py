@@ -60,7 +60,7 @@ class Shown(NamedTuple):
 
 
 def _described(result: Any) -> list[str]:
-    """The lines of a result's `repr`, without the name of its class, which the title says already."""
+    """The lines of a result's `repr`, without the name of its class, which is in the title."""
     first, *rest = repr(result).splitlines()
     name = type(result).__name__
     inside = re.fullmatch(rf"{name}(?:\((?P<numbers>.*)\)| of (?P<things>.*))", first)

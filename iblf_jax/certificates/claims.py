@@ -79,7 +79,8 @@ def why_no_claim(scenario: Scenario) -> str:
         return f"Theorem 2 needs the observer (3.11), printed or in momentum form; {type(observer).__name__} has no claim of this kind"
     if not isinstance(scenario.actuator, Ideal):
         actuator = checks.with_article(type(scenario.actuator).__name__)
-        return f"Theorem 2 is about a torque that acts as it is commanded; {actuator} has no claim of this kind"
+        law = "Theorem 2 is about a torque that acts as it is commanded"
+        return f"{law}; {actuator} has no claim of this kind"
     return ""
 
 

@@ -202,9 +202,10 @@ def assumed(runs: Pair) -> str:
     )
     values = ", ".join(f"{name} {_all_digits(value)} {unit}" for name, value, unit in numbers)
     return (
-        "the paper prints no masses, lengths, centres of mass or inertias of its arm. These runs ASSUME the numbers that are customary "
-        f"in this literature: {values}, g = {float(arm.g):g} m/s^2. Torques, errors and times depend on them and need not be those of "
-        "the paper's figures."
+        "the paper prints no masses, lengths, centres of mass or inertias of its arm. "
+        "These runs ASSUME the numbers that are customary in this literature: "
+        f"{values}, g = {float(arm.g):g} m/s^2. "
+        "Torques, errors and times depend on them and need not be those of the paper's figures."
     )
 
 

@@ -25,8 +25,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "reproduce",
         help="reproduce the paper's simulation and its six figures",
         description="Run the paper's law (integral barrier) and its comparison (log barrier), write the six figures, an animation of the "
-        "arm, the data and the metrics, and say which of the paper's claims held. The paper prints no masses and lengths of its arm: those "
-        "of the runs are assumed, and the output says which.",
+        "arm, the data and the metrics, and say which of the paper's claims held. "
+        "The paper prints no masses and lengths of its arm: "
+        "those of the runs are assumed, and the output says which.",
         epilog="Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.",
     )
     parser.add_argument("--out", required=True, metavar="DIR", help="write everything into this folder")
@@ -56,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     print(metrics_table(runs) + "\n")
     claims, note = paper_claims(runs), remark(runs)
     _print_claims(claims, note)
-    _write_data(folder, args, runs, {"assumed": assumption, "claims": claims, "remark": note}, seconds)
+    findings = {"assumed": assumption, "claims": claims, "remark": note}
+    _write_data(folder, args, runs, findings, seconds)
     _draw(folder, runs)
     print(f"\nsimulations: {seconds['first']:.2f} s with compilation, {seconds['again']:.2f} s for the two runs alone; ", end="")
     print(f"all in {time.perf_counter() - begin:.1f} s")

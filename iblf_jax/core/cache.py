@@ -71,7 +71,8 @@ def keep_programs() -> None:
     except OSError:
         return
     if stranger is not None:
-        notices.warn(f"compiled programs are not kept: {top} holds {stranger!r}, a link or of another user; remove it.")
+        problem = f"{top} holds {stranger!r}, a link or of another user; remove it."
+        notices.warn(f"compiled programs are not kept: {problem}")
     elif os.access(folder, os.W_OK | os.X_OK):
         config.update("jax_compilation_cache_dir", str(folder))
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

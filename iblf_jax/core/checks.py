@@ -39,7 +39,10 @@ SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e9
 """[s].  No run, step, period or delay of a robot is shorter or longer."""
 
 LONGEST_NAME = 220
-"""Bytes of the name of a file: file systems allow 255, and the names of temporary files are longer than those that they replace."""
+"""Bytes of the name of a file.
+
+File systems allow 255, and the names of temporary files are longer than those that they replace.
+"""
 
 MOST_JOINTS = 10_000
 """More than any robot has."""
@@ -130,9 +133,9 @@ def did_you_mean(name: Any, known: Iterable[str]) -> str:
 
 
 def with_article(noun: str) -> str:
-    """A noun with its indefinite article, by the letter that it begins with: "an Actuator", "a Controller".
+    """A noun with its indefinite article: "an Actuator", "a Controller".
 
-    Names of classes with an initial that is spoken as a consonant, such as "Uniform", have "a".
+    The first letter decides, but for a vowel that is spoken as a consonant, as in "a Uniform".
     """
     spoken_as_consonant = re.match(r"(?i)(uni(?!n|m[^o])|us[ei]|eu|one([^a-z]|$))", noun)
     begins_with_vowel = noun[:1].lower() in tuple("aeiou")
@@ -140,11 +143,19 @@ def with_article(noun: str) -> str:
 
 
 class ArgumentError(TypeError, ValueError):
-    """Arguments that do not fit a constructor: a refusal like every other, and the TypeError that Python itself would raise."""
+    """Arguments that do not fit a constructor.
+
+    It is a refusal like every other, and the TypeError that Python itself would raise.
+    """
 
 
-def check_arguments(owner: str, fields: Iterable[dataclasses.Field], args: tuple, kwargs: Mapping[str, Any]) -> None:
-    """Raises ArgumentError where the arguments of a constructor are too many, unknown, given twice or missing.
+def check_arguments(
+    owner: str,
+    fields: Iterable[dataclasses.Field],
+    args: tuple,
+    kwargs: Mapping[str, Any],
+) -> None:
+    """Raises ArgumentError where arguments are too many, unknown, given twice or missing.
 
     Args:
       owner: name of the class.
@@ -163,10 +174,13 @@ def check_arguments(owner: str, fields: Iterable[dataclasses.Field], args: tuple
             got, expected = Words(f"an unknown argument {name!r}"), f"fields of {owner}"
             raise ArgumentError(fail(owner, got, expected, did_you_mean(name, names)))
         if name in positional[: len(args)]:
-            raise ArgumentError(fail(f"{owner}.{name}", Words("two values"), "one", f"Write {call}."))
+            got = Words("two values")
+            raise ArgumentError(fail(f"{owner}.{name}", got, "one", f"Write {call}."))
+    given = {*kwargs, *positional[: len(args)]}
     for field in fields:
-        has_default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-        if not has_default and field.name not in kwargs and field.name not in positional[: len(args)]:
+        has_value = field.default is not dataclasses.MISSING
+        has_maker = field.default_factory is not dataclasses.MISSING
+        if not has_value and not has_maker and field.name not in given:
             expected = _kind_of(field)
             remedy = f"Write {owner}({field.name}=...); help({owner}) says what it means."
             raise ArgumentError(fail(f"{owner}.{field.name}", Words("nothing"), expected, remedy))
@@ -176,8 +190,9 @@ def _kind_of(field: dataclasses.Field) -> str:
     """What a field holds, in words."""
     if field.metadata.get("leaf"):
         return f"a number or an array of numbers [{field.metadata['unit']}]"
-    kind = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
-    return with_article(kind)
+    if isinstance(field.type, str):
+        return with_article(field.type)
+    return with_article(getattr(field.type, "__name__", str(field.type)))
 
 
 def renamed(**names: str) -> Callable[[F], F]:
@@ -371,7 +386,14 @@ def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> flo
     return number
 
 
-def number_between(name: str, value: Any, least: float, most: float, unit: str, remedy: str = "") -> float:
+def number_between(
+    name: str,
+    value: Any,
+    least: float,
+    most: float,
+    unit: str,
+    remedy: str = "",
+) -> float:
     """A finite Python float from `least` to `most` from a user's argument, or a ValueError."""
     expected = f"a number from {least:g} to {most:g} [{unit}]"
     try:
@@ -384,11 +406,15 @@ def number_between(name: str, value: Any, least: float, most: float, unit: str, 
 
 
 def time_span(name: str, value: Any, zero: bool = False) -> float:
-    """A duration, period or delay [s] from a user's argument, between the shortest and the longest of a robot, or a ValueError."""
+    """A duration, period or delay [s] from a user's argument, or a ValueError.
+
+    It lies between the shortest and the longest that a robot has.
+    """
     seconds = positive_number(name, value, "s", zero)
     if seconds == 0.0 or SHORTEST_TIME <= seconds <= LONGEST_TIME:
         return seconds
-    raise fail(name, value, f"a time from {SHORTEST_TIME:g} to {LONGEST_TIME:g} s", "Times are in seconds.")
+    expected = f"a time from {SHORTEST_TIME:g} to {LONGEST_TIME:g} s"
+    raise fail(name, value, expected, "Times are in seconds.")
 
 
 def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
@@ -509,7 +535,10 @@ def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
 
 
 class UnwritableError(OSError, ValueError):
-    """A path at which nothing can be written: a refusal like every other, and an OSError, which programs that write files expect."""
+    """A path at which nothing can be written.
+
+    It is a refusal like every other, and the OSError that programs which write files expect.
+    """
 
 
 def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
@@ -526,7 +555,10 @@ def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
 
 
 def folder_to_write(name: str, value: Any) -> Path:
-    """The path of a folder that is there or can be made, in which files can be written; a ValueError where that is not so."""
+    """The path of a folder that is there or can be made, or a ValueError.
+
+    Files can be written there.
+    """
     path = file_path(name, value, "a folder")
     expected = "the path of a folder that can be written"
     nearest = next((place for place in (path, *path.parents) if place.exists()), Path())
@@ -545,8 +577,8 @@ def _can_be_written(name: str, path: Path, folder: Path, expected: str) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        if error.errno == errno.ENOSPC:  # a full disk is no fault of the path; what is written later says so
-            return
+        if error.errno == errno.ENOSPC:
+            return  # A full disk is no fault of the path; what is written later says so.
         remedy = f"{folder} cannot be written ({error.strerror}): choose another place."
         raise UnwritableError(fail(name, str(path), expected, remedy)) from None
 
@@ -567,8 +599,9 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
 
 
 def recorded_every(value: Any, steps: int) -> int:
-    """Every how many steps to record, as the compiled loops count it: in int32, and past the last step is as good as any further.
+    """Every how many steps to record, as the compiled loops count it, in int32.
 
-    A number beyond that of the steps which any run can have is a slip, and refused.
+    A number past the last step is as good as any further one.  One that is larger than the number
+    of steps which any run can have is refused.
     """
     return min(positive_integer("record_every", value, most=MOST_STEPS), steps + 1, MOST_STEPS)

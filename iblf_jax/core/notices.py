@@ -1,8 +1,9 @@
 """Warnings of the package: each once in a call of the user's, at the user's line.
 
-`warnings.warn(text, stacklevel=...)` counts frames, and the number of frames between a check and the user's line is another one on
-every route through the package.  A wrong count shows a line of the package with its source, and the same text again for every route:
-Python takes it for another place.  So `warn` looks for the frame of the user, and `each_warning_once` marks a call.
+`warnings.warn(text, stacklevel=...)` counts frames, and the number of frames between a check and
+the user's line differs between the routes through the package.  A wrong count shows a line of the
+package with its source, and the same text again for every route, because Python takes it for another
+place.  So `warn` looks for the frame of the user, and `each_warning_once` marks a call.
 
 Python 3.12 has `skip_file_prefixes` for the first; the package runs on 3.11 too.
 """
@@ -20,7 +21,10 @@ from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable)
 
-NOT_THE_USER = ("iblf_jax", "jax", "jaxlib", "contextlib", "functools", "importlib", "concurrent", "threading", "runpy")
+NOT_THE_USER = (
+    *("iblf_jax", "jax", "jaxlib", "contextlib", "functools"),
+    *("importlib", "concurrent", "threading", "runpy"),
+)
 """Packages and modules whose frames lie between a check of this package and the line of its user."""
 
 _GIVEN: ContextVar[set[str] | None] = ContextVar("iblf_jax_warnings", default=None)
@@ -30,7 +34,7 @@ _MUTED: ContextVar[type[Warning] | None] = ContextVar("iblf_jax_muted", default=
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warns at the user's line, unless the current call of the package has given the same warning already.
+    """Warns at the user's line, unless the current call has given the same warning already.
 
     Args:
       text: the message.
@@ -51,11 +55,12 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
     names = frame.f_globals
     module = names.get("__name__") or "<string>"
     registry = names.setdefault("__warningregistry__", {})
-    warnings.warn_explicit(text, category, frame.f_code.co_filename, frame.f_lineno, module, registry)
+    filename, line = frame.f_code.co_filename, frame.f_lineno
+    warnings.warn_explicit(text, category, filename, line, module, registry)
 
 
 def _users_frame() -> FrameType | None:
-    """The innermost frame that belongs neither to this package nor to what it calls; None if there is none."""
+    """The innermost frame that belongs neither to this package nor to what it calls, if any."""
     frame = sys._getframe(1)
     while frame is not None:
         module = str(frame.f_globals.get("__name__", ""))
@@ -66,7 +71,10 @@ def _users_frame() -> FrameType | None:
 
 
 def each_warning_once(function: F) -> F:
-    """Decorator of a public function: what is called inside of it, other public functions too, gives each warning once."""
+    """Decorator of a public function: inside of one call of it, each warning is given once.
+
+    What it calls counts too, other public functions included.
+    """
 
     @functools.wraps(function)
     def called(*args: Any, **options: Any) -> Any:

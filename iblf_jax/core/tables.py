@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 UNSAFE_IN_SCRIPT = "<>&\u2028\u2029"
-"""Characters that can end or change a script element or a line of it, wherever they stand in the script."""
+"""Characters that can end or change a script element, or a line of it, wherever they are."""
 
 
 def as_text(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> list[str]:
@@ -43,10 +43,10 @@ def as_html(heading: Sequence[str], rows: Iterable[Sequence[str]], bold: Collect
 
 
 def as_script_data(value: Any) -> str:
-    r"""A value as JSON that may stand inside a script element of an HTML page, whatever its strings hold.
+    r"""A value as JSON for a script element of an HTML page, whatever its strings hold.
 
-    A browser looks for "</script" and "<!--" before it reads the script, inside strings too, so no such character may be there
-    as it is.  JSON.parse and JavaScript read the escaped text as the same value.
+    A browser looks for "</script" and "<!--" before it reads the script, inside strings too.  So
+    their characters are escaped; JSON.parse and JavaScript read the escaped text as the same value.
 
     Args:
       value: numbers, strings, lists and dicts.

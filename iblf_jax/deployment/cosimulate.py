@@ -118,7 +118,7 @@ def _film_writer(path: str | Path) -> Callable:
 
 
 def check_single(scenario: Scenario) -> Scenario:
-    """The scenario; ValueError for what is no scenario, a batch of them, or one of traced values."""
+    """The scenario; ValueError for no scenario, a batch of them, or one of traced values."""
     if not isinstance(scenario, Scenario):
         raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
     if np.ndim(scenario.initial.q) != 1:

@@ -40,7 +40,7 @@ LONGEST_STEP = 1e-3
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-6, 1e3
 """[s].  With a period outside of them the run of the self-test would be too long."""
 LONGEST_IDENTIFIER = 63
-"""Characters of a name that every C compiler tells apart (C99, 5.2.4.1); the names of files begin with it too."""
+"""Characters of a name that every C compiler compares (C99, 5.2.4.1)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,18 +165,22 @@ def checked_name(name: Any, default: str) -> str:
     """What begins every name in the code, or a ValueError."""
     if name is None:
         return default
-    expected = f"a C identifier of at most {LONGEST_IDENTIFIER} characters that is no word of C, its headers or CMake"
-    is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is not None
-    if not is_identifier or len(name) > LONGEST_IDENTIFIER or name in RESERVED or name.lower() in FILES:
-        raise checks.fail("name", name, expected, 'Such as name="arm_law".')
-    return name
+    rest = LONGEST_IDENTIFIER - 1
+    pattern = rf"[A-Za-z][A-Za-z0-9_]{{0,{rest}}}"
+    is_identifier = isinstance(name, str) and re.fullmatch(pattern, name) is not None
+    if is_identifier and name not in RESERVED and name.lower() not in FILES:
+        return name
+    expected = f"a C identifier of at most {LONGEST_IDENTIFIER} characters"
+    expected += " that is no word of C, its headers or CMake"
+    raise checks.fail("name", name, expected, 'Such as name="arm_law".')
 
 
 def _check_period(period: float) -> None:
-    """Raises ValueError for a period with which the simulated run of the self-test would be too long."""
+    """Raises ValueError for a period with which the run of the self-test would be too long."""
     if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
         expected = f"a period of the law from {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
-        raise checks.fail("period", period, expected, "The self-test holds a simulated run with it.")
+        remedy = "The self-test holds a simulated run with it."
+        raise checks.fail("period", period, expected, remedy)
 
 
 def _available(dtype: str) -> str:

@@ -96,9 +96,11 @@ def _by_name(scenario: Any) -> dict[str, Scenario]:
         return {"": check_single(scenario)}
     expected = "a scenario, or a mapping from names to scenarios"
     if not scenario or not all(isinstance(name, str) for name in scenario):
-        raise checks.fail("scenario", scenario, expected, 'Such as {"integral": first, "log": second}.')
+        remedy = 'Such as {"integral": first, "log": second}.'
+        raise checks.fail("scenario", scenario, expected, remedy)
     if "__proto__" in scenario:
-        raise checks.fail("scenario", "__proto__", expected, "JavaScript reserves this name: take another one.")
+        remedy = "JavaScript reserves this name: take another one."
+        raise checks.fail("scenario", "__proto__", expected, remedy)
     return {name: check_single(each) for name, each in scenario.items()}
 
 

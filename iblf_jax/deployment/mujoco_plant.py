@@ -192,7 +192,8 @@ def _without_missing_meshes(spec: Any, path: Path) -> None:
     missing = {mesh.name for mesh in spec.meshes if not (place / (Path(mesh.file).name if spec.strippath else mesh.file)).exists()}
     shapes = [geom for geom in spec.geoms if geom.meshname in missing]
     if shapes:
-        notices.warn(f"{path}: {len(shapes)} shapes are left out, as their meshes are not there: these touch nothing.")
+        reason = "as their meshes are not there: these touch nothing."
+        notices.warn(f"{path}: {len(shapes)} shapes are left out, {reason}")
     for geom in shapes:
         spec.delete(geom)
     for mesh in list(spec.meshes):

@@ -86,7 +86,8 @@ def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: fl
     Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapter 3.
     """
     duration = checks.time_span("duration", duration)
-    radius = checks.number_between("radius", radius, *RADII, "1", "A loop is stable below a spectral radius of 1.")
+    remedy = "A loop is stable below a spectral radius of 1."
+    radius = checks.number_between("radius", radius, *RADII, "1", remedy)
     margin = checks.number_between("margin", margin, *MARGINS, "1")
     if isinstance(scenario, Scenario) and scenario.sampling is None:
         scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))

@@ -219,8 +219,9 @@ def _smaller_step(result: Rollout, steps: int) -> str:
     """A step with which this run would be accurate, in words."""
     if not checks.is_concrete(result.scenario):
         return "a smaller one"
+    duration = steps * float(result.dt)
     try:
-        return f"dt={find_dt(result.scenario, duration=steps * float(result.dt), method=result.method):g}"
+        return f"dt={find_dt(result.scenario, duration=duration, method=result.method):g}"
     except ValueError:  # the run is too long for a step to be tried
         return "a smaller one"
 

@@ -207,7 +207,8 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
         if before is not None and not poor_before and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL:
             return coarser
         before, poor_before, coarser, parts = q, poor, float(dt), _next_round(parts)
-    notices.warn(f"No step down to {coarser:g} s makes this run accurate: the loop may magnify every error.")
+    problem = "makes this run accurate: the loop may magnify every error."
+    notices.warn(f"No step down to {coarser:g} s {problem}")
     return coarser
 
 
@@ -215,7 +216,7 @@ def _can_be_tried(duration: float, dt: float) -> None:
     """Raises ValueError where a run is too long for a step to be tried on it."""
     if duration / dt > MOST_TRIED:
         expected = f"at most {MOST_TRIED * dt:g} s, which are {MOST_TRIED} steps of {dt:g} s"
-        remedy = "No run of that many steps is tried: give a time after which the motion repeats itself or has settled."
+        remedy = "Longer runs are not tried: give a time after which the motion repeats or has settled."
         raise checks.fail("duration", duration, expected, remedy)
 
 

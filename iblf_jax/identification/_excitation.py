@@ -29,7 +29,7 @@ SPACING = 0.8
 SAMPLES, DENSE = 25, 8
 """Times at which the motion counts, by waypoint; and how many times as many at which it must be inside."""
 BASIS_COPIES = 8
-"""Matrices of position, velocity and acceleration that are in memory at once, with room for what is computed of them."""
+"""Matrices of position, velocity and acceleration in memory at once, with room for their use."""
 REST = 1e-4
 MARGIN = 0.1
 """Part of the room between bounds that is kept free on each side, for the errors of the law."""
@@ -86,7 +86,8 @@ def excitation(
     """
     duration = checks.time_span("duration", duration)
     count = _waypoints(duration, waypoints)
-    iterations, seed = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS), checks.seed(seed)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    seed = checks.seed(seed)
     with jax.enable_x64(True):
         dtype = jnp.asarray(scenario.initial.q).dtype if isinstance(scenario, Scenario) else None
         start = canonical(astype(canonical(scenario), "float64"))
@@ -110,12 +111,13 @@ def excitation(
 
 
 def _waypoints(duration: float, waypoints: int | None) -> int:
-    """The number of waypoints; ValueError where the matrices of the spline would not fit into the memory."""
+    """The number of waypoints; ValueError where the spline's matrices do not fit into the memory."""
     most = int((checks.memory() / (BASIS_COPIES * 8.0 * DENSE * SAMPLES)) ** 0.5)
     if waypoints is not None:
         return checks.positive_integer("waypoints", waypoints, least=4, most=most)
     if duration / SPACING > most:
-        raise checks.fail("duration", duration, f"at most {most * SPACING:g} s", "Excite the robot by several shorter motions.")
+        remedy = "Excite the robot by several shorter motions."
+        raise checks.fail("duration", duration, f"at most {most * SPACING:g} s", remedy)
     return max(6, round(duration / SPACING))
 
 

@@ -150,12 +150,13 @@ def identify(
 
 
 def _check_delay(delay: Any) -> None:
-    """Raises ValueError for a delay of the torque that is no number or too long; None is found from the log."""
+    """Raises ValueError for a delay of the torque that is no number or too long."""
     if delay is None:
         return
     number = checks.as_floats("delay", delay)
     if number.ndim != 0 or not abs(float(number)) <= LARGEST_DELAY:
-        raise checks.fail("delay", delay, f"one number [s], of a size of at most {LARGEST_DELAY:g} s")
+        expected = f"one number [s], of a size of at most {LARGEST_DELAY:g} s"
+        raise checks.fail("delay", delay, expected, "Leave it out to have it found from the log.")
 
 
 def _is_continuous(log: Any) -> bool:

@@ -33,7 +33,10 @@ LARGEST_NUMBER = 1e10
 FARTHEST = 1e20
 """A range or a friction may be, where it stands for "none" or "locked"."""
 DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-"""A number of a description.  Python's `float` also accepts "2_5", digits of other scripts, "infinity" and "nan"."""
+"""A number of a description.
+
+Python's `float` also accepts "2_5", digits of other scripts, "infinity" and "nan".
+"""
 SPACES = " \t\r\n"
 """What separates the numbers of an attribute: the white space of XML."""
 
@@ -140,7 +143,7 @@ class _Reader:
     def _included(self, file: str) -> Path:
         """The path of an included file, which must be in the main file's folder or below it.
 
-        Symbolic links are followed before the comparison, so that a link cannot lead out of the folder.
+        Symbolic links are followed before the comparison: a link cannot lead out of the folder.
         """
         folder = os.path.realpath(self.folder)
         expected = f"a file in the folder of the description, {folder}, or in a folder below it"
@@ -187,8 +190,10 @@ def floats(where: str, text: str, count: int | None = None, *, most: float = LAR
         raise checks.fail(where, text, expected)
     if not all(DECIMAL.fullmatch(word) for word in words):
         remedy = "Write decimal numbers such as 0.25, -3 or 1.5e-3, separated by spaces."
-        raise checks.fail(where, text, f"{expected}, finite, in decimal notation and in SI units", remedy)
+        expected = f"{expected}, finite, in decimal notation and in SI units"
+        raise checks.fail(where, text, expected, remedy)
     values = [float(word) for word in words]
     if not all(math.isfinite(x) and abs(x) < most for x in values):
-        raise checks.fail(where, text, f"{expected}, finite and in SI units", f"Its size must be below {most:g}.")
+        expected = f"{expected}, finite and in SI units"
+        raise checks.fail(where, text, expected, f"Its size must be below {most:g}.")
     return values

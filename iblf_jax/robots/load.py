@@ -75,8 +75,9 @@ def load(
     repairs = Repairs(checks.flag("repair", repair))
     root = description.read(path)
     picked = _Request(base, tip, dict(locked), gravity, repairs)
+    reader = _from_urdf if root.tag == "robot" else _from_mjcf
     try:
-        arm = _from_urdf(root, path, picked) if root.tag == "robot" else _from_mjcf(root, path, picked)
+        arm = reader(root, path, picked)
     except ValueError as error:
         raise description.of_file(path, error) from error
     if arm.repaired:

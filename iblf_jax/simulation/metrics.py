@@ -440,7 +440,8 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     checks.one_of(f"{field}.needs", needs, OF_SCENARIO)
     if not has_signal(scenario, needs):
         words, remedy = OF_SCENARIO[needs]
-        raise checks.fail(field, f"{checks.with_article(type(fold).__name__)} that reads {needs}", f"a scenario with {words}", remedy)
+        got = f"{checks.with_article(type(fold).__name__)} that reads {needs}"
+        raise checks.fail(field, got, f"a scenario with {words}", remedy)
 
 
 def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenario: Scenario | None = None) -> tuple[Fold, ...]:

@@ -144,7 +144,8 @@ class Scenario:
                 try:
                     jax.eval_shape(lambda r=robot, x=region: x.distance(regions.position_of(r, x.point, jnp.zeros(r.n))))
                 except Exception as error:
-                    what = f"a region for a point of {checks.with_article(type(robot).__name__)} of {robot.n} joints"
+                    kind = checks.with_article(type(robot).__name__)
+                    what = f"a region for a point of {kind} of {robot.n} joints"
                     raise checks.fail(name, region, what, f"{type(error).__name__}: {checks.line(str(error))}") from error
 
     @property
@@ -187,8 +188,9 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     names = [field.name for field in dataclasses.fields(Scenario)]
     for name in parts:
         if name not in (*names, "robot"):
-            remedy = f"{checks.nearest(name, ('robot', *names))} Leaves change by ij.with_parameters.".strip()
-            raise checks.fail("part", name, f"the name of a part: robot, {', '.join(names)}", remedy)
+            known = ("robot", *names)
+            remedy = f"{checks.nearest(name, known)} Leaves change by ij.with_parameters.".strip()
+            raise checks.fail("part", name, f"the name of a part: {', '.join(known)}", remedy)
     if "robot" in parts:
         for name in ("plant", "model"):
             if name in parts:

@@ -71,7 +71,8 @@ MOST_MEMORY = 2.0**60
 def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
     """A user's arguments of `run_blocks` that say how and change no number, checked; they may be None (all devices, `memory` rules)."""
     chunk = None if chunk is None else checks.positive_integer("chunk", chunk, most=checks.MOST_STEPS)
-    memory = checks.number_between("memory", memory, 1.0, MOST_MEMORY, "bytes", "Such as memory=4e9.")
+    remedy = "Such as memory=4e9."
+    memory = checks.number_between("memory", memory, 1.0, MOST_MEMORY, "bytes", remedy)
     return {"chunk": chunk, "memory": memory, "devices": checks.devices("devices", devices)}
 
 

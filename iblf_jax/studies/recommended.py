@@ -56,7 +56,8 @@ def recommended_dt(
     tableau(method)
     seed, duration = checks.seed(seed), checks.time_span("duration", duration)
     perturbations = {} if perturbations is None else perturbations
-    checks.mapping("perturbations", perturbations, '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}')
+    example = '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}'
+    checks.mapping("perturbations", perturbations, example)
     if perturbations:  # refused here, before a step is looked for
         targets_of(canonical(scenario), perturbations)
     dt = step_size.find_dt(scenario, duration=duration, method=method)

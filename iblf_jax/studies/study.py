@@ -308,7 +308,8 @@ class Study:
         ((_, again),) = run_blocks(self.setup.study_run, self.setup.shared, self.setup.lanes, [block])
         again = jax.tree.map(lambda x: x[place], again)
         if not all(np.array_equal(x, self.metrics[name][i], equal_nan=True) for name, x in again.metrics.items()):
-            notices.warn(f"Run {i} gives other numbers here than in the study: made on another machine or version.")
+            reason = "made on another machine or version"
+            notices.warn(f"Run {i} gives other numbers here than in the study: {reason}.")
         study_run, shared = self.setup.study_run, self.setup.shared
         run = simulate_unchecked(
             paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),

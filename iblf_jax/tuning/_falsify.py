@@ -148,7 +148,8 @@ def falsify(
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     check_step(scenario, dt)
     starts = checks.positive_integer("starts", starts, most=MOST_RUNS)
-    iterations, seed = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS), checks.seed(seed)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    seed = checks.seed(seed)
     checks.fits("iterations", iterations, 8 * starts)
     cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)

@@ -149,9 +149,11 @@ def pareto(
     Source: head of this module.
     """
     began = time.perf_counter()
-    points, seed = checks.positive_integer("points", points, least=2, most=MOST_RUNS), checks.seed(seed)
+    points = checks.positive_integer("points", points, least=2, most=MOST_RUNS)
+    seed = checks.seed(seed)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
-    tolerance, pair = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1"), _pair(objectives)
+    tolerance = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1")
+    pair = _pair(objectives)
     timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
     problem = build(scenario, parameters, pair, perturbations, runs, seed, risk, timing, levels=True)
     if not differentiates_forward(len(problem.box.z)):

@@ -152,8 +152,9 @@ class Objective:
 
 
 WHAT_IT_IS = (
-    "an objective with at least one term: a sum of terms of ij.objectives (tracking, effort, torque_rate, settle, peak_torque, margin, "
-    "metric and others), each with a weight, to which requirements can be added"
+    "an objective with at least one term: a sum of terms of ij.objectives "
+    "(tracking, effort, torque_rate, settle, peak_torque, margin, metric and others), "
+    "each with a weight, to which requirements can be added"
 )
 
 
@@ -170,7 +171,8 @@ def _remedy(given: Any) -> str:
     """How an objective is written, for what a user gave in its place."""
     example = "Such as ij.objectives.tracking() + 0.1 * ij.objectives.effort()."
     if isinstance(given, str):
-        return f"A name is none; a metric is made a term by ij.objectives.metric(fold, {given!r}). {example}"
+        call = f"ij.objectives.metric(fold, {given!r})"
+        return f"A name is none; a metric is made a term by {call}. {example}"
     if isinstance(given, type) or callable(given):
         return f"Terms are made by a call, with brackets. {example}"
     return example

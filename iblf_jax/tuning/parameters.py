@@ -109,7 +109,8 @@ def _as_tunable(place: int, given: Any) -> Tunable:
         return given
     if not isinstance(given, str):
         remedy = 'Such as "controller.K2" or ij.tunable("controller.K2", 5.0, 50.0).'
-        raise checks.fail(f"parameters[{place}]", given, "the path of a leaf, or ij.tunable(path, low, high)", remedy)
+        expected = "the path of a leaf, or ij.tunable(path, low, high)"
+        raise checks.fail(f"parameters[{place}]", given, expected, remedy)
     return Tunable(given)
 
 

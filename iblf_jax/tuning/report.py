@@ -141,14 +141,21 @@ class Report:
         return first.after < first.before and first.significant is not False
 
     def __str__(self) -> str:
-        """What matters first: bounds, then requirements, then the objective, then what else there is to know."""
-        rows = [*self._of_bounds(), *self._of_requirements(), *self._of_objective(), *self._of_gains()]
-        return "\n".join([self._heading(), *(f"  {row}" for row in rows)])
+        """What matters first: bounds, then requirements, then the objective, then the rest."""
+        sections = (
+            self._of_bounds(),
+            self._of_requirements(),
+            self._of_objective(),
+            self._of_gains(),
+        )
+        rows = [f"  {row}" for section in sections for row in section]
+        return "\n".join([self._heading(), *rows])
 
     def _heading(self) -> str:
         if self.seed is None:
             return "Report on one nominal run: no statistics"
-        return f"Report on {self.runs} fresh runs (seed {self.seed}), {self.confidence:.0%} confidence"
+        runs = f"{self.runs} fresh runs (seed {self.seed})"
+        return f"Report on {runs}, {self.confidence:.0%} confidence"
 
     def _of_bounds(self) -> list[str]:
         """How often bounds were violated, and the smallest margin."""
@@ -168,13 +175,14 @@ class Report:
         whole = self.changes[0]
         rows = [str(change) for change in self.changes]
         if whole.significant is False:
-            rows.append("The objective's change is not significant: these runs do not show that tuning helped.")
+            doubt = "these runs do not show that tuning helped."
+            rows.append(f"The objective's change is not significant: {doubt}")
         elif whole.after > whole.before:
             rows.append("The objective went up.")
         return rows
 
     def _of_gains(self) -> list[str]:
-        """Torque, gains at the end of their range, the run at half the step, and how the search ended."""
+        """Torque, gains at the end of their range, the run at half the step, the search's end."""
         torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
         of_all = "" if self.seed is None else " of all runs"
         rows = [f"peak torque{of_all}, joint by joint: {torques[0]} -> {torques[1]} N m"]

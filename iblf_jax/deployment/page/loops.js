@@ -1,7 +1,9 @@
-// The closed loops of a page: their modules, parameters, sliders and runs.  It draws nothing and needs no document.
-// The parameters in a module's memory are the only copy of a loop's numbers: a run and the sliders both read them there.
+// The closed loops of a page: their modules, parameters, sliders and runs.  It draws nothing and
+// needs no document.  The parameters in a module's memory are the only copy of a loop's numbers:
+// a run and the sliders both read them there.
 class Loops {
-  // described: name -> {wasm, table}; requested: a function from a parameter's path to the text of the page's address, or null.
+  // described: name -> {wasm, table}.  requested: a function from a parameter's path to its text in
+  // the page's address, or null.
   constructor(described, requested) {
     this.described = described;
     this.requested = requested;
@@ -28,22 +30,24 @@ class Loops {
     loop._initialize();
     loop.defaults();
     new Reals(loop.memory.buffer, loop.settings(), table.settings.length).set(table.settings);
-    const found = {loop, table, Reals, parameters: new Reals(loop.memory.buffer, loop.parameters(), table.count)};
+    const parameters = new Reals(loop.memory.buffer, loop.parameters(), table.count);
     for (const each of this.controlled(table)) {
       const text = this.requested(each.words), value = Number(text);
       const isNumber = text !== null && text.trim() !== "" && Number.isFinite(value);
-      if (isNumber && (!each.positive || value > 0)) for (const k of each.places) found.parameters[k] = value;
+      const isAllowed = isNumber && (!each.positive || value > 0);
+      if (isAllowed) for (const k of each.places) parameters[k] = value;
     }
-    return found;
+    return {loop, table, Reals, parameters};
   }
 
-  // What has a slider: its name, the places of its numbers among the parameters, and the ends of its range.
+  // What has a slider: its name, the places of its numbers among the parameters, its range.
   controlled(table) {
     const found = [];
     for (const p of table.parameters.filter(p => p.slider)) {
       const size = p.shape.reduce((product, length) => product * length, 1);
       const all = Array.from({length: size}, (_, k) => p.offset + k);
-      const groups = p.each ? all.map((place, i) => [p.path + "[" + i + "]", [place]]) : [[p.path, all]];
+      const separate = all.map((place, i) => [p.path + "[" + i + "]", [place]]);
+      const groups = p.each ? separate : [[p.path, all]];
       groups.forEach(([words, places], i) => {
         const [low, high] = p.slider[Math.min(i, p.slider.length - 1)];
         found.push({words, places, low, high, unit: p.unit, positive: p.positive});
@@ -52,12 +56,14 @@ class Loops {
     return found;
   }
 
-  // The sliders of a loop with the numbers that its next run will use; a range that a number is outside of is widened to it.
+  // The sliders of a loop with the numbers that its next run will use.  Where a number is outside
+  // of its range, the range is widened.
   sliders(name) {
     const {table, parameters} = this.opened(name);
     return this.controlled(table).map(each => {
       const values = each.places.map(k => parameters[k]);
-      return {...each, values, low: Math.min(each.low, ...values), high: Math.max(each.high, ...values)};
+      const low = Math.min(each.low, ...values), high = Math.max(each.high, ...values);
+      return {...each, values, low, high};
     });
   }
 
@@ -66,14 +72,16 @@ class Loops {
     for (const k of places) parameters[k] = value;
   }
 
-  // Runs a loop with its parameters as they are: columns by name, one number for each recorded instant.
+  // Runs a loop with its parameters as they are: columns by name, a number for each record.
   run(name, steps, every) {
     const {loop, table, Reals} = this.opened(name);
     loop.start();
-    const rows = loop.run(steps + 1, every), all = new Reals(loop.memory.buffer, loop.records(), rows * table.record);
+    const rows = loop.run(steps + 1, every);
+    const all = new Reals(loop.memory.buffer, loop.records(), rows * table.record);
     const found = {rows, t: Array.from({length: rows}, (_, k) => k * every * table.settings[0])};
+    const columnAt = place => Array.from({length: rows}, (_, k) => all[k * table.record + place]);
     for (const {name: column, offset, size} of table.records)
-      found[column] = Array.from({length: size}, (_, i) => Array.from({length: rows}, (_, k) => all[k * table.record + offset + i]));
+      found[column] = Array.from({length: size}, (_, i) => columnAt(offset + i));
     return found;
   }
 }
