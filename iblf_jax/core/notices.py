@@ -48,26 +48,32 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
         if text in given:
             return
         given.add(text)
-    frame = _users_frame()
-    if frame is None:
-        warnings.warn_explicit(text, category, filename="iblf_jax", lineno=1)
-        return
-    names = frame.f_globals
-    module = names.get("__name__") or "<string>"
-    registry = names.setdefault("__warningregistry__", {})
-    filename, line = frame.f_code.co_filename, frame.f_lineno
-    warnings.warn_explicit(text, category, filename, line, module, registry)
+    warnings.warn(text, category, stacklevel=_levels_to_the_user())
 
 
-def _users_frame() -> FrameType | None:
-    """The innermost frame that belongs neither to this package nor to what it calls, if any."""
-    frame = sys._getframe(1)
-    while frame is not None:
-        module = str(frame.f_globals.get("__name__", ""))
-        if module.partition(".")[0] not in NOT_THE_USER:
-            return frame
-        frame = cast(FrameType, frame.f_back)
-    return None
+def _levels_to_the_user() -> int:
+    """How many frames above `warn` the user's line is, as the argument `stacklevel` counts them.
+
+    Where there is no line of a user's, as in the command line, it is more than there are frames.
+    """
+    level = 1
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and _is_of_the_package(frame):
+        if not _is_skipped(frame):
+            level += 1
+        frame = frame.f_back
+    return level
+
+
+def _is_of_the_package(frame: FrameType) -> bool:
+    """Whether a frame is of this package, or of what stands between it and its user."""
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0] in NOT_THE_USER
+
+
+def _is_skipped(frame: FrameType) -> bool:
+    """Whether `warnings.warn` does not count a frame: one of the machinery of imports."""
+    filename = frame.f_code.co_filename
+    return "importlib" in filename and "_bootstrap" in filename
 
 
 def each_warning_once(function: F) -> F:

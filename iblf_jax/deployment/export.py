@@ -186,7 +186,7 @@ def _check_period(period: float) -> None:
 def _available(dtype: str) -> str:
     """JAX's name of a type of C, if JAX computes in it."""
     wanted = TYPES[dtype]
-    if jnp.zeros((), wanted).dtype != wanted:
+    if jax.dtypes.canonicalize_dtype(wanted) != wanted:
         raise checks.fail(
             "dtype", dtype, '"float", as JAX computes in float32 here', 'Call jax.config.update("jax_enable_x64", True) first.'
         )

@@ -42,7 +42,6 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
-from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.newton import Newton
 from iblf_jax.tuning.parameters import Box
@@ -147,7 +146,8 @@ def falsify(
     checks.one_of("backend", backend, BACKENDS)
     steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
     check_step(scenario, dt)
-    starts = checks.positive_integer("starts", starts, most=MOST_RUNS)
+    starts = checks.positive_integer("starts", starts)
+    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
     seed = checks.seed(seed)
     checks.fits("iterations", iterations, 8 * starts)
