@@ -37,6 +37,8 @@ DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 Python's `float` also accepts "2_5", digits of other scripts, "infinity" and "nan".
 """
+ARGUMENTS = ("base: ", "tip: ", "locked: ", "locked[", "gravity: ")
+"""How messages about an argument of `load`, and not about what is in the file, begin."""
 SPACES = " \t\r\n"
 """What separates the numbers of an attribute: the white space of XML."""
 
@@ -68,10 +70,15 @@ def read(path: str | os.PathLike, field: str = "path") -> ET.Element:
 
 
 def of_file(path: str | os.PathLike, error: ValueError) -> ValueError:
-    """The error with the file's name in front, unless its message names the file already."""
+    """The error with the file's name in front, unless its message names the file already.
+
+    Where an argument of the caller is at fault, its name stays in front and the file's follows.
+    """
     text = str(error)
     if text.startswith(f"{path}: ") or repr(str(path)) in text:
         return error
+    if text.startswith(ARGUMENTS):
+        return ValueError(f"{text} The file is {checks.line(str(path), 'field')}.")
     return checks.inside(path, error)
 
 
