@@ -193,7 +193,7 @@ def theorem_1(runs: Pair) -> PaperClaim:
 
 def assumed(runs: Pair) -> str:
     """What these runs assume because the paper does not print it: the numbers of the arm."""
-    arm = next(iter(runs.values())).scenario.plant
+    arm: Any = next(iter(runs.values())).scenario.plant  # the preset's TwoLink
     numbers = (
         ("masses", arm.mass, "kg"),
         ("lengths", arm.length, "m"),
