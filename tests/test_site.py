@@ -48,7 +48,7 @@ def test_a_script_of_the_gallery_makes_its_page(script):
 
 
 def test_the_pages_that_readers_start_with_are_among_them():
-    assert {"README", "guide", "start", "own_law", "own_robot", "read_a_certificate"} <= {page.stem for page in PAGES}
+    assert {"README", "guide", "start", "own_law", "own_robot", "own_parts", "read_a_certificate"} <= {page.stem for page in PAGES}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
