@@ -13,6 +13,8 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.controllers import Command
 from iblf_jax.testing import ContractError
+from iblf_jax.testing._contract import Findings, in_dtype
+from iblf_jax.testing.own_claims import check_claims
 
 TWO_LINK = ij.robots.TwoLink
 
@@ -166,6 +168,44 @@ def test_broken_law():
     rejects(ij.testing.check_law, changed(PlainLaw, command=unguarded)(3.0), "not finite at xi", "guarded_error")
 
 
+class Stating(PlainLaw):
+    """A law that states a claim: a damped spring's energy, and what its damper takes."""
+
+    def lyapunov(self, t, q, dq, f_tilde, setting, state):
+        tube = setting.tube(t)
+        return 0.5 * dq * (setting.model.mass_matrix(q) @ dq) + 0.5 * self.gain * (q - tube.q_d) ** 2
+
+    def decay(self, t, q, dq, f_tilde, setting, state):
+        return 0.2 * self.gain * dq**2
+
+
+def claims_of(law):
+    """What `check_law` finds wrong with a law's own claim."""
+    findings = Findings(law, "Controller")
+    with jax.numpy_dtype_promotion("standard"), jax.enable_x64(True):
+        base = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law)
+        check_claims(findings, in_dtype(base, "float64"))
+    return findings.problems
+
+
+def test_broken_claims_of_a_law():
+    half = changed(Stating, decay=property())
+    with pytest.raises(ContractError, match="it has lyapunov and no decay"):
+        claims_of(half(3.0))
+    wide = changed(Stating, decay=lambda self, t, q, dq, *args: jnp.zeros(3))
+    with pytest.raises(ContractError, match=r"decay\(t, q, dq, f_tilde, setting, state\) gives .*must be an array of shape \(\) or \(2,\)"):
+        claims_of(wide(3.0))
+    terms = changed(Stating, disturbance_terms=lambda self, t, q, dq, f_tilde, df, setting, state: df.astype("float64"))
+    with pytest.raises(ContractError, match=r"disturbance_terms.* gives float64 for float32"):
+        claims_of(terms(3.0))
+
+
+def test_claims_of_a_law_are_nonnegative():
+    assert claims_of(changed(Stating)(3.0)) == []
+    growing = changed(Stating, decay=lambda self, t, q, dq, *args: 3.0 * (dq - 0.2) * dq)
+    assert any("decay is -" in problem for problem in claims_of(growing(3.0)))
+
+
 def test_broken_fold():
     class Root:
         units: ClassVar[dict[str, str]] = {"rms": "rad"}
@@ -270,7 +310,7 @@ MEMBERS_OF_JOINTS = {
     "reference": (ij.testing.check_reference, lambda k: ij.references.Sinusoid(offset=0.5 * k, amplitude=0.1)),
     "side": (ij.testing.check_side, ij.bounds.Constant),
     "fold": (ij.testing.check_fold, lambda k: ij.metrics.Settling(tolerance=0.01 * k)),
-    "objective": (ij.testing.check_objective, lambda k: ij.objectives.margin_above(0.01 * k)),
+    "objective": (ij.testing.check_objective, lambda k: WeightedSquare(weight=k)),
     "law": (ij.testing.check_law, lambda k: ij.controllers.Saturated(ij.controllers.PDGravity(Kp=60 * k, Kd=20 * k), limit=90.0)),
     "law-by-hand": (ij.testing.check_law, lambda k: PlainLaw(jnp.asarray(20.0 * k))),
     "barrier": (ij.testing.check_barrier, lambda k: WeightedMapping(weight=k)),
@@ -294,6 +334,22 @@ class WeightedMapping:
 
     def virtual_velocity(self, tube, q, k1, o):
         return ij.barriers.Mapping(guard=self.guard).virtual_velocity(tube, q, k1, o)
+
+
+@ij.component
+class WeightedSquare:
+    """What a user tunes for, with a leaf of one number a joint: sum_k dt weight . e1^2."""
+
+    weight: ij.Leaf = ij.leaf("1", sign="positive")
+
+    def init(self, sample):
+        return jnp.zeros_like(sample.t)
+
+    def update(self, acc, sample):
+        return acc + sample.dt * jnp.sum(self.weight * sample.e1**2)
+
+    def finish(self, acc):
+        return acc, acc, acc[None]
 
 
 QUICK_AT = {"sensor": 3, "disturbance": 6, "side": 1}

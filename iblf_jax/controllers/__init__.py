@@ -2,6 +2,7 @@
 
 from iblf_jax.controllers._base import Command as Command
 from iblf_jax.controllers._base import Controller as Controller
+from iblf_jax.controllers._base import LyapunovLaw as LyapunovLaw
 from iblf_jax.controllers._base import Setting as Setting
 from iblf_jax.controllers._base import State as State
 from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
@@ -44,6 +45,7 @@ __all__ = [
     "Controller",
     "DynamicSurface",
     "FullState",
+    "LyapunovLaw",
     "PDGravity",
     "ReferenceGovernor",
     "SafetyFilter",

@@ -17,7 +17,7 @@ from iblf_jax.disturbances import Sinusoids
 from iblf_jax.observers import Printed
 from iblf_jax.presets import customary_two_link, zhang_yan_2024
 from iblf_jax.references import Sinusoid as SinusoidalReference
-from iblf_jax.robots import PlanarChain, Robot
+from iblf_jax.robots import PlanarChain
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 from iblf_jax.testing._contract import Findings
 
@@ -85,7 +85,7 @@ def fitted_to(member: T, n: int, family: str) -> T:
     return fit_joints(member, n, family)
 
 
-def arm_of(n: int) -> Robot:
+def arm_of(n: int) -> Any:
     """An arm of n joints: the customary two-link arm, or a planar chain of links like its own, lighter from base to tip."""
     if n == USUAL:
         return customary_two_link()

@@ -18,6 +18,7 @@ from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
 from iblf_jax.testing.joints import check_scenario, scenario_for
+from iblf_jax.testing.own_claims import check_claims
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
 """Where the law is asked for a torque, in xi: a run may get anywhere, and must stay finite there."""
@@ -65,6 +66,7 @@ def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = Non
             return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1, **named}
 
         probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.setting))
+        check_claims(findings, base)
         _at_the_wall(findings, base)
         findings.stop_if_any()
         _closed_loop(findings, in_dtype(base, "float32"))
