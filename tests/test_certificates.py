@@ -507,7 +507,18 @@ def test_a_law_that_states_its_own_claim_is_held_against_it(own):
     assert text.endswith("18 lines of the paper's theorem do not apply, because " + certificate["inequality, case 2"].note + ".")
     assert "18 lines" in certificate.table_html()
     assert len(certificate.lines) == len(certificate.applicable) + 18
+    assert certificate.is_of_own_claim
+    assert np.all(np.abs(certificate.traces.left) <= line.tolerance)
     json.dumps(certificate.to_dict(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_an_own_claim_is_drawn_as_one(own, paper_certificate):
+    figure = certify(own, **OWN).plot()
+    words = " ".join(text.get_text() for text in [*figure.texts, *(text for axes in figure.axes for text in axes.texts)])
+    assert "The law's own claim along the run: holds" in words
+    assert "own decay" in words
+    assert not paper_certificate.is_of_own_claim
 
 
 def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):

@@ -203,11 +203,13 @@ def _numbers(whole: Whole) -> dict[str, Any]:
 
 
 def _traces(trajectory: Trajectory) -> Traces:
-    """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim."""
+    """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim.
+
+    Of a law that has only a claim of its own, V and the left side are those of that claim.
+    """
     sample, proof, case = trajectory.sample, trajectory.proof, applicable_case(trajectory.whole)
     nothing = np.full(trajectory.t.shape, np.nan)
-    unclaimed = nothing if proof.own == () else own_law.left_side(proof.own)
-    envelope, left = (nothing, unclaimed) if case is None else (trajectory.envelope[case].bound, left_side(trajectory, case))
+    envelope, left = (nothing, nothing) if case is None else (trajectory.envelope[case].bound, left_side(trajectory, case))
     bounds = (
         {"xi, by V1": np.full(sample.q.shape, np.nan), "e2": nothing, "f_tilde": nothing}
         if case is None
@@ -227,6 +229,9 @@ def _traces(trajectory: Trajectory) -> Traces:
         f_tilde_bound=bounds["f_tilde"],
         held=proof.held,
     )
+    if case is None and own_law.applies(trajectory):
+        left = np.where(proof.held, np.nan, own_law.left_side(proof.own))
+        traces = traces._replace(V=proof.own.V, left=left, dropped=np.zeros_like(left))
     return Traces(*(x[trajectory.recorded] for x in traces))
 
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.actuators import Ideal
-from iblf_jax.certificates.result import NOT_APPLICABLE, Line
+from iblf_jax.certificates.result import NOT_APPLICABLE, OWN_INEQUALITY, Line
 from iblf_jax.controllers import LyapunovLaw, Saturated
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_spd
@@ -34,7 +34,9 @@ from iblf_jax.simulation.scenario import Scenario
 
 REQUIRED = ("lyapunov", "decay")
 """What a law that states a claim of its own has."""
-NAMES = ("own V", "own decay", "inequality, own V")
+EQUATION = "own"
+"""What the lines of the claim have in the place of a number in the paper."""
+NAMES = ("own V", "own decay", OWN_INEQUALITY)
 """The lines of the claim."""
 ROUNDING = 8.0
 """Relative errors of the derivatives of V, in those of their terms."""
@@ -149,6 +151,11 @@ def _limited(scenario: Scenario, law: Any, t: jax.Array, state: LoopState, now) 
     return jnp.any(jnp.abs(now["tau"] - own) > UNCHANGED * jnp.finfo(own.dtype).eps * jnp.abs(own))
 
 
+def applies(trajectory: Any) -> bool:
+    """Whether the law states a claim of its own that says something about the run."""
+    return trajectory.proof.own != () and not why_not(trajectory.whole)
+
+
 def left_side(own: Any) -> np.ndarray:
     """V' + W - T, which must not be positive, (T,)."""
     return own.dV + own.decay - own.terms
@@ -176,7 +183,7 @@ def lines(trajectory: Any, judged: Any) -> list[Line]:
     for name, statement, margins, sizes in described:
         description: dict[str, Any] = {
             "name": name,
-            "equation": type(law).__name__,
+            "equation": EQUATION,
             "statement": statement,
             "unit": "1" if name == NAMES[0] else "1/s",
         }

@@ -16,6 +16,8 @@ import numpy as np
 from iblf_jax.core import checks, tables
 
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
+OWN_INEQUALITY = "inequality, own V"
+"""Name of the inequality that a law states of itself."""
 FEW = 3
 """Lines that do not apply are named up to this number."""
 SEEN_ONLY = "no claim, only seen ("
@@ -124,6 +126,12 @@ class Certificate:
     def holds(self) -> bool:
         """Whether every claim that applies was checked and holds."""
         return self.verdict == HOLDS
+
+    @property
+    def is_of_own_claim(self) -> bool:
+        """Whether what was checked is a claim that the law states of itself, and not the paper's theorem."""
+        inequalities = [line.name for line in self.applicable if line.name.startswith("inequality")]
+        return inequalities == [OWN_INEQUALITY]
 
     def __getitem__(self, name: str) -> Line:
         for line in self.lines:
