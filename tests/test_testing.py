@@ -297,7 +297,7 @@ def test_actuators_with_other_inputs_and_without_a_steady_state(methods, n):
     ij.testing.check_actuator(changed(VoltageMotor, **methods)(R=per_joint(n)))
 
 
-def test_a_broken_sensor_is_told_its_record():
+def test_a_sensor_without_its_record_is_refused():
     broken = changed(ij.sensors.Ideal, measure=lambda self, q, dq, normal, period, state: ((q, dq), state))
     rejects(ij.testing.check_sensor, broken(), "iblf_jax.sensors.Measurement")
 

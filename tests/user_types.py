@@ -34,7 +34,7 @@ class Drive:
 
 
 @ij.component
-class Around:
+class Wrapping:
     """A law of a user's that wraps another, and states a claim of its own."""
 
     law: ij.controllers.Controller
@@ -53,7 +53,7 @@ class Around:
 def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.bounds.Tube) -> None:
     """Parts of a user's own fit where the package's do."""
     actuator: ij.actuators.Actuator = Drive(gain=3.0)
-    law: ij.controllers.Controller = Around(law=scenario.controller)
+    law: ij.controllers.Controller = Wrapping(law=scenario.controller)
     ij.with_parts(scenario, actuator=actuator, controller=law)
     assert_type(sample.e1, jax.Array)
     assert_type(tube.q_d, jax.Array)

@@ -4,11 +4,12 @@ A law may state a Lyapunov function V of its own and how fast V decreases, W.  T
 
     V' <= -W + T
 
-is checked at every step, as the inequality of Theorem 2 is: V' is the derivative of V along the vector field of the whole loop, by
-forward-mode differentiation.  No differences along a run enter.
+is checked at every step, as the inequality of Theorem 2 is: V' is the derivative of V along the
+vector field of the whole loop, by forward-mode differentiation.  No differences along a run enter.
 
-T is what the law's `disturbance_terms` state.  For a law without that method it is the term that an error of the estimate adds to V',
-whatever the law is: by (2.1) the acceleration is the model's under an exact estimate, plus M0^-1 f_tilde, so
+T is what the law's `disturbance_terms` state.  For a law without that method it is the term that
+an error of the estimate adds to V', whatever the law is: by (2.1) the acceleration is the model's
+under an exact estimate, plus M0^-1 f_tilde, so
 
     T = dV/dq' . M0^-1 f_tilde
 
@@ -57,11 +58,13 @@ class OwnTerms(NamedTuple):
     size: jax.Array
     """Sizes of what V' is a sum of, added up: rounding is relative to it."""
     limited: jax.Array
-    """Whether a torque limit around the law changed its torque, () bool: then its claim is not about this loop."""
+    """Whether a torque limit changed the law's torque, () bool: nothing is claimed then."""
 
 
 def stating_law(scenario: Scenario) -> LyapunovLaw | None:
-    """The law that states a claim of its own: the outermost, or the one within limits of the torque; None if it states none.
+    """The law that states a claim of its own, or None.
+
+    It is the outermost law, or the one within limits of the torque.
 
     Raises:
       ValueError: a law that states half of a claim.
@@ -75,17 +78,19 @@ def stating_law(scenario: Scenario) -> LyapunovLaw | None:
     missing = [name for name in REQUIRED if name not in stated]
     if missing:
         what = f"{type(law).__name__} with {stated[0]} and without {missing[0]}"
-        raise checks.fail("controller", what, "both methods, or neither", "See iblf_jax.controllers.LyapunovLaw.")
+        remedy = "See iblf_jax.controllers.LyapunovLaw."
+        raise checks.fail("controller", what, "both methods, or neither", remedy)
     return law
 
 
 def why_none(scenario: Scenario) -> str:
-    """Why a scenario's law states no claim of its own, as the end of a sentence; "" if it states one."""
+    """Why a law states no claim of its own, as the end of a sentence; "" if it states one."""
     if stating_law(scenario) is not None:
         return ""
     inner, outer = unwrapped(scenario.controller), scenario.controller
     if hasattr(inner, REQUIRED[0]):
-        return f"; the claim that it states of itself does not cover the {type(outer).__name__} that wraps it"
+        wrapper = type(outer).__name__
+        return f"; the claim that it states of itself does not cover the {wrapper} that wraps it"
     return ", and states none of its own (controllers.LyapunovLaw)"
 
 
@@ -93,14 +98,20 @@ def why_not(whole: Any) -> str:
     """Why the law's own claim says nothing about a run; "" if it does."""
     actuator = whole.run.scenario.actuator
     if not isinstance(actuator, Ideal):
-        return f"the law's own claim is about a torque that acts as it is commanded, not about a {type(actuator).__name__}"
+        about = "the law's own claim is about a torque that acts as it is commanded"
+        return f"{about}, not about a {type(actuator).__name__}"
     if whole.left_out == whole.samples:
         return "the guard or a torque limit was at work all the time"
     return whole.no_run
 
 
 def terms_at(
-    scenario: Scenario, t: jax.Array, state: LoopState, along: LoopState, now: dict[str, jax.Array], ahead: dict[str, jax.Array]
+    scenario: Scenario,
+    t: jax.Array,
+    state: LoopState,
+    along: LoopState,
+    now: dict[str, jax.Array],
+    ahead: dict[str, jax.Array],
 ) -> OwnTerms:
     """The law's own claim at one state.
 
@@ -109,7 +120,8 @@ def terms_at(
       t: time, () [s].
       state: of the loop at t.
       along: its rate.
-      now, ahead: f ("disturbance"), its estimate ("disturbance_estimate") and the torque ("tau"), (n,), and their rates.
+      now: f ("disturbance"), its estimate ("disturbance_estimate") and the torque ("tau"), (n,).
+      ahead: their rates.
     """
     law: Any = stating_law(scenario)
     setting, q, dq = scenario.setting, state.q, state.dq
@@ -129,7 +141,8 @@ def terms_at(
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
     if hasattr(law, "disturbance_terms"):
-        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, ahead["disturbance"], setting, state.controller))
+        df = ahead["disturbance"]
+        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, setting, state.controller))
     else:
         terms = slopes[2] @ solve_spd(M0, f_tilde)
     size = _size(M0, slopes, rates, now) + jnp.abs(decay) + jnp.abs(terms)
@@ -137,17 +150,28 @@ def terms_at(
 
 
 def _size(M0, slopes, rates, now) -> jax.Array:
-    """Sizes of the terms of V', added up.  An acceleration is known as well as the torques whose difference it is."""
-    torques = jnp.abs(matvec(M0, rates[2])) + jnp.abs(now["tau"]) + jnp.abs(now["disturbance"]) + jnp.abs(now["disturbance_estimate"])
-    products = jax.tree.map(lambda slope, rate: jnp.sum(jnp.abs(slope) * jnp.abs(rate)), slopes, rates)
-    return sum(jax.tree.leaves(products)) + jnp.sum(jnp.abs(slopes[2]) * jnp.abs(solve_spd(M0, torques)))
+    """Sizes of the terms of V', added up.
+
+    An acceleration is known only as well as the torques whose difference it is.
+    """
+
+    def product(slope, rate):
+        return jnp.sum(jnp.abs(slope) * jnp.abs(rate))
+
+    torques = jnp.abs(matvec(M0, rates[2]))
+    for name in ("tau", "disturbance", "disturbance_estimate"):
+        torques = torques + jnp.abs(now[name])
+    products = jax.tree.map(product, slopes, rates)
+    return sum(jax.tree.leaves(products)) + product(slopes[2], solve_spd(M0, torques))
 
 
 def _limited(scenario: Scenario, law: Any, t: jax.Array, state: LoopState, now) -> jax.Array:
-    """Whether the limits around the law changed its torque; a smooth one does so before it is reached."""
+    """Whether limits changed the law's torque; a smooth one does so before it is reached."""
     if law is scenario.controller:
         return jnp.zeros((), bool)
-    own = law.command(t, state.q, state.dq, now["disturbance_estimate"], scenario.setting, state.controller)[0].tau
+    f_hat = now["disturbance_estimate"]
+    command, _ = law.command(t, state.q, state.dq, f_hat, scenario.setting, state.controller)
+    own = command.tau
     return jnp.any(jnp.abs(now["tau"] - own) > UNCHANGED * jnp.finfo(own.dtype).eps * jnp.abs(own))
 
 
@@ -197,7 +221,7 @@ def lines(trajectory: Any, judged: Any) -> list[Line]:
 
 
 def _largest(values: np.ndarray) -> np.ndarray:
-    """The largest size of some values, at each of them: near 0 they are differences of numbers of this size."""
+    """The largest size of some values, at each: near 0 they are differences of such numbers."""
     return np.full(values.shape, np.max(np.abs(values)))
 
 
@@ -205,4 +229,5 @@ def _excluded(whole: Any) -> str:
     """How many samples are left out, in words; "" if none is."""
     if not whole.left_out:
         return ""
-    return f"{whole.left_out} of {whole.samples} samples are left out: the guard or a torque limit was at work"
+    left_out = f"{whole.left_out} of {whole.samples} samples are left out"
+    return f"{left_out}: the guard or a torque limit was at work"

@@ -15,9 +15,10 @@ from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, p
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
 
 SMALL_TORQUES = (0.1, 1e-3)
-"""N m.  Sizes of the torques that an actuator has to deliver at a standstill; one of them is enough."""
-INPUT_SCALES = np.asarray([sign * 10.0**power for power in (0, 1, 2, 3, 4, 5, -1, -2, -3) for sign in (1, -1)])
-"""Inputs per torque from which the input that delivers a torque is searched: units may differ by this much."""
+"""N m.  Sizes of the torques that an actuator has to deliver at a standstill; one is enough."""
+POWERS = (0, 1, 2, 3, 4, 5, -1, -2, -3)
+INPUT_SCALES = np.asarray([sign * 10.0**power for power in POWERS for sign in (1, -1)])
+"""Inputs per torque from which the input that delivers a torque is searched, in any unit."""
 NEWTON_STEPS = 20
 DELIVERED = 1e-6
 """Relative error at which a torque counts as delivered."""
@@ -64,7 +65,8 @@ def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
         return
     is_pair = isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Measurement)
     if not is_pair:
-        findings.add(f"{label} gives {type(found).__name__}", "It must be a pair (iblf_jax.sensors.Measurement(q, dq), next state)")
+        remedy = "It must be a pair (iblf_jax.sensors.Measurement(q, dq), next state)"
+        findings.add(f"{label} gives {type(found).__name__}", remedy)
         return
     measured, after = found
     has_shape(findings, label + ", q", measured.q, q.shape)
@@ -111,7 +113,8 @@ def _delivers(findings: Findings, actuator, asked, dq) -> None:
     if found is None:
         return
     if not all(hasattr(found, field) for field in Delivered._fields):
-        findings.add(f"{label} gives {type(found).__name__}", "It must be an iblf_jax.actuators.Delivered(tau, limited, rate)")
+        remedy = "It must be an iblf_jax.actuators.Delivered(tau, limited, rate)"
+        findings.add(f"{label} gives {type(found).__name__}", remedy)
         return
     has_shape(findings, label + ", tau", found.tau, asked.shape)
     has_shape(findings, label + ", limited", found.limited, asked.shape, jnp.bool_)
@@ -127,17 +130,21 @@ def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Arra
         if found is not None:
             growth = _growth(actuator, found, state)
             remedy = "Look at the sign of its rate"
-            findings.require(growth <= 0, f"its state grows by itself at a constant input, with {growth:.3g} 1/s", remedy)
+            problem = f"its state grows by itself at a constant input, with {growth:.3g} 1/s"
+            findings.require(growth <= 0, problem, remedy)
             return
     delivered = np.asarray(actuator.deliver(torque, jnp.zeros_like(torque), state).tau)
     findings.add(
-        f"from init({np.asarray(torque)}) at a standstill no input makes it deliver that torque; asked for it, it gives {delivered} N m",
+        f"from init({np.asarray(torque)}) at a standstill no input makes it deliver that torque; commanded to, it gives {delivered} N m",
         "`init` must return the state in which the actuator delivers the torque",
     )
 
 
 def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Array | None:
-    """An input, in whatever unit, at which a state delivers a torque at a standstill; None if Newton's method finds none."""
+    """An input, in any unit, at which a state delivers a torque at a standstill, by Newton's method.
+
+    None if no start leads to one.
+    """
 
     @jax.jit
     def shortfalls(inputs):
@@ -164,7 +171,7 @@ def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Ar
 
 
 def _growth(actuator: Any, asked: jax.Array, state: Any) -> float:
-    """How fast the state grows by itself at a constant input at a standstill, 1/s; 0 if it does not, or has no memory."""
+    """How fast the state grows by itself at a constant input at a standstill, 1/s; 0 if not at all."""
     flat, rebuild = ravel_pytree(state)
     if flat.size == 0:
         return 0.0

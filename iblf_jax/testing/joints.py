@@ -28,13 +28,13 @@ USUAL = 2
 
 
 def joints_of(member: Any, default: int = USUAL) -> int:
-    """The number of joints that a member's leaves have; the default if they are scalars or disagree."""
+    """The number of joints of a member's leaves; the default if they are scalars or disagree."""
     sizes = _sizes(member)
     return sizes.pop() if len(sizes) == 1 else default
 
 
 def _sizes(member: Any) -> set[int]:
-    """Lengths of the leaves that have one number a joint: those declared so, or all vectors if none is."""
+    """Lengths of the leaves declared as one number a joint, or of all vectors if none is."""
     declared = set(_declared_sizes(member))
     if declared:
         return declared
@@ -56,7 +56,7 @@ def _declared_sizes(member: Any) -> Iterator[int]:
 
 
 def _undeclared(member: Any) -> list[Any]:
-    """Leaves of a member that JAX knows but that no field declares: those of a class that was registered by hand."""
+    """Leaves that no field declares: those of a class that was registered by hand."""
     if dataclasses.is_dataclass(member) and any(map(is_leaf_field, dataclasses.fields(member))):
         return []
     return jax.tree.leaves(member)
@@ -69,24 +69,25 @@ def check_number(n: int | None) -> None:
 
 
 def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:
-    """The number of joints to check a member for: `n`, or that of its leaves; a finding if these disagree."""
+    """The number of joints to check for: `n`, or that of the leaves."""
     if n is not None:
         return n
     sizes = sorted(set(_declared_sizes(member)))
     if len(sizes) > 1:
         listed = " and ".join(map(str, sizes))
-        findings.add(f"its leaves are for {listed} joints", "Give each one number, or all of them one number a joint")
+        remedy = "Give each one number, or all of them one number a joint"
+        findings.add(f"its leaves are for {listed} joints", remedy)
         findings.stop_if_any()
     return joints_of(member)
 
 
 def fitted_to(member: T, n: int, family: str) -> T:
-    """The member with its scalars repeated for n joints; ValueError where a leaf has another number of joints."""
+    """The member with its scalars repeated for n joints; ValueError where a leaf has others."""
     return fit_joints(member, n, family)
 
 
 def arm_of(n: int) -> Any:
-    """An arm of n joints: the customary two-link arm, or a planar chain of links like its own, lighter from base to tip."""
+    """An arm of n joints: the customary two-link arm, or a planar chain like it."""
     if n == USUAL:
         return customary_two_link()
     shrink = 0.8 ** np.arange(n)
@@ -95,7 +96,7 @@ def arm_of(n: int) -> Any:
 
 
 def scenario_of(n: int) -> Scenario:
-    """A scenario of n joints: the paper's simulation, or one with its reference, bounds, gains and observer for that many joints."""
+    """A scenario of n joints: the paper's, or one with its reference, bounds and gains."""
     if n == USUAL:
         return zhang_yan_2024()
     quarter = np.pi / 2
@@ -115,16 +116,25 @@ def scenario_of(n: int) -> Scenario:
 
 
 def check_scenario(scenario: Any, n: int | None) -> None:
-    """Raises ValueError for something that is no scenario, or for an `n` that it does not have; None is neither."""
+    """Raises ValueError for no scenario (None is allowed), or for an `n` that it does not have."""
     check_number(n)
     if scenario is None:
         return
     if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", "Such as iblf_jax.presets.zhang_yan_2024().")
+        remedy = "Such as iblf_jax.presets.zhang_yan_2024()."
+        raise checks.fail("scenario", scenario, "a Scenario", remedy)
     if n not in (None, scenario.n):
-        raise checks.fail("n", n, f"{scenario.n}, the joints of the scenario", "Leave one of the two out.")
+        expected = f"{scenario.n}, the joints of the scenario"
+        raise checks.fail("n", n, expected, "Leave one of the two out.")
 
 
-def scenario_for(findings: Findings, member: Any, scenario: Scenario | None, n: int | None) -> Scenario:
-    """The scenario to check a member in: the one given, or one of as many joints as the member is for."""
-    return scenario_of(number_of_joints(findings, member, n)) if scenario is None else scenario
+def scenario_for(
+    findings: Findings,
+    member: Any,
+    scenario: Scenario | None,
+    n: int | None,
+) -> Scenario:
+    """The scenario to check a member in: the one given, or one of the member's number of joints."""
+    if scenario is not None:
+        return scenario
+    return scenario_of(number_of_joints(findings, member, n))

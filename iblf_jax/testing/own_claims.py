@@ -19,15 +19,17 @@ SPREAD = 0.3
 
 
 def check_claims(findings: Findings, scenario: Scenario) -> None:
-    """Shapes, types and derivatives of V, W and T, and V >= 0, W >= 0 where the estimate is exact; nothing for a law that states none."""
+    """Checks V, W and T of a law that states a claim: shapes, types, derivatives, V, W >= 0.
+
+    The last is checked where the estimate is exact, f_tilde = 0.
+    """
     law: Any = scenario.controller
     stated = [name for name in REQUIRED if hasattr(law, name)]
     if not stated:
         return
+    remedy = "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
     for name in REQUIRED:
-        findings.require(
-            name in stated, f"it has {stated[0]} and no {name}", "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
-        )
+        findings.require(name in stated, f"it has {stated[0]} and no {name}", remedy)
     findings.stop_if_any()
     for dtype in ("float64", "float32"):
         _shapes(findings, in_dtype(scenario, dtype))
@@ -52,13 +54,17 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
         findings.require(lowest >= 0, f"{name} is {lowest:.3g} somewhere where f_tilde = 0", remedy)
 
 
-def _near_the_reference(scenario: Scenario, rng: np.random.Generator) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+def _near_the_reference(
+    scenario: Scenario,
+    rng: np.random.Generator,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """A time, and states and an error of the estimate there: (), (STATES, n), (STATES, n), (n,)."""
     t = jnp.asarray(0.7)
     tube = scenario.setting.tube(t)
     q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
     width = jnp.minimum(tube.k_l, tube.k_u)
-    return t, tube.q_d + jnp.clip(q, -0.9 * width, 0.9 * width), tube.dq_d + dq, jnp.linspace(0.1, 0.2, scenario.n)
+    inside = tube.q_d + jnp.clip(q, -0.9 * width, 0.9 * width)
+    return t, inside, tube.dq_d + dq, jnp.linspace(0.1, 0.2, scenario.n)
 
 
 def _shapes(findings: Findings, scenario: Scenario) -> None:
@@ -66,17 +72,25 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
     setting, q, dq = scenario.setting, scenario.initial.q, scenario.initial.dq
     t, zero = jnp.zeros((), q.dtype), jnp.zeros_like(q)
     own = law.init(q, dq, setting)
-    calls: dict[str, tuple[Any, tuple]] = {
-        f"{name}(t, q, dq, f_tilde, setting, state)": (getattr(law, name), (t, q, dq, zero, setting, own)) for name in REQUIRED
-    }
+    arguments = (t, q, dq, zero, setting, own)
+    calls: dict[str, tuple[Any, tuple]] = {}
+    for name in REQUIRED:
+        calls[f"{name}(t, q, dq, f_tilde, setting, state)"] = (getattr(law, name), arguments)
     if hasattr(law, "disturbance_terms"):
         label = "disturbance_terms(t, q, dq, f_tilde, df, setting, state)"
         calls[label] = (law.disturbance_terms, (t, q, dq, zero, zero, setting, own))
     for label, (call, args) in calls.items():
         got = shape_of(findings, label, call, *args)
-        if got is None:
-            continue
-        fits = hasattr(got, "shape") and got.shape in ((), q.shape)
-        findings.require(fits, f"{label} gives {got}", f"It must be an array of shape () or {q.shape}, which is summed")
-        remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
-        findings.require(not fits or got.dtype == q.dtype, f"{label} gives {getattr(got, 'dtype', '')} for {q.dtype} arguments", remedy)
+        if got is not None:
+            _is_summable(findings, label, got, q)
+
+
+def _is_summable(findings: Findings, label: str, got: Any, like: jax.Array) -> None:
+    """A finding unless a method gives one number, or one a joint, of the arguments' type."""
+    fits = hasattr(got, "shape") and got.shape in ((), like.shape)
+    remedy = f"It must be an array of shape () or {like.shape}, which is summed"
+    if not findings.require(fits, f"{label} gives {got}", remedy):
+        return
+    remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
+    same = got.dtype == like.dtype
+    findings.require(same, f"{label} gives {got.dtype} for {like.dtype} arguments", remedy)
