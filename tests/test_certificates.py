@@ -546,6 +546,29 @@ def test_the_rate_of_an_own_V_is_its_difference_quotient(own):
 
 
 @pytest.mark.slow
+def test_an_own_V_with_the_error_of_the_estimate_in_it(paper):
+    @ij.component
+    class WithEstimate(Passive):
+        """V + f_tilde . f_tilde / 2: with the momentum observer V' = -W - kf |f_tilde|^2 + r . f_tilde + f_tilde . f' exactly."""
+
+        kf: ij.Leaf = ij.leaf("1/s", default=20.0)
+
+        def lyapunov(self, t, q, dq, f_tilde, setting, state):
+            return Passive.lyapunov(self, t, q, dq, f_tilde, setting, state) + 0.5 * f_tilde @ f_tilde
+
+        def decay(self, t, q, dq, f_tilde, setting, state):
+            return Passive.decay(self, t, q, dq, f_tilde, setting, state) + jnp.sum(self.kf * f_tilde**2)
+
+    law = WithEstimate(slope=2.0, K=5.0, kf=12.0)
+    scenario = dataclasses.replace(paper, controller=law, observer=ij.observers.Momentum(kf=12.0))
+    line = certify(scenario, **OWN)["inequality, own V"]
+    assert line.verdict == "holds"
+    assert abs(line.margin) <= line.tolerance < 1e-10
+    too_fast = certify(ij.with_parameters(scenario, {"controller.kf": 13.0}), **OWN)["inequality, own V"]
+    assert too_fast.verdict == "fails"
+
+
+@pytest.mark.slow
 def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
     @ij.component
     class Adaptive:

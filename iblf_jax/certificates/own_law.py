@@ -7,11 +7,13 @@ A law may state a Lyapunov function V of its own and how fast V decreases, W.  T
 is checked at every step, as the inequality of Theorem 2 is: V' is the derivative of V along the
 vector field of the whole loop, by forward-mode differentiation.  No differences along a run enter.
 
-T is what the law's `disturbance_terms` state.  For a law without that method it is the term that
-an error of the estimate adds to V', whatever the law is: by (2.1) the acceleration is the model's
-under an exact estimate, plus M0^-1 f_tilde, so
+T is what the law's `disturbance_terms` state.  For a law without that method it is what the
+uncertain term adds to V', whatever the law is: by (2.1) the acceleration is the model's under an
+exact estimate, plus M0^-1 f_tilde, and f_tilde' = f' - f_hat', so
 
-    T = dV/dq' . M0^-1 f_tilde
+    T = dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'
+
+The second term is zero for a V without f_tilde.
 
 A law that does not use the estimate is given the uncertain term f itself in place of f_tilde.
 """
@@ -39,6 +41,8 @@ EQUATION = "own"
 """What the lines of the claim have in the place of a number in the paper."""
 NAMES = ("own V", "own decay", OWN_INEQUALITY)
 """The lines of the claim."""
+GENERAL_TERMS = "dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'"
+"""T of a law that states none, whatever the law is."""
 ROUNDING = 8.0
 """Relative errors of the derivatives of V, in those of their terms."""
 UNCHANGED = 8.0
@@ -144,7 +148,7 @@ def terms_at(
         df = ahead["disturbance"]
         terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, setting, state.controller))
     else:
-        terms = slopes[2] @ solve_spd(M0, f_tilde)
+        terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ ahead["disturbance"]
     size = _size(M0, slopes, rates, now) + jnp.abs(decay) + jnp.abs(terms)
     return OwnTerms(V, dV, decay, terms, size, _limited(scenario, law, t, state, now))
 
@@ -197,7 +201,7 @@ def lines(trajectory: Any, judged: Any) -> list[Line]:
     if law is None:
         return []
     states_terms = hasattr(law, "disturbance_terms")
-    right_side = "what the law states" if states_terms else "dV/dq' . M0^-1 f_tilde"
+    right_side = "what the law states" if states_terms else GENERAL_TERMS
     described = (
         (NAMES[0], "V >= 0", own.V, _largest(own.V)),
         (NAMES[1], "W >= 0: the decay that the law states", own.decay, _largest(own.decay)),

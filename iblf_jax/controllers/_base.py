@@ -103,8 +103,8 @@ class LyapunovLaw(Protocol):
         V' <= -W + T
 
     `certify` differentiates V along the vector field of the loop and holds the inequality against every step of a run.  T is what
-    `disturbance_terms` returns.  A law without that method is given T = dV/dq' . M0^-1 f_tilde, what an error of the estimate adds to V'
-    whatever the law is.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
+    `disturbance_terms` returns.  A law without that method is given what the uncertain term adds to V' whatever the law is,
+    T = dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
     """
 
     def lyapunov(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, setting: Setting, state: State) -> jax.Array:
