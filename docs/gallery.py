@@ -64,7 +64,7 @@ def page(script: Path) -> list[Path]:
             printed, seen = io.StringIO(), {id(x) for x in names.values()}
             with contextlib.redirect_stdout(printed), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                exec(compile(source, str(script), "exec"), names)
+                exec(compile(source, str(script), "exec", dont_inherit=True), names)
             lines += [words.strip(), ""] if words else []
             lines += ["```python", source.strip(), "```", ""] if source.strip() else []
             for name, value in list(names.items()):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import re
 from pathlib import Path
 from typing import Any
 
 import equations
+import public_types
 
 import iblf_jax as ij
 
@@ -16,7 +18,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "runs": (
         "Scenarios and runs",
         "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status SimulationError SimulationWarning parameters "
-        "with_parameters recommended_dt recommended_period vector_field VectorField explain component leaf static astype",
+        "with_parameters recommended_dt recommended_period vector_field VectorField explain component leaf Leaf static astype",
     ),
     "studies": (
         "Studies",
@@ -24,19 +26,47 @@ PAGES: dict[str, tuple[str, str]] = {
         "log_uniform choice joint_normal",
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
-    "tuning": ("Tuning", "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning"),
+    "tuning": (
+        "Tuning",
+        "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning objectives.Quantity objectives.Outer",
+    ),
     "identification": ("Parameters from logs", "identify Identification excitation"),
     "out": (
         "Out of Python, files and reports",
         "export Exported explore cosimulate report load_scenario save_scenario load_rollouts save_rollouts",
     ),
+    "testing": (
+        "Checkers for your own classes",
+        "testing.check_law testing.check_barrier testing.check_observer testing.check_sensor testing.check_actuator testing.check_robot "
+        "testing.check_reference testing.check_side testing.check_region testing.check_disturbance testing.check_fold "
+        "testing.check_objective testing.ContractError",
+    ),
 }
 """Page -> its title and the names that it explains."""
-FAMILIES = ("controllers", "barriers", "observers", "robots", "references", "bounds", "regions", "disturbances", "sensors", "actuators")
+FAMILIES = (
+    "controllers",
+    "barriers",
+    "observers",
+    "robots",
+    "references",
+    "bounds",
+    "regions",
+    "disturbances",
+    "sensors",
+    "actuators",
+    "metrics",
+)
+OWN_TYPES = "What a class of your own has, returns and is given"
+"""Heading of a family's protocols and records."""
 
 
 def page_of(thing: Any, name: str, level: int = 2) -> str:
     """One public object in Markdown."""
+    if public_types.is_protocol(thing) or public_types.is_record(thing):
+        return public_types.page(thing, name, level, body)
+    documented_in = public_types.ALIASES.get(name)
+    if documented_in is not None:
+        return "\n".join([f"{'#' * level} {name}", "", body(public_types.alias_text(documented_in, name)), ""])
     doc = inspect.getdoc(thing) or ""
     lines = [f"{'#' * level} {name}", ""]
     if callable(thing):
@@ -80,18 +110,25 @@ def body(doc: str) -> str:
     return "\n".join(out)
 
 
+def named(name: str) -> Any:
+    """What a public name stands for; one of a module of the package's has a dot, "testing.check_law"."""
+    return functools.reduce(getattr, name.split("."), ij)
+
+
 def write(folder: Path) -> None:
     """Writes all pages into a folder."""
     folder.mkdir()
     names = []
     for page, (title, listed) in PAGES.items():
-        texts = [page_of(getattr(ij, name), name) for name in listed.split()]
+        texts = [page_of(named(name), name) for name in listed.split()]
         (folder / f"{page}.md").write_text(f"# {title}\n\n" + "\n".join(texts))
         names.append(page)
     for family in FAMILIES:
         module = getattr(ij, family)
         members = {cls.__name__: cls for cls in module.MEMBERS.values()}
         texts = [page_of(cls, name) for name, cls in members.items()]
+        texts += [f"## {OWN_TYPES}\n"]
+        texts += [page_of(thing, f"{family}.{name}", 3) for name, thing in public_types.types_of(module).items()]
         (folder / f"{family}.md").write_text(f"# {family.capitalize()}\n\n{body(inspect.getdoc(module) or '')}\n\n" + "\n".join(texts))
         names.append(family)
     listed = "\n".join(names)

@@ -22,6 +22,7 @@ from iblf_jax.bounds import Bounds as Bounds
 from iblf_jax.core import linalg as linalg
 from iblf_jax.core import pytree as pytree
 from iblf_jax.core import status as status
+from iblf_jax.core.pytree import Leaf as Leaf
 from iblf_jax.core.pytree import astype as astype
 from iblf_jax.core.pytree import component as component
 from iblf_jax.core.pytree import leaf as leaf

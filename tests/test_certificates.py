@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -440,6 +441,194 @@ def test_no_claim_is_not_applicable(paper, name):
     assert name in certificate["inequality, case 2"].note
     assert {line.verdict for line in certificate.lines} == {"holds", "not applicable"}
     json.dumps(certificate.to_dict(), allow_nan=False)
+
+
+# ---------------------------------------------------------------------------------------------------- a law's own claim
+
+
+@ij.component
+class Passive:
+    """A user's law with a proof of its own: V = r^T M0 r / 2 + e^T slope K e, V' = -W + r . f_tilde exactly."""
+
+    slope: ij.Leaf = ij.leaf("1/s", sign="positive")
+    K: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
+    share: ij.Leaf = ij.leaf("1", shape="scalar", default=1.0)
+    """Of the true decay, what it states."""
+    late: ij.Leaf = ij.leaf("1/s", shape="scalar", default=0.0)
+    """What it states too much, from t = 0.05 s on."""
+
+    def errors(self, t, q, dq, setting):
+        tube = setting.tube(t)
+        e, de = q - tube.q_d, dq - tube.dq_d
+        return e, de, de + self.slope * e, tube.ddq_d - self.slope * de
+
+    def init(self, q, dq, setting):
+        return ()
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        _, _, r, dv = self.errors(t, q, dq, setting)
+        model, no = setting.model, jnp.zeros(q.shape, bool)
+        tau = model.mass_matrix(q) @ dv + model.coriolis(q, dq, dq - r) + model.gravity(q) - f_hat - self.K * r
+        return ij.controllers.Command(tau, dq - r, 0.0 * q, no, no), ()
+
+    def lyapunov(self, t, q, dq, f_tilde, setting, state):
+        e, _, r, _ = self.errors(t, q, dq, setting)
+        return 0.5 * r @ (setting.model.mass_matrix(q) @ r) + jnp.sum(self.slope * self.K * e**2)
+
+    def decay(self, t, q, dq, f_tilde, setting, state):
+        e, de, _, _ = self.errors(t, q, dq, setting)
+        return self.share * jnp.sum(self.K * (de**2 + (self.slope * e) ** 2)) + jnp.where(t > 0.05, self.late, 0.0)
+
+
+OWN = {"duration": 0.1, "dt": 1e-3, "method": "euler"}
+
+
+@pytest.fixture(scope="module")
+def own(paper):
+    """The paper's arm with more load than its model, under a law that states its own claim."""
+    scenario = dataclasses.replace(paper, controller=Passive(slope=[3.0, 4.0], K=[8.0, 2.0]), observer=ij.observers.NoObserver())
+    return ij.with_parameters(scenario, {"plant.payload": 0.4})
+
+
+def test_a_law_that_states_its_own_claim_is_held_against_it(own):
+    certificate = certify(own, **OWN)
+    assert certificate.holds
+    line = certificate["inequality, own V"]
+    # The proof leaves nothing: the inequality is an equality, to rounding, although f_tilde is large.
+    assert abs(line.margin) <= line.tolerance < 1e-10
+    assert certificate.numbers["F_m"] > 0.9
+    assert [line.name for line in certificate.applicable] == [
+        *("f bounded", "f' bounded", "reference inside", "start inside"),
+        *("own V", "own decay", "inequality, own V"),
+    ]
+    text = repr(certificate)
+    assert "inequality, own V" in text
+    assert "not applicable" not in text
+    assert text.endswith("18 lines of the paper's theorem do not apply, because " + certificate["inequality, case 2"].note + ".")
+    assert "18 lines" in certificate.table_html()
+    assert len(certificate.lines) == len(certificate.applicable) + 18
+    assert certificate.is_of_own_claim
+    assert np.all(np.abs(certificate.traces.left) <= line.tolerance)
+    json.dumps(certificate.to_dict(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_an_own_claim_is_drawn_as_one(own, paper_certificate):
+    figure = certify(own, **OWN).plot()
+    words = " ".join(text.get_text() for text in [*figure.texts, *(text for axes in figure.axes for text in axes.texts)])
+    assert "The law's own claim along the run: holds" in words
+    assert "own decay" in words
+    assert not paper_certificate.is_of_own_claim
+
+
+def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
+    certificate = certify(ij.with_parameters(own, {"controller.share": 1.02}), **OWN)
+    line = certificate["inequality, own V"]
+    assert certificate.verdict == line.verdict == "fails"
+    assert line.first == 0.0
+    late = certify(ij.with_parameters(own, {"controller.share": 0.98, "controller.late": 9.0}), **OWN)["inequality, own V"]
+    assert late.verdict == "fails"
+    assert late.first == pytest.approx(0.051)
+    assert "first broken at t = 0.051 s" in late.where()
+    weak = certify(ij.with_parameters(own, {"controller.share": 0.9}), **OWN)["inequality, own V"]
+    assert weak.verdict == "holds"
+    assert weak.margin > 0
+
+
+@pytest.mark.slow
+def test_the_rate_of_an_own_V_is_its_difference_quotient(own):
+    run = jax.tree.map(np.asarray, ij.simulate(own, duration=0.02, dt=1e-4, record_every=1))
+    _, stretches = look(run)
+    terms = next(stretches).proof.own
+    slope = (terms.V[2:] - terms.V[:-2]) / 2e-4
+    np.testing.assert_allclose(terms.dV[1:-1], slope, rtol=1e-4)
+    assert np.ptp(terms.dV) > 1.0
+
+
+@pytest.mark.slow
+def test_an_own_V_with_the_error_of_the_estimate_in_it(paper):
+    @ij.component
+    class WithEstimate(Passive):
+        """V + f_tilde . f_tilde / 2: with the momentum observer V' = -W - kf |f_tilde|^2 + r . f_tilde + f_tilde . f' exactly."""
+
+        kf: ij.Leaf = ij.leaf("1/s", default=20.0)
+
+        def lyapunov(self, t, q, dq, f_tilde, setting, state):
+            return Passive.lyapunov(self, t, q, dq, f_tilde, setting, state) + 0.5 * f_tilde @ f_tilde
+
+        def decay(self, t, q, dq, f_tilde, setting, state):
+            return Passive.decay(self, t, q, dq, f_tilde, setting, state) + jnp.sum(self.kf * f_tilde**2)
+
+    law = WithEstimate(slope=2.0, K=5.0, kf=12.0)
+    scenario = dataclasses.replace(paper, controller=law, observer=ij.observers.Momentum(kf=12.0))
+    line = certify(scenario, **OWN)["inequality, own V"]
+    assert line.verdict == "holds"
+    assert abs(line.margin) <= line.tolerance < 1e-10
+    too_fast = certify(ij.with_parameters(scenario, {"controller.kf": 13.0}), **OWN)["inequality, own V"]
+    assert too_fast.verdict == "fails"
+
+
+@pytest.mark.slow
+def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
+    @ij.component
+    class Adaptive:
+        """V = r . M0 r / 2 + d . d / (2 gamma), joint by joint, with T = r f; it is given f itself, as it uses no estimate."""
+
+        K: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
+        gamma: ij.Leaf = ij.leaf("1/s", sign="positive")
+        uses_observer: ClassVar[bool] = False
+
+        def init(self, q, dq, setting):
+            return {"d": 0.3 + 0.0 * q}
+
+        def errors(self, t, q, dq, setting):
+            tube = setting.tube(t)
+            return dq - tube.dq_d + 2.0 * (q - tube.q_d), tube.ddq_d - 2.0 * (dq - tube.dq_d)
+
+        def command(self, t, q, dq, f_hat, setting, state):
+            r, dv = self.errors(t, q, dq, setting)
+            model, no = setting.model, jnp.zeros(q.shape, bool)
+            tau = model.mass_matrix(q) @ dv + model.coriolis(q, dq, dq - r) + model.gravity(q) - self.K * r - state["d"]
+            return ij.controllers.Command(tau, dq - r, 0.0 * q, no, no), {"d": self.gamma * r}
+
+        def lyapunov(self, t, q, dq, f_tilde, setting, state):
+            r, _ = self.errors(t, q, dq, setting)
+            return 0.5 * r * (setting.model.mass_matrix(q) @ r) + 0.5 * state["d"] ** 2 / self.gamma
+
+        def decay(self, t, q, dq, f_tilde, setting, state):
+            return self.K * self.errors(t, q, dq, setting)[0] ** 2
+
+        def disturbance_terms(self, t, q, dq, f_tilde, df, setting, state):
+            return self.errors(t, q, dq, setting)[0] * f_tilde
+
+    certificate = certify(dataclasses.replace(paper, controller=Adaptive(K=6.0, gamma=[2.0, 3.0])), **OWN)
+    line = certificate["inequality, own V"]
+    assert certificate.holds
+    assert abs(line.margin) <= line.tolerance < 1e-10
+    assert "what the law states" in line.statement
+
+
+@pytest.mark.slow
+def test_where_an_own_claim_is_not_made(own):
+    law = own.controller
+    smooth = ij.controllers.Saturated(law=law, limit=[20.0, 9.0], edge="smooth")
+    assert "all the time" in certify(dataclasses.replace(own, controller=smooth), **OWN)["inequality, own V"].note
+    cut = certify(dataclasses.replace(own, controller=ij.controllers.Saturated(law=law, limit=[8.0, 1.0])), **OWN)
+    assert 0 < cut.numbers["samples_left_out"] < 101
+    assert cut["inequality, own V"].verdict == "holds"
+    lagging = certify(dataclasses.replace(own, actuator=ij.actuators.Motor(bandwidth=200.0)), **OWN)
+    assert lagging.verdict == "not applicable"
+    assert "Motor" in lagging["inequality, own V"].note
+    filtered = certify(dataclasses.replace(own, controller=ij.controllers.SafetyFilter(law=law)), **OWN)
+    assert "does not cover the SafetyFilter" in filtered.omitted
+    sampled = certify(ij.with_parts(own, sampling=ij.Sampling(period=1e-3)), **OWN)
+    assert sampled["inequality, own V"].verdict == "not applicable"
+
+
+def test_half_a_claim_is_refused(own):
+    half = ij.component(type("Half", (Passive,), {"__annotations__": {}, "decay": property()}))
+    with pytest.raises(ValueError, match="with lyapunov and without decay"):
+        certify(dataclasses.replace(own, controller=half(slope=3.0, K=2.0)), **OWN)
 
 
 @pytest.mark.slow

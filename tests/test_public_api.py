@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import inspect
 import json
 import re
@@ -9,12 +11,13 @@ import subprocess
 import sys
 
 import pytest
+from conftest import ROOT
 
 import iblf_jax as ij
 
 PROMISED = [
     *("simulate", "recommended_dt", "Scenario", "Initial", "Rollout", "Metrics", "Status", "SimulationError", "SimulationWarning"),
-    *("parameters", "with_parameters", "astype", "component", "leaf", "static", "robots", "references", "bounds", "disturbances"),
+    *("parameters", "with_parameters", "astype", "component", "leaf", "Leaf", "static", "robots", "references", "bounds", "disturbances"),
     *(
         "with_parts",
         "vector_field",
@@ -62,6 +65,89 @@ def undocumented(name: str, thing: object) -> list[str]:
             if not key.startswith("_") and inspect.isfunction(function) and not (function.__doc__ or "").strip():
                 missing.append(f"{name}.{key}")
     return missing
+
+
+PUBLIC_MODULE = {
+    "iblf_jax.tuning.quantities": "iblf_jax.tuning.objectives",
+    "iblf_jax.simulation.metrics": "iblf_jax.simulation.metrics",
+    "iblf_jax.studies.distributions": "iblf_jax.studies.distributions",
+}
+"""Module with a Protocol -> the public module of its family, where that is not the module or folder at the top of the package."""
+ELSEWHERE = ("jax.Array", "np.ndarray", "Any", "bool", "dict", "float", "int", "str", "tuple", "None", "ClassVar")
+"""What annotations of the protocols name that is not of this package."""
+
+
+def protocols() -> dict[str, ast.ClassDef]:
+    """Every Protocol of the package, "module:Name" -> its definition."""
+    found = {}
+    for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and "Protocol" in map(ast.unparse, node.bases):
+                found[f"{module}:{node.name}"] = node
+    return found
+
+
+PROTOCOLS = protocols()
+
+
+def family_of(module: str):
+    """The public module of a family that has a Protocol in `module`."""
+    return importlib.import_module(PUBLIC_MODULE.get(module, ".".join(module.split(".")[:2])))
+
+
+def types_named(annotations: list[ast.expr]) -> set[str]:
+    """Names of types in some annotations, without those that come from elsewhere."""
+    nodes = [node for annotation in annotations for node in ast.walk(annotation)]
+    names = {ast.unparse(node) for node in nodes if isinstance(node, ast.Attribute | ast.Name)}
+    return names - set(ELSEWHERE) - {"jax", "np"}
+
+
+def not_public(key: str, definition: ast.ClassDef) -> list[str]:
+    """Types that a class of this Protocol returns or is given, and that no public module has under their name."""
+    module = importlib.import_module(key.split(":")[0])
+    family = family_of(key.split(":")[0])
+    anywhere = [getattr(ij, name) for name in dir(ij) if inspect.ismodule(getattr(ij, name))]
+    methods = [node for node in definition.body if isinstance(node, ast.FunctionDef)]
+    returned = types_named([node.returns for node in methods if node.returns is not None])
+    fields = types_named([node.annotation for node in definition.body if isinstance(node, ast.AnnAssign)])
+    given = types_named([arg.annotation for node in methods for arg in node.args.args if arg.annotation is not None])
+
+    def lacks(name: str, places: list) -> bool:
+        return not any(getattr(place, name, None) is getattr(module, name) for place in places)
+
+    own = {definition.name, *returned, *fields}
+    missing = {name for name in own if lacks(name, [family])} | {name for name in given if lacks(name, [family, *anywhere])}
+    return sorted(missing)
+
+
+def test_the_protocols_of_all_families_are_among_them():
+    names = {key.split(":")[1] for key in PROTOCOLS}
+    assert {"Robot", "Reference", "Side", "Region", "Disturbance", "Barrier", "Observer", "Controller"} <= names
+    assert {"Sensor", "Velocity", "Actuator", "Fold", "Quantity", "Distribution"} <= names
+
+
+@pytest.mark.parametrize("key", PROTOCOLS)
+def test_every_type_that_a_users_class_returns_is_public(key):
+    missing = not_public(key, PROTOCOLS[key])
+    assert not missing, f"{family_of(key.split(':')[0]).__name__} must export {missing}, for classes of users"
+
+
+@pytest.mark.parametrize(
+    "name", ["actuators.Delivered", "controllers.Command", "sensors.Measurement", "bounds.Tube", "metrics.Sample", "objectives.Outer"]
+)
+def test_what_users_return_is_documented_on_the_reference_pages(name, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import public_types
+    import reference
+
+    family, _, short = name.partition(".")
+    listed = {f"{family}.{known}" for known in public_types.types_of(getattr(ij, family))} if family in reference.FAMILIES else set()
+    listed |= {known for _, names in reference.PAGES.values() for known in names.split()}
+    assert name in listed
+    fields = public_types.fields_of(reference.named(name))
+    assert set(getattr(reference.named(name), "_fields", ())) <= set(fields)
+    assert all(f"**{field}**" in reference.page_of(reference.named(name), short) for field in fields)
 
 
 @pytest.mark.parametrize("name", PROMISED)
@@ -146,6 +232,10 @@ def test_import_is_light_and_leaves_the_session_alone():
 
 
 def test_these_tests_can_fail():
+    made_up = ast.parse("class Robot(Protocol):\n    def load(self, x: planar_skeleton) -> tuple[keep_programs, Robot]: ...").body[0]
+    assert isinstance(made_up, ast.ClassDef)
+    assert not_public("iblf_jax.robots._base:Robot", made_up) == ["keep_programs", "planar_skeleton"]
+
     class Bare:
         def method(self): ...
 

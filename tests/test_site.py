@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
-import warnings
 
 import pytest
+import run_page
 from conftest import ROOT
 
 sys.path.insert(0, str(ROOT / "docs"))
@@ -20,10 +21,15 @@ import iblf_jax as ij
 
 PAGES = [
     page
-    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    if "```python" in page.read_text() and page.name != "other_solvers.md"
+    for page in [
+        *sorted(ROOT.glob("*.md")),
+        *(page for folder in ("docs", "benchmarks", "examples") for page in sorted((ROOT / folder).rglob("*.md"))),
+    ]
+    if run_page.blocks(page.read_text(encoding="utf-8"))
 ]
-"""Pages with Python; `test_vector_field` has the one about other solvers."""
+"""Every page with Python: README, CONTRIBUTING and what is beside them, and the documentation."""
+ELSEWHERE = {"other_solvers"}
+"""`test_vector_field` runs the page about other solvers, which needs a library of theirs."""
 LONG = pytest.mark.release
 """The guide takes two minutes of a processor; its short forms are the other pages."""
 
@@ -41,19 +47,61 @@ def test_a_script_of_the_gallery_makes_its_page(script):
     assert gallery.is_made(script)
 
 
+def test_the_pages_that_readers_start_with_are_among_them():
+    assert {"README", "guide", "start", "own_law", "own_robot", "own_parts", "read_a_certificate"} <= {page.stem for page in PAGES}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_name_on_a_page_exists(page):
+    unknown = run_page.unknown_names(page.read_text(encoding="utf-8"), ij)
+    assert not unknown, f"{page.name} names {unknown}, which iblf_jax does not have"
+
+
 @pytest.mark.parametrize(
-    "page", [pytest.param(page, marks=LONG if page.stem == "guide" else pytest.mark.slow) for page in PAGES], ids=lambda page: page.stem
+    "page",
+    [pytest.param(page, marks=LONG if page.stem == "guide" else pytest.mark.slow) for page in PAGES if page.stem not in ELSEWHERE],
+    ids=lambda page: page.stem,
 )
-def test_every_block_of_a_page_runs(page, tmp_path, monkeypatch):
+def test_every_block_of_a_page_runs_in_a_process_of_its_own(page, tmp_path):
+    """Nothing of this test reaches the page: neither its `__future__` flags, nor its settings of JAX, nor its names.
+
+    The tests run on the oldest supported Python, 3.11, which evaluates annotations at once.  On 3.14 and later `run_page` evaluates them
+    after each block, so that a name which is missing from the package fails there too.
+    """
     if page.stem == "sweep_on_a_cluster":
         pytest.importorskip("zarr")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"__name__": "__main__"}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
-            exec(compile(block, page.name, "exec"), names)
+    command = [sys.executable, str(ROOT / "tests" / "run_page.py"), str(page)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+PAGE_OF_A_CLASS = """# A page
+
+```python
+{first_line}
+import iblf_jax as ij
+
+
+class Law:
+    gain: ij.{name} = 1.0
+
+    def command(self, q: ij.{name}) -> float:
+        return ij.{name}
+```
+"""
+
+
+@pytest.mark.parametrize("first_line", ["", "from __future__ import annotations"], ids=["at-once", "lazily"])
+def test_a_page_whose_annotation_names_nothing_fails(first_line, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(PAGE_OF_A_CLASS.format(first_line=first_line, name="Leaf"))
+    assert run_page.run(page)["Law"].__annotations__
+    assert run_page.unknown_names(page.read_text(), ij) == []
+    page.write_text(PAGE_OF_A_CLASS.format(first_line=first_line, name="NoSuchType"))
+    with pytest.raises(AttributeError, match="NoSuchType"):
+        run_page.run(page)
+    assert run_page.unknown_names(page.read_text(), ij) == ["ij.NoSuchType"]
 
 
 def test_every_flag_has_a_section():

@@ -13,6 +13,8 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.controllers import Command
 from iblf_jax.testing import ContractError
+from iblf_jax.testing._contract import Findings, in_dtype
+from iblf_jax.testing.own_claims import check_claims
 
 TWO_LINK = ij.robots.TwoLink
 
@@ -166,6 +168,44 @@ def test_broken_law():
     rejects(ij.testing.check_law, changed(PlainLaw, command=unguarded)(3.0), "not finite at xi", "guarded_error")
 
 
+class Stating(PlainLaw):
+    """A law that states a claim: a damped spring's energy, and what its damper takes."""
+
+    def lyapunov(self, t, q, dq, f_tilde, setting, state):
+        tube = setting.tube(t)
+        return 0.5 * dq * (setting.model.mass_matrix(q) @ dq) + 0.5 * self.gain * (q - tube.q_d) ** 2
+
+    def decay(self, t, q, dq, f_tilde, setting, state):
+        return 0.2 * self.gain * dq**2
+
+
+def claims_of(law):
+    """What `check_law` finds wrong with a law's own claim."""
+    findings = Findings(law, "Controller")
+    with jax.numpy_dtype_promotion("standard"), jax.enable_x64(True):
+        base = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law)
+        check_claims(findings, in_dtype(base, "float64"))
+    return findings.problems
+
+
+def test_broken_claims_of_a_law():
+    half = changed(Stating, decay=property())
+    with pytest.raises(ContractError, match="it has lyapunov and no decay"):
+        claims_of(half(3.0))
+    wide = changed(Stating, decay=lambda self, t, q, dq, *args: jnp.zeros(3))
+    with pytest.raises(ContractError, match=r"decay\(t, q, dq, f_tilde, setting, state\) gives .*must be an array of shape \(\) or \(2,\)"):
+        claims_of(wide(3.0))
+    terms = changed(Stating, disturbance_terms=lambda self, t, q, dq, f_tilde, df, setting, state: df.astype("float64"))
+    with pytest.raises(ContractError, match=r"disturbance_terms.* gives float64 for float32"):
+        claims_of(terms(3.0))
+
+
+def test_claims_of_a_law_are_nonnegative():
+    assert claims_of(changed(Stating)(3.0)) == []
+    growing = changed(Stating, decay=lambda self, t, q, dq, *args: 3.0 * (dq - 0.2) * dq)
+    assert any("decay is -" in problem for problem in claims_of(growing(3.0)))
+
+
 def test_broken_fold():
     class Root:
         units: ClassVar[dict[str, str]] = {"rms": "rad"}
@@ -191,3 +231,167 @@ def test_random_samples_are_apart(rng):
 
     e1 = np.asarray(samples(rng).e1)
     assert np.unique(e1).size == e1.size
+
+
+# ------------------------------------------------------------------------------------------------------------- any number of joints
+
+
+@ij.component
+class VoltageMotor:
+    """An actuator of a user's, whose input is a voltage: tau = Kt i, L i' = u - R i - Kt q'."""
+
+    R: ij.Leaf = ij.leaf("ohm", sign="positive")
+    Kt: ij.Leaf = ij.leaf("N m/A", sign="positive", default=0.08)
+    L: ij.Leaf = ij.leaf("H", sign="positive", default=2e-3)
+
+    def init(self, tau):
+        return tau / self.Kt
+
+    def deliver(self, asked, dq, state):
+        rate = (asked - self.R * state - self.Kt * dq) / self.L
+        return ij.actuators.Delivered(self.Kt * state, jnp.zeros(asked.shape, bool), rate)
+
+
+def without_memory(self, asked, dq, state):
+    """Its input is a current in mA, its torque proportional to it, in the other direction."""
+    return ij.actuators.Delivered(-1e-3 * self.Kt * asked, jnp.zeros(asked.shape, bool), ())
+
+
+def washed_out(self, asked, dq, state):
+    """It delivers what changes, and in the end nothing."""
+    return ij.actuators.Delivered(asked - state, jnp.zeros(asked.shape, bool), self.R * (asked - state))
+
+
+def with_wrong_sign(self, asked, dq, state):
+    return ij.actuators.Delivered(self.Kt * state, jnp.zeros(asked.shape, bool), (asked + self.R * state) / self.L)
+
+
+def per_joint(n):
+    return np.linspace(1.0, 2.0, n)
+
+
+def test_an_actuator_of_one_joint_whose_input_is_a_voltage():
+    ij.testing.check_actuator(VoltageMotor(R=[1.0]))
+    with pytest.raises(ValueError, match=r"actuator.R: got .*expected one number, or 2"):
+        ij.testing.check_actuator(VoltageMotor(R=[1.0]), n=2)
+
+
+@pytest.mark.parametrize(
+    ("methods", "words"),
+    [
+        ({"init": lambda self, tau: 0.7 * tau / self.Kt}, ("no input makes it deliver that torque", "`init` must return")),
+        ({"deliver": with_wrong_sign}, ("its state grows by itself", "sign of its rate")),
+        ({"deliver": lambda self, asked, dq, state: (state, state, state)}, ("iblf_jax.actuators.Delivered",)),
+    ],
+    ids=["init", "sign", "no-record"],
+)
+def test_broken_actuators(methods, words):
+    rejects(ij.testing.check_actuator, changed(VoltageMotor, **methods)(R=[1.0]), *words)
+
+
+@pytest.mark.parametrize(
+    "methods", [{"init": lambda self, tau: (), "deliver": without_memory}, {"init": lambda self, tau: 0.0 * tau, "deliver": washed_out}]
+)
+@pytest.mark.parametrize("n", [pytest.param(n, marks=[pytest.mark.slow] if n > 1 else []) for n in (1, 3, 6)])
+def test_actuators_with_other_inputs_and_without_a_steady_state(methods, n):
+    ij.testing.check_actuator(changed(VoltageMotor, **methods)(R=per_joint(n)))
+
+
+def test_a_sensor_without_its_record_is_refused():
+    broken = changed(ij.sensors.Ideal, measure=lambda self, q, dq, normal, period, state: ((q, dq), state))
+    rejects(ij.testing.check_sensor, broken(), "iblf_jax.sensors.Measurement")
+
+
+MEMBERS_OF_JOINTS = {
+    "actuator": (ij.testing.check_actuator, lambda k: VoltageMotor(R=k)),
+    "sensor": (ij.testing.check_sensor, lambda k: ij.sensors.Encoder(counts=4096, velocity=ij.sensors.FilteredDifference(cutoff=200 * k))),
+    "observer": (ij.testing.check_observer, lambda k: ij.observers.Momentum(kf=20 * k)),
+    "disturbance": (ij.testing.check_disturbance, lambda k: ij.disturbances.Friction(viscous=0.1 * k)),
+    "reference": (ij.testing.check_reference, lambda k: ij.references.Sinusoid(offset=0.5 * k, amplitude=0.1)),
+    "side": (ij.testing.check_side, ij.bounds.Constant),
+    "fold": (ij.testing.check_fold, lambda k: ij.metrics.Settling(tolerance=0.01 * k)),
+    "objective": (ij.testing.check_objective, lambda k: WeightedSquare(weight=k)),
+    "law": (ij.testing.check_law, lambda k: ij.controllers.Saturated(ij.controllers.PDGravity(Kp=60 * k, Kd=20 * k), limit=90.0)),
+    "law-by-hand": (ij.testing.check_law, lambda k: PlainLaw(jnp.asarray(20.0 * k))),
+    "barrier": (ij.testing.check_barrier, lambda k: WeightedMapping(weight=k)),
+}
+"""Family -> its checker, and a member from one number a joint."""
+
+
+@ij.component
+class WeightedMapping:
+    """A barrier of a user's with a leaf of one number a joint: the mapping barrier with a weight."""
+
+    weight: ij.Leaf = ij.leaf("1", sign="positive")
+    guard: float = ij.static(default=1e-3)
+    uses_o: ClassVar[bool] = False
+
+    def value(self, tube, q):
+        return self.weight * ij.barriers.Mapping(guard=self.guard).value(tube, q)
+
+    def slope(self, tube, q):
+        return self.weight * ij.barriers.Mapping(guard=self.guard).slope(tube, q)
+
+    def virtual_velocity(self, tube, q, k1, o):
+        return ij.barriers.Mapping(guard=self.guard).virtual_velocity(tube, q, k1, o)
+
+
+@ij.component
+class WeightedSquare:
+    """What a user tunes for, with a leaf of one number a joint: sum_k dt weight . e1^2."""
+
+    weight: ij.Leaf = ij.leaf("1", sign="positive")
+
+    def init(self, sample):
+        return jnp.zeros_like(sample.t)
+
+    def update(self, acc, sample):
+        return acc + sample.dt * jnp.sum(self.weight * sample.e1**2)
+
+    def finish(self, acc):
+        return acc, acc, acc[None]
+
+
+QUICK_AT = {"sensor": 3, "disturbance": 6, "side": 1}
+"""Members of which the default run checks one number of joints."""
+
+
+@pytest.mark.parametrize(
+    ("family", "n"),
+    [
+        pytest.param(family, n, id=f"{family}-{n}", marks=[] if QUICK_AT.get(family) == n else [pytest.mark.slow])
+        for family in MEMBERS_OF_JOINTS
+        for n in (1, 2, 3, 6)
+    ],
+)
+def test_members_of_any_number_of_joints(family, n):
+    check, member_of = MEMBERS_OF_JOINTS[family]
+    check(member_of(per_joint(n)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_the_number_of_joints_is_that_of_the_leaves(n):
+    from iblf_jax.testing.joints import joints_of, scenario_of
+
+    assert joints_of(VoltageMotor(R=per_joint(n))) == n
+    assert joints_of(ij.controllers.Saturated(ij.controllers.PDGravity(Kp=per_joint(n), Kd=1.0), limit=2.0)) == n
+    assert joints_of(PlainLaw(jnp.asarray(per_joint(n)))) == n
+    assert joints_of(ij.disturbances.Sum((ij.disturbances.Step(size=per_joint(n), time=1.0), ij.disturbances.Friction()))) == n
+    # Coordinates of the tip, and waypoints, are not one number a joint.
+    assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
+    scenario = scenario_of(n)
+    assert scenario.n == n
+    tube = scenario.setting.tube(jnp.asarray(0.0))
+    assert bool(jnp.all((tube.lower < tube.q_d) & (tube.q_d < tube.upper) & (tube.lower < 0.8) & (tube.upper > 0.8)))
+
+
+def test_leaves_of_different_numbers_of_joints_are_a_finding():
+    rejects(ij.testing.check_actuator, VoltageMotor(R=[1.0, 2.0, 3.0], Kt=[0.1, 0.2]), "its leaves are for 2 and 3 joints")
+
+
+@pytest.mark.parametrize("check", [ij.testing.check_law, ij.testing.check_observer, ij.testing.check_disturbance])
+def test_a_number_of_joints_beside_a_robot_must_be_its_own(check, paper):
+    member = {"check_law": paper.controller, "check_observer": paper.observer}.get(check.__name__, paper.disturbance)
+    beside = {"check_law": {"scenario": paper}, "check_observer": {"model": paper.model}}.get(check.__name__, {"plant": paper.plant})
+    with pytest.raises(ValueError, match=r"n: got 3, expected 2"):
+        check(member, n=3, **beside)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import run_page
 from conftest import ROOT
 from members import LAWS, OBSERVERS
 
 import iblf_jax as ij
 from iblf_jax.simulation.closed_loop import initial_state, rate
 
-PAGE = (ROOT / "docs" / "how_to" / "other_solvers.md").read_text(encoding="utf-8")
+PAGE = ROOT / "docs" / "how_to" / "other_solvers.md"
 LAW_WITH_MEMORY = {"controller": LAWS["adaptive_rbf"], "observer": OBSERVERS["extended_state"]}
 
 
@@ -22,10 +21,7 @@ LAW_WITH_MEMORY = {"controller": LAWS["adaptive_rbf"], "observer": OBSERVERS["ex
 def page() -> dict:
     """What the code blocks of the page leave behind, run from top to bottom as a reader would."""
     pytest.importorskip("diffrax")
-    shown: dict = {}
-    for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
-        exec(compile(block, "how_to_other_solvers.md", "exec"), shown)
-    return shown
+    return run_page.run(PAGE)
 
 
 @pytest.fixture(scope="module")

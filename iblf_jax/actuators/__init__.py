@@ -1,6 +1,8 @@
 """Actuators: what becomes of a commanded torque.  The contract is `Actuator` in `_base.py`."""
 
 from iblf_jax.actuators._base import Actuator as Actuator
+from iblf_jax.actuators._base import Delivered as Delivered
+from iblf_jax.actuators._base import State as State
 from iblf_jax.actuators.chain import Chain as Chain
 from iblf_jax.actuators.ideal import Ideal as Ideal
 from iblf_jax.actuators.motor import Motor as Motor
@@ -8,4 +10,4 @@ from iblf_jax.actuators.motor import Motor as Motor
 MEMBERS = {"ideal": Ideal, "motor": Motor, "chain": Chain}
 """Every actuator by the name that a scenario file gives it."""
 
-__all__ = ["MEMBERS", "Actuator", "Chain", "Ideal", "Motor"]
+__all__ = ["MEMBERS", "Actuator", "Chain", "Delivered", "Ideal", "Motor", "State"]

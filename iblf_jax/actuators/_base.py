@@ -1,4 +1,4 @@
-"""The contract of an actuator: it is told a torque, and gives another.
+"""The contract of an actuator: it takes the law's command and gives a torque.
 
 Its state is integrated with the plant.  Friction is the plant's, delay the sampled loop's (`Sampling`).
 """
@@ -27,6 +27,9 @@ class Delivered(NamedTuple):
 class Actuator(Protocol):
     """What the package asks of an actuator.
 
+    The command of a law is a torque.  An actuator may take another input, such as a voltage, under a law that
+    commands one; an observer is given the command, so such a loop needs one that does not use it.
+
     One with limits also has `unlimited`, the same without them: how fast a loop is, is measured on it.
     """
 
@@ -38,7 +41,7 @@ class Actuator(Protocol):
         """What it delivers.
 
         Args:
-          asked: the torque that it is told, (n,) [N m].
+          asked: the law's command, (n,): a torque [N m], or the actuator's own input in its unit.
           dq: velocity of the joints, (n,) [rad/s].
           state: its own.
         """

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from iblf_jax import actuators, sensors
-from iblf_jax.certificates import claims
+from iblf_jax.certificates import claims, own_law
 from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed, grid
@@ -39,7 +39,11 @@ def certify(
 
         V2' + rho V2 - 1/2 |f'|^2 <= 0  at every step, and what follows from it                             (3.17)-(3.31)
 
-    V2' and f' are exact (by jvp along the vector field of the whole loop).  A law, an observer or a situation without a claim is
+    A law that states a Lyapunov function V of its own and its decay W (`controllers.LyapunovLaw`) is held against
+
+        V' <= -W + T
+
+    V', V2' and f' are exact (by jvp along the vector field of the whole loop).  A law, an observer or a situation without a claim is
     "not applicable", never "fails"; a sampled loop is held against its continuous run instead.  Steps that a run did not record are made
     again, from each recorded sample to the next.
 
@@ -51,17 +55,19 @@ def certify(
       worst: of a study, judge that many runs, those nearest to their bounds; None for all.
 
     Returns:
-      A `Certificate`; over many runs each line is that of the run with the smallest margin.
+      A `Certificate`; over many runs each line is that of the run with the smallest margin.  It prints the lines that apply, and why the
+      others do not in one sentence; its `lines` are all of them.
 
     Raises:
-      ValueError: a run of another scenario, one that its own scenario, dt and method do not reproduce (or whose samples do not say how
-        many steps it had), or arguments of the wrong kind.
+      ValueError: a law that states half of a claim; a run of another scenario, one that its own scenario, dt and method do
+        not reproduce (or whose samples do not say how many steps it had), or arguments of the wrong kind.
 
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
     """
     scenario = canonical(scenario)
     if not checks.is_concrete(scenario):
         raise checks.fail("scenario", "traced values", "numbers", "certify works on the host: call it outside jit, vmap and grad.")
+    own_law.stating_law(scenario)
     if run is None:
         every = 1 + checks.whole_steps(duration, dt) // CERTIFY_RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
@@ -145,7 +151,7 @@ def _sampled(run: Rollout) -> Certificate:
         continuous = simulate(ideal, duration=steps * float(run.dt), dt=float(run.dt), method=run.method, record_every=every)
     beside = jax.tree.map(np.asarray, continuous)
     certificate = _one(beside)
-    nothing: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time"))
+    nothing: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
     lines = tuple(dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **nothing) for line in certificate.lines)
     excess, margins = run.V - beside.V, [_margins(x) for x in (run, beside)]
     k, joint = int(np.argmax(excess)), int(np.argmin(margins[0] - margins[1]))
@@ -164,7 +170,7 @@ def _sampled(run: Rollout) -> Certificate:
     return Certificate(_heading(scenario), (*lines, *measured), certificate.numbers, traces, joints=joint_names(scenario.plant, run.n))
 
 
-SAMPLED = "sampled loop: Theorem 2 is about a law that runs at every instant"
+SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
 MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
 
 
@@ -196,7 +202,10 @@ def _numbers(whole: Whole) -> dict[str, Any]:
 
 
 def _traces(trajectory: Trajectory) -> Traces:
-    """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim."""
+    """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim.
+
+    Of a law that has only a claim of its own, V and the left side are those of that claim.
+    """
     sample, proof, case = trajectory.sample, trajectory.proof, applicable_case(trajectory.whole)
     nothing = np.full(trajectory.t.shape, np.nan)
     envelope, left = (nothing, nothing) if case is None else (trajectory.envelope[case].bound, left_side(trajectory, case))
@@ -219,6 +228,9 @@ def _traces(trajectory: Trajectory) -> Traces:
         f_tilde_bound=bounds["f_tilde"],
         held=proof.held,
     )
+    if case is None and own_law.applies(trajectory):
+        left = np.where(proof.held, np.nan, own_law.left_side(proof.own))
+        traces = traces._replace(V=proof.own.V, left=left, dropped=np.zeros_like(left))
     return Traces(*(x[trajectory.recorded] for x in traces))
 
 

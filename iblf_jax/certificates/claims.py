@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.actuators import Ideal
+from iblf_jax.certificates import own_law
 from iblf_jax.controllers import Backstepping, FullState
 from iblf_jax.core import checks
 from iblf_jax.observers import Momentum, Printed
@@ -68,7 +69,8 @@ def why_no_claim(scenario: Scenario) -> str:
     """Why Theorem 2 claims nothing about a scenario, in words; "" if it does claim something."""
     law, observer = law_of(scenario), scenario.observer
     if not isinstance(law, Backstepping | FullState):
-        return f"Theorem 2 is about the backstepping law (3.14); {type(law).__name__} has no claim of this kind"
+        words = f"Theorem 2 is about the backstepping law (3.14); {type(law).__name__} has no claim of this kind"
+        return words + own_law.why_none(scenario)
     for barrier, rate in (
         (law.barrier, decay_rate(law)),
         *([(law.velocity_barrier, decay_phi(law))] if isinstance(law, FullState) else []),

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates import claims
-from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Line
+from iblf_jax.certificates import claims, own_law
+from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, SEEN_ONLY, Line
 from iblf_jax.certificates.trajectory import Trajectory, Whole
 from iblf_jax.controllers import FullState
 from iblf_jax.core.status import Status
@@ -70,12 +70,14 @@ def _worst(same: list[Line]) -> Line:
 
     worst = min(same, key=order)
     values = [line.value for line in same if line.value is not None]
+    broken = [line.first for line in same if line.first is not None]
+    worst = dataclasses.replace(worst, first=min(broken, default=None))
     return dataclasses.replace(worst, value=max(values)) if worst.value is not None and values else worst
 
 
 def of_stretch(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
     """The lines that are about instants, for one stretch, and the largest share that each dropped term has of its margin there."""
-    lines = assumptions(trajectory)
+    lines = [*assumptions(trajectory), *own_law.lines(trajectory, judged)]
     if is_full(trajectory.whole):
         lines += [*full_assumptions(trajectory), step_inequality(trajectory)]
     lines += [inequality(trajectory, case) for case in claims.CASES]
@@ -124,8 +126,10 @@ def judged(trajectory: Trajectory, margins: np.ndarray, tolerances: np.ndarray |
     broken = claimed & ~(margins >= -tolerances)
     watched = np.where(broken if np.any(broken) else claimed, np.nan_to_num(margins, nan=-np.inf), np.inf)
     place = np.unravel_index(np.argmin(watched), margins.shape)
+    rows = np.flatnonzero(broken.reshape(margins.shape[0], -1).any(axis=1))
     return Line(
-        verdict=FAILS if np.any(broken) else HOLDS,
+        verdict=FAILS if rows.size else HOLDS,
+        first=float(trajectory.t[rows[0]]) if rows.size else None,
         margin=float(margins[place]),
         tolerance=float(tolerances[place]),
         time=float(trajectory.t[place[0]]),
@@ -391,8 +395,8 @@ def dropped(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
         ("dropped term of the law", "(3.13)", "e2^T M0' e2/2 alone <= the margin that the proof leaves", proof.dropped_e2),
         ("dropped term of the observer", "(3.11)", "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves", proof.dropped_f),
     )
-    by_law = "exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else ""
-    by_law = "exact: C0 q' is cancelled, and e2 weighed without M0" if is_full(trajectory.whole) else by_law
+    by_law = "the claim is exact: the law uses C0 alpha" if getattr(law, "reading", "") == "corrected" else ""
+    by_law = "the claim is exact: C0 q' is cancelled, and e2 weighed without M0" if is_full(trajectory.whole) else by_law
     exact = (by_law, _exact_observer(trajectory))
     lines, shares = [], {}
     for (name, equation, statement, term), none_dropped in zip(described, exact, strict=True):
@@ -416,7 +420,9 @@ def dropped(trajectory: Trajectory) -> tuple[list[Line], dict[str, float]]:
 
 
 def _exact_observer(trajectory: Trajectory) -> str:
-    return "exact: the observer has momentum form" if type(trajectory.whole.run.scenario.observer).__name__ == "Momentum" else ""
+    return (
+        "the claim is exact: the observer has momentum form" if type(trajectory.whole.run.scenario.observer).__name__ == "Momentum" else ""
+    )
 
 
 def conclusions(trajectory: Trajectory) -> list[Line]:
@@ -431,7 +437,7 @@ def conclusions(trajectory: Trajectory) -> list[Line]:
     line = _line(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
     line = _as_status(whole, line, Status.VELOCITY_VIOLATED)
     if applicable_case(whole) is None:
-        line = dataclasses.replace(line, verdict=NOT_APPLICABLE, note=f"no claim, only seen ({why_not(whole, whole.case)})")
+        line = dataclasses.replace(line, verdict=NOT_APPLICABLE, note=f"{SEEN_ONLY}{why_not(whole, whole.case)})")
     return [first, line]
 
 
@@ -446,6 +452,6 @@ def conclusion(trajectory: Trajectory) -> Line:
     unclaimed = case is not None and _xi_bound(trajectory.whole.run.scenario, trajectory.t[:1], trajectory.proof.V[:1]) is None
     if case is None or unclaimed:
         reason = NO_BOUND if unclaimed else why_not(trajectory.whole, trajectory.whole.case)
-        note = f"no claim, only seen ({reason})"
+        note = f"{SEEN_ONLY}{reason})"
         return Line(**{**vars(line), "verdict": NOT_APPLICABLE, "note": note})
     return line

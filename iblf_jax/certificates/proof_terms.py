@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.bounds import NARROWEST
+from iblf_jax.certificates import own_law
 from iblf_jax.certificates.claims import decay_phi, decay_rate, law_of
 from iblf_jax.controllers import Backstepping, FullState
 from iblf_jax.core.linalg import solve_spd
@@ -80,6 +81,8 @@ class ProofTerms(NamedTuple):
     """Error of sqrt(2 V2) for one unit of relative error, ()."""
     full: Any = ()
     """Of a law that bounds velocities too, its `FullTerms`."""
+    own: Any = ()
+    """Of a law that states a claim of its own, its `own_law.OwnTerms`."""
 
 
 class FullTerms(NamedTuple):
@@ -161,6 +164,9 @@ def _seen(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str,
         "df_terms": df_terms,
         "V_terms": V_terms,
     }
+    if own_law.stating_law(scenario) is not None:
+        proof["own"] = own_law.terms_at(scenario, t, state, along, now, ahead)
+        proof["held"] |= proof["own"].limited
     if isinstance(law_of(scenario), FullState):
         proof["full"] = _full(scenario, t, state, M0, ahead, f_tilde)
         # Where alpha is outside the velocities' bounds, e2 has no tube.

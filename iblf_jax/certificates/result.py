@@ -7,6 +7,7 @@ smallest, and the verdict.  "Not applicable" is a verdict of its own: no claim w
 from __future__ import annotations
 
 import dataclasses
+import html
 import math
 from typing import Any, NamedTuple
 
@@ -15,6 +16,12 @@ import numpy as np
 from iblf_jax.core import checks, tables
 
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
+OWN_INEQUALITY = "inequality, own V"
+"""Name of the inequality that a law states of itself."""
+FEW = 3
+"""Lines that do not apply are named up to this number."""
+SEEN_ONLY = "no claim, only seen ("
+"""Beginning of the note of a line that was seen to hold, and that nothing claims."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,14 +53,22 @@ class Line:
     """The reason of "not applicable", or what else should be known."""
     counts: bool = True
     """Whether the verdict enters `Certificate.verdict`; what is only measured does not."""
+    first: float | None = None
+    """The first instant at which a line about instants is broken [s]; None if none is."""
+
+    @property
+    def applies(self) -> bool:
+        """Whether the line says something of this run: a verdict, or a number that was measured beside the claims."""
+        return self.verdict != NOT_APPLICABLE or (self.value is not None and not self.counts)
 
     def where(self) -> str:
-        """Run, joint and time of the smallest margin, in words."""
+        """Run, joint and time of the smallest margin, and when the line was first broken, in words."""
         if self.margin is None and self.value is None:
             return ""
         parts = [] if self.run is None else [f"run {self.run}"]
         parts += [] if self.joint is None else [f"joint {self.joint}"]
         parts += [] if self.time is None else [f"t = {self.time:.4g} s"]
+        parts += [] if self.first is None else [f"first broken at t = {self.first:.4g} s"]
         return ", ".join(parts)
 
 
@@ -112,6 +127,12 @@ class Certificate:
         """Whether every claim that applies was checked and holds."""
         return self.verdict == HOLDS
 
+    @property
+    def is_of_own_claim(self) -> bool:
+        """Whether what was checked is a claim that the law states of itself, and not the paper's theorem."""
+        inequalities = [line.name for line in self.applicable if line.name.startswith("inequality")]
+        return inequalities == [OWN_INEQUALITY]
+
     def __getitem__(self, name: str) -> Line:
         for line in self.lines:
             if isinstance(name, str) and line.name == name:
@@ -121,7 +142,8 @@ class Certificate:
     def __repr__(self) -> str:
         rows = [("", "equation", "verdict", "margin", "value", "where the margin is smallest"), *self._rows()]
         notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
-        return "\n".join([f"Certificate: {self.verdict}  ({self.subject})", *tables.as_text(rows), *(["notes", *notes] if notes else [])])
+        shown = [f"Certificate: {self.verdict}  ({self.subject})", *tables.as_text(rows), *(["notes", *notes] if notes else [])]
+        return "\n".join([*shown, *([self.omitted] if self.omitted else [])])
 
     def _repr_html_(self) -> str:
         from iblf_jax import reports
@@ -129,16 +151,37 @@ class Certificate:
         return reports.card(self)
 
     def table_html(self) -> str:
-        """Its lines as an HTML table, those that fail in bold."""
+        """The lines that apply as an HTML table, those that fail in bold, and below it why the others do not apply."""
         heading = ("", "equation", "verdict", "margin", "value", "where", "checked", "note")
-        rows = [(*row, line.statement, line.note) for line, row in zip(self.lines, self._rows(), strict=True)]
-        failing = [i for i, line in enumerate(self.lines) if line.verdict == FAILS]
-        return tables.as_html(heading, rows, failing)
+        rows = [(*row, line.statement, line.note) for line, row in zip(self.applicable, self._rows(), strict=True)]
+        failing = [i for i, line in enumerate(self.applicable) if line.verdict == FAILS]
+        table = tables.as_html(heading, rows, failing)
+        return f"{table}<p>{html.escape(self.omitted)}</p>" if self.omitted else table
+
+    @property
+    def applicable(self) -> tuple[Line, ...]:
+        """The lines that say something of this run; `lines` has all."""
+        return tuple(line for line in self.lines if line.applies)
+
+    @property
+    def omitted(self) -> str:
+        """How many lines do not apply, and why, in one sentence; "" if all apply."""
+        reasons: dict[str, list[str]] = {}
+        for line in self.lines:
+            if not line.applies:
+                reasons.setdefault(_reason(line.note), []).append(line.name)
+        count = sum(map(len, reasons.values()))
+        if count == 0:
+            return ""
+        subject = "1 line of the paper's theorem does not apply" if count == 1 else f"{count} lines of the paper's theorem do not apply"
+        if len(reasons) == 1:
+            return f"{subject}, because {next(iter(reasons))}."
+        return f"{subject}: {'; '.join(f'{_named(names)}, because {reason}' for reason, names in reasons.items())}."
 
     def _notes(self) -> dict[str, list[str]]:
         """Each note and the lines that it belongs to."""
         notes: dict[str, list[str]] = {}
-        for line in self.lines:
+        for line in self.applicable:
             if line.note:
                 notes.setdefault(line.note, []).append(line.name)
         return notes
@@ -151,7 +194,7 @@ class Certificate:
     def _rows(self) -> list[tuple[str, str, str, str, str, str]]:
         return [
             (line.name, line.equation, line.verdict, _number(line.margin, line.unit), _number(line.value, line.unit), line.where())
-            for line in self.lines
+            for line in self.applicable
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -170,6 +213,18 @@ class Certificate:
         from iblf_jax.plotting import certificates
 
         return certificates.certificate(self, **options)
+
+
+def _named(names: list[str]) -> str:
+    """Lines by their names, or their number where there are many."""
+    return ", ".join(names) if len(names) <= FEW else f"{len(names)} lines"
+
+
+def _reason(note: str) -> str:
+    """Why a line does not apply, from its note."""
+    if note.startswith(SEEN_ONLY):
+        return note.removeprefix(SEEN_ONLY).removesuffix(")")
+    return note
 
 
 def _number(value: float | None, unit: str) -> str:

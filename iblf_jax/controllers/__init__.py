@@ -2,7 +2,9 @@
 
 from iblf_jax.controllers._base import Command as Command
 from iblf_jax.controllers._base import Controller as Controller
+from iblf_jax.controllers._base import LyapunovLaw as LyapunovLaw
 from iblf_jax.controllers._base import Setting as Setting
+from iblf_jax.controllers._base import State as State
 from iblf_jax.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.controllers.backstepping import Backstepping as Backstepping
 from iblf_jax.controllers.computed_torque import ComputedTorque as ComputedTorque
@@ -43,11 +45,13 @@ __all__ = [
     "Controller",
     "DynamicSurface",
     "FullState",
+    "LyapunovLaw",
     "PDGravity",
     "ReferenceGovernor",
     "SafetyFilter",
     "Saturated",
     "Setting",
+    "State",
     "SurfaceBarrier",
     "law_by_name",
     "within_effort",

@@ -70,6 +70,8 @@ class Command(NamedTuple):
 class Controller(Protocol):
     """What the package asks of a law.
 
+    A law with a proof of its own may also fit `LyapunovLaw`; then `certify` checks what it states.
+
     A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it works ("k1", "K2" if it says nothing),
     which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `needs_velocity_bounds = True` if it cannot do
     without `Setting.velocity_bounds`; `includes_e2 = True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2;
@@ -91,5 +93,43 @@ class Controller(Protocol):
           f_hat: the observer's estimate of the uncertain term, (n,) [N m].
           setting: model, reference and bounds.
           state: the law's own state.
+        """
+        ...
+
+
+class LyapunovLaw(Protocol):
+    """What a law that states a claim of its own has besides: a Lyapunov function V and its decay W, for `certify` to check.
+
+        V' <= -W + T
+
+    `certify` differentiates V along the vector field of the loop and holds the inequality against every step of a run.  T is what
+    `disturbance_terms` returns.  A law without that method is given what the uncertain term adds to V' whatever the law is,
+    T = dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
+    """
+
+    def lyapunov(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, setting: Setting, state: State) -> jax.Array:
+        """V >= 0, () or (n,).
+
+        Args:
+          t: time, () [s].
+          q, dq: position [rad] and velocity [rad/s], (n,).
+          f_tilde: error of the observer's estimate, f - f_hat, (n,) [N m]; f itself for a law with `uses_observer = False`.
+          setting: model, reference and bounds.
+          state: the law's own state.
+        """
+        ...
+
+    def decay(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, setting: Setting, state: State) -> jax.Array:
+        """W >= 0, () or (n,), in the unit of V a second: how fast V decreases where f_tilde = 0.  Arguments as `lyapunov`."""
+        ...
+
+    def disturbance_terms(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, df: jax.Array, setting: Setting, state: State
+    ) -> jax.Array:
+        """T, () or (n,), in the unit of V a second: what f_tilde and f' may add to V'.  A law may leave this method out.
+
+        Args:
+          t, q, dq, f_tilde, setting, state: as `lyapunov`.
+          df: rate of the uncertain term, f', (n,) [N m/s].
         """
         ...

@@ -19,15 +19,16 @@ LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "non
 
 
 @_style.styled()
-def certificate(shown: Certificate, *, title: str = "Theorem 2 along the run", until: float | None = None) -> Figure:
+def certificate(shown: Certificate, *, title: str | None = None, until: float | None = None) -> Figure:
     """What `Certificate.plot` shows, the verdict in the title.
 
     V2 with its envelope (3.20) or (3.28); the left side of the differential inequality (3.18) or (3.26), which must stay below zero,
     and the dropped terms of the printed proof; xi, |e2| and |f_tilde| with their bounds.  Samples without a claim are left out.
+    Of a law with a claim of its own, V and the left side are those of that claim.
 
     Args:
       shown: the certificate; over many runs, its worst run is drawn.
-      title: the first line of the title.
+      title: the first line of the title; what the certificate is about if not given.
       until: draw up to this time only [s].
 
     Returns:
@@ -39,9 +40,11 @@ def certificate(shown: Certificate, *, title: str = "Theorem 2 along the run", u
     if not isinstance(shown, Certificate):
         raise checks.fail("shown", type(shown).__name__, "a Certificate", "Draw what ij.certify returned.")
     traces = _until(shown.traces, until)
+    subject, symbol = ("The law's own claim", "$V$") if shown.is_of_own_claim else ("Theorem 2", "$V_2$")
+    title = f"{subject} along the run" if title is None else title
     figure = _style.new_figure(WIDTH, HEIGHT)
     panels = figure.subplots(2, 3)
-    _against_bound(panels[0, 0], traces.t, {"$V_2$": traces.V}, traces.envelope, "Lyapunov function $V_2$", "1")
+    _against_bound(panels[0, 0], traces.t, {symbol: traces.V}, traces.envelope, f"Lyapunov function {symbol}", "1")
     _inequality(panels[0, 1], traces)
     _relative_error(panels[0, 2], traces, shown.joints)
     _against_bound(panels[1, 0], traces.t, {"$|e_2|$": traces.e2}, traces.e2_bound, "velocity error $|e_2|$", "rad/s")
@@ -140,7 +143,7 @@ def _mark_held(panels: Any, traces: Traces) -> None:
 def _verdicts(axes: Axes, shown: Certificate) -> None:
     """The lines that were checked along the run, with their verdicts."""
     axes.set_axis_off()
-    named = ("K2", "kf", "inequality", "envelope", "xi", "e2", "f_tilde", "joints")
+    named = ("K2", "kf", "own", "inequality", "envelope", "xi", "e2", "f_tilde", "joints")
     growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]
     lines = [line for line in shown.lines if line.name.startswith(named) and line.verdict != "not applicable" and line.counts]
     for row, line in enumerate(lines):

@@ -2,6 +2,7 @@
 
 from iblf_jax.sensors._base import Measurement as Measurement
 from iblf_jax.sensors._base import Sensor as Sensor
+from iblf_jax.sensors._base import State as State
 from iblf_jax.sensors._base import Velocity as Velocity
 from iblf_jax.sensors.encoder import Encoder as Encoder
 from iblf_jax.sensors.filtered_difference import FilteredDifference as FilteredDifference
@@ -23,6 +24,7 @@ __all__ = [
     "Measured",
     "Measurement",
     "Sensor",
+    "State",
     "Tracking",
     "Velocity",
 ]

@@ -19,7 +19,8 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
 from iblf_jax.simulation.accuracy import UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
-from iblf_jax.simulation.signals import Sample, speed_margin
+from iblf_jax.simulation.signals import Sample as Sample
+from iblf_jax.simulation.signals import speed_margin
 
 
 class Fold(Protocol):

@@ -16,8 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.presets import zhang_yan_2024
-from iblf_jax.simulation.scenario import Scenario
 
 STEP = 1e-6
 """Relative step of the central differences; with float64 they are good to about 1e-9."""
@@ -263,21 +261,6 @@ def _float32(findings, outputs, values, point) -> None:
                 scale = max(1.0, float(np.max(np.abs(values[name]), initial=0)))
                 off = float(np.max(np.abs(np.asarray(value, float) - np.asarray(values[name])), initial=0))
                 findings.require(off <= 5e-3 * scale, f"{name} in float32 is off by {off:.2g}")
-
-
-def scenario_or_the_papers(scenario: Any) -> Scenario:
-    """The scenario to try a member in: the paper's simulation if none is given; ValueError for what is no scenario."""
-    if scenario is None:
-        return zhang_yan_2024()
-    if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", "Such as iblf_jax.presets.zhang_yan_2024().")
-    return scenario
-
-
-def joints_of(member: Any, default: int = 2) -> int:
-    """The number of joints that a member's leaves speak of, or the default if they are scalars."""
-    sizes = {np.shape(x)[0] for x in jax.tree.leaves(member) if np.ndim(x) == 1}
-    return sizes.pop() if len(sizes) == 1 else default
 
 
 def find_jump(function: Callable, start: float, end: float, known: Sequence[float] = ()) -> float | None:

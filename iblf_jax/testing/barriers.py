@@ -12,8 +12,8 @@ import numpy as np
 from iblf_jax.barriers import Barrier
 from iblf_jax.barriers._base import CLAIMS
 from iblf_jax.bounds import Tube
-from iblf_jax.presets import zhang_yan_2024
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
+from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints, scenario_of
 
 XI = (-40.0, -3.0, -1.0 - 1e-9, -1.0, -1.0 + 1e-9, -0.9, -0.3, -1e-9, 0.0, 1e-9, 0.3, 0.9, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 3.0, 40.0)
 """Where every barrier is looked at, in xi: far outside, on and about the wall, inside, on and about zero."""
@@ -21,7 +21,7 @@ XI = (-40.0, -3.0, -1.0 - 1e-9, -1.0, -1.0 + 1e-9, -0.9, -0.3, -1e-9, 0.0, 1e-9,
 TIMES = (0.0, 1.0, 2.5, 4.0)
 
 
-def check_barrier(barrier: Any) -> None:
+def check_barrier(barrier: Any, *, n: int | None = None) -> None:
     """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays along alpha.
 
         V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the wall,
@@ -29,25 +29,30 @@ def check_barrier(barrier: Any) -> None:
 
     Args:
       barrier: an instance.
+      n: number of joints; found from its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
+      ValueError: no number of joints, or one that its leaves do not have.
     """
+    check_number(n)
     with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
         guard, uses_o = barrier.guard, barrier.uses_o
         remedy = "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
         findings.require(isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf), f"guard is {guard!r}", remedy)
         findings.require(isinstance(uses_o, bool), f"uses_o is {uses_o!r}", "It must be a bool of the class, uses_o: ClassVar[bool]")
         findings.stop_if_any()
-        barrier = in_dtype(barrier, "float64")
-        setting = in_dtype(zhang_yan_2024(), "float64").setting
-        k1, o = jnp.asarray([2.0, 3.0]), jnp.asarray([0.1, 0.2]) if uses_o else None
+        n = number_of_joints(findings, barrier, n)
+        barrier = fitted_to(in_dtype(barrier, "float64"), n, "barrier")
+        setting = in_dtype(scenario_of(n), "float64").setting
+        k1 = _joint_by_joint(n, 2.0, 3.0)
+        o = _joint_by_joint(n, 0.1, 0.2) if uses_o else None
         tube = setting.tube(jnp.asarray(1.0))
-        q = tube.q_d + jnp.asarray([0.2, -0.15])
+        q = tube.q_d + _joint_by_joint(n, 0.2, -0.15)
         calls: dict[str, tuple] = {"value(tube, q)": (barrier.value, (tube, q)), "slope(tube, q)": (barrier.slope, (tube, q))}
         calls["virtual_velocity(tube, q, k1, o)"] = (barrier.virtual_velocity, (tube, q, k1, o))
         for label, (call, args) in calls.items():
-            has_shape(findings, label, shape_of(findings, label, call, *args), (2,))
+            has_shape(findings, label, shape_of(findings, label, call, *args), (n,))
         findings.stop_if_any()
 
         def outputs(barrier, tube, q, k1, o):
@@ -61,6 +66,11 @@ def check_barrier(barrier: Any) -> None:
             numbers = _numbers(barrier, setting, jnp.asarray(t), k1, o, jnp.asarray(XI))
             _at_every_xi(findings, numbers, guard)
             _claims(findings, barrier, tube, k1, numbers, guard)
+
+
+def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
+    """Two numbers in turn, (n,)."""
+    return jnp.asarray(np.resize([first, second], n))
 
 
 @jax.jit
@@ -129,7 +139,7 @@ def _claims(findings: Findings, barrier: Any, tube: Tube, k1: jax.Array, numbers
     inside = np.abs(xi) < min(1 - 2 * guard, 1.0)
     rate = getattr(barrier, "decay_rate", lambda k1: None)(k1)
     if rate is not None:
-        has_shape(findings, "decay_rate(k1)", rate, (2,))
+        has_shape(findings, "decay_rate(k1)", rate, k1.shape)
         excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
         findings.require(excess <= 1e-9, f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha", "Claim a smaller rate, or None")
     ratio = getattr(barrier, "error_over_slope", lambda tube, q: None)

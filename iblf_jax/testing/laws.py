@@ -16,7 +16,9 @@ from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, scenario_or_the_papers, shape_of
+from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing.joints import check_scenario, scenario_for
+from iblf_jax.testing.own_claims import check_claims
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
 """Where the law is asked for a torque, in xi: a run may get anywhere, and must stay finite there."""
@@ -27,20 +29,21 @@ SPEED = 2.0
 """rad/s.  Bounds of the velocities for a law that needs some."""
 
 
-def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
+def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = None) -> None:
     """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite at the wall, a short closed loop.
 
     Args:
       law: an instance.
-      scenario: the surroundings to try it in; the paper's simulation if not given.
+      scenario: to try it in; if not given the paper's simulation, or one like it for as many joints as the law is for.
+      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: surroundings that are no scenario.
+      ValueError: a scenario that is none, or has another number of joints than `n`.
     """
-    scenario = scenario_or_the_papers(scenario)
+    check_scenario(scenario, n)
     with examine(law, "Controller", Controller) as findings:
-        base = in_dtype(scenario, "float64")
+        base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
         watched = base.velocity_bounds
         if watched is None and getattr(unwrapped(law), "needs_velocity_bounds", False):
             watched = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
@@ -63,6 +66,7 @@ def check_law(law: Any, *, scenario: Scenario | None = None) -> None:
             return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1, **named}
 
         probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.setting))
+        check_claims(findings, base)
         _at_the_wall(findings, base)
         findings.stop_if_any()
         _closed_loop(findings, in_dtype(base, "float32"))

@@ -13,32 +13,37 @@ from iblf_jax.engine.step import folded
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
 
 LENGTH, REGIONS = 40, 1
 
 
-def check_fold(fold: Any) -> None:
+def check_fold(fold: Any, *, n: int | None = None) -> None:
     """Checks a metric: the accumulator's structure, names and units, derivatives, float32, no NaN.
 
     Args:
       fold: an instance.
+      n: number of joints; found from its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
+      ValueError: no number of joints, or one that its leaves do not have.
     """
+    check_number(n)
     with examine(fold, "Fold", Fold) as findings:
         units = fold.units
         ok = hasattr(units, "items") and all(isinstance(x, str) for pair in units.items() for x in pair)
         findings.require(ok, f"units is {units!r}", 'It must be a dict from name to SI unit, {"rmse": "rad"}')
-        fold = in_dtype(fold, "float64")
+        n = number_of_joints(findings, fold, n)
+        fold = fitted_to(in_dtype(fold, "float64"), n, "metric")
         for dtype in ("float64", "float32"):
-            _structure(findings, *in_dtype((fold, samples(np.random.default_rng(4))), dtype))
+            _structure(findings, *in_dtype((fold, samples(np.random.default_rng(4), n)), dtype))
         findings.stop_if_any()
 
         def outputs(fold, moving, flags):
             return folded((fold,), samples_from(moving, flags))
 
-        some = samples(np.random.default_rng(4))
+        some = samples(np.random.default_rng(4), n)
         moving, flags = parts(some)
         result = jax.jit(folded)((fold,), some)
         for name, value in result.items():

@@ -19,12 +19,11 @@ from iblf_jax.testing._contract import (
     examine,
     has_shape,
     in_dtype,
-    joints_of,
     probe,
     same_structure,
-    scenario_or_the_papers,
     shape_of,
 )
+from iblf_jax.testing.joints import check_scenario, joints_of, scenario_for
 from iblf_jax.testing.metrics import LENGTH, at_rest, parts, samples, samples_from
 from iblf_jax.tuning.objectives import Objective, Requirement, complete
 from iblf_jax.tuning.quantities import Quantities, Quantity
@@ -33,21 +32,23 @@ DIRECTIONS = 3
 """Directions in which second derivatives are looked at."""
 
 
-def check_objective(objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0) -> None:
+def check_objective(objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0, n: int | None = None) -> None:
     """Checks what gains are to be tuned for: accumulators, derivatives, float32, no NaN, and a short run that gives it its scales.
 
         g = d(smooth value) / d(samples) by both modes and by finite differences,   N = N^T,   value at the start finite and not 0
 
     Args:
       objective: an objective as you composed it, a requirement, or a quantity of your own that they are made of.
-      scenario: what it is tried on; the paper's simulation if not given.
+      scenario: what it is tried on; if not given the paper's simulation, or one like it for as many joints as its leaves have.
       duration: of the run [s], as `tune` will have it.
+      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: what it is tried on is no scenario, or not for a time.
+      ValueError: what it is tried on is no scenario, has another number of joints than `n`, or is not for a time.
     """
-    scenario, duration = scenario_or_the_papers(scenario), checks.positive_number("duration", duration, "s")
+    check_scenario(scenario, n)
+    duration = checks.positive_number("duration", duration, "s")
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
     elif not isinstance(objective, Objective):
@@ -56,16 +57,16 @@ def check_objective(objective: Any, *, scenario: Scenario | None = None, duratio
             objective = Objective((), (Requirement(objective, limit, limit),))
     for quantity in objective.quantities:
         with examine(quantity, "Quantity", Quantity) as findings:
-            _quantity(findings, in_dtype(quantity, "float64"), duration)
+            _quantity(findings, in_dtype(quantity, "float64"), duration, joints_of(quantity))
     with examine(objective, "Objective", Objective) as findings:
         findings.require(objective.quantities, "it has neither terms nor requirements", "Such as ij.objectives.tracking()")
         findings.stop_if_any()
-        _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
+        _on_a_run(findings, in_dtype(objective, "float64"), scenario_for(findings, objective, scenario, n), duration)
 
 
-def _quantity(findings: Findings, quantity: Any, duration: float) -> None:
+def _quantity(findings: Findings, quantity: Any, duration: float, joints: int) -> None:
     step = duration / LENGTH
-    some = samples(np.random.default_rng(4), joints_of(quantity), step)
+    some = samples(np.random.default_rng(4), joints, step)
     # Between whole steps, so that no sample stands where a quantity begins to count.
     some = dataclasses.replace(some, t=some.t + 0.5 * step)
     for dtype in ("float64", "float32"):

@@ -10,29 +10,34 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.observers import Observer
-from iblf_jax.presets import customary_two_link
 from iblf_jax.robots import Robot
-from iblf_jax.simulation.scenario import fit_joints
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing.joints import arm_of, check_number, fitted_to, number_of_joints
 
 
-def check_observer(observer: Any, *, model: Any = None) -> None:
+def check_observer(observer: Any, *, model: Any = None, n: int | None = None) -> None:
     """Checks an observer: shapes, the state's structure, derivatives, float32, and a hundred steps of a scan.
 
     Args:
       observer: an instance.
-      model: the robot that it knows; the customary two-link arm if not given.
+      model: the robot that it knows; an arm of n joints if not given.
+      n: number of joints, if no model is given; found from its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: a model that is no robot.
+      ValueError: a model that is no robot, or has another number of joints than `n` or the leaves.
     """
+    check_number(n)
     if model is not None:
         checks.conforms("model", model, Robot)
     with examine(observer, "Observer", Observer) as findings:
-        model = in_dtype(customary_two_link() if model is None else model, "float64")
+        if model is None:
+            model = arm_of(number_of_joints(findings, observer, n))
+        if n not in (None, model.n):
+            raise checks.fail("n", n, f"{model.n}, the joints of the model", "Leave one of the two out.")
+        model = in_dtype(model, "float64")
         n, t = model.n, jnp.asarray(0.7)
-        fitted = fit_joints(in_dtype(observer, "float64"), n, "observer")
+        fitted = fitted_to(in_dtype(observer, "float64"), n, "observer")
         q, dq, tau = jnp.asarray(np.random.default_rng(3).uniform(-1, 1, (3, n)))
         for dtype in ("float64", "float32"):
             _structure(findings, *in_dtype((fitted, t, q, dq, tau, model), dtype))

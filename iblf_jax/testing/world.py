@@ -11,12 +11,11 @@ import numpy as np
 from iblf_jax.bounds import Side
 from iblf_jax.core import checks
 from iblf_jax.disturbances import Disturbance
-from iblf_jax.presets import customary_two_link
 from iblf_jax.references import Reference
 from iblf_jax.regions import Region
 from iblf_jax.robots import Robot
-from iblf_jax.simulation.scenario import fit_joints
-from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, joints_of, probe, shape_of
+from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, probe, shape_of
+from iblf_jax.testing.joints import arm_of, check_number, fitted_to, joints_of, number_of_joints
 
 
 def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -31,8 +30,8 @@ def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
 
 def _surroundings(n: int | None, duration: float) -> tuple[int | None, float]:
     """Number of joints, if given, and duration of a checker's arguments; ValueError where they are none."""
-    joints = None if n is None else checks.positive_integer("n", n, most=checks.MOST_JOINTS)
-    return joints, checks.positive_number("duration", duration, "s")
+    check_number(n)
+    return n, checks.positive_number("duration", duration, "s")
 
 
 def _smooth_in_time(findings: Findings, label: str, function: Any, duration: float) -> None:
@@ -65,7 +64,7 @@ def check_reference(reference: Any, *, n: int | None = None, duration: float = 2
     n, duration = _surroundings(n, duration)
     with examine(reference, "Reference", Reference) as findings:
         t = jnp.asarray(0.3217 * duration)
-        fitted = fit_joints(in_dtype(reference, "float64"), joints_of(reference) if n is None else n, "reference")
+        fitted = fitted_to(in_dtype(reference, "float64"), number_of_joints(findings, reference, n), "reference")
         got = shape_of(findings, "position(t)", fitted.position, t)
         expected = got.shape if n is None and got is not None and len(got.shape) == 1 else (n or joints_of(reference),)
         has_shape(findings, "position(t)", got, expected)
@@ -93,9 +92,9 @@ def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> No
     """
     n, duration = _surroundings(n, duration)
     with examine(side, "Side", Side) as findings:
-        n = joints_of(side) if n is None else n
+        n = number_of_joints(findings, side, n)
         t = jnp.asarray(0.3217 * duration)
-        fitted = fit_joints(in_dtype(side, "float64"), n, "side")
+        fitted = fitted_to(in_dtype(side, "float64"), n, "side")
         q_d = jnp.linspace(0.3, 0.7, n)
         has_shape(findings, "at(t, q_d)", shape_of(findings, "at(t, q_d)", fitted.at, t, q_d), (n,))
         findings.stop_if_any()
@@ -166,28 +165,33 @@ def _takes(region: Any, dimensions: int) -> bool:
         return False
 
 
-def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None, duration: float = 20.0) -> None:
+def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None, duration: float = 20.0, n: int | None = None) -> None:
     """Checks a disturbance: shapes, derivatives, float32, and that every jump is declared in `jump_times`.
 
     Args:
       disturbance: an instance.
-      plant: robot that it acts on; the customary two-link arm if not given.
+      plant: robot that it acts on; an arm of n joints if not given.
       model: what the law knows of it; the plant if not given.
       duration: stretch of time to look at [s].
+      n: number of joints, if no plant is given; found from its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: an argument beside the disturbance that is none.
+      ValueError: an argument beside the disturbance that is none, or a plant with another number of joints than `n`.
     """
-    _, duration = _surroundings(None, duration)
+    n, duration = _surroundings(n, duration)
     for name, robot in (("plant", plant), ("model", model)):
         if robot is not None:
             checks.conforms(name, robot, Robot)
     with examine(disturbance, "Disturbance", Disturbance) as findings:
-        plant = in_dtype(customary_two_link() if plant is None else plant, "float64")
+        if plant is None:
+            plant = model if model is not None else arm_of(number_of_joints(findings, disturbance, n))
+        if n not in (None, plant.n):
+            raise checks.fail("n", n, f"{plant.n}, the joints of the plant", "Leave one of the two out.")
+        plant = in_dtype(plant, "float64")
         model = plant if model is None else in_dtype(model, "float64")
         n, t = plant.n, jnp.asarray(0.3217 * duration)
-        fitted = fit_joints(in_dtype(disturbance, "float64"), n, "disturbance")
+        fitted = fitted_to(in_dtype(disturbance, "float64"), n, "disturbance")
         rng = np.random.default_rng(2)
         q, dq = jnp.asarray(rng.uniform(-1, 1, (2, n)))
         label = "torque(t, q, dq, plant, model)"

@@ -26,9 +26,11 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.engine.derivatives import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, Quantity, TimeIntegral
+from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, TimeIntegral
+from iblf_jax.tuning.quantities import Quantity as Quantity
 
 
 @component

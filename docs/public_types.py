@@ -1,0 +1,97 @@
+"""Pages of the types that a class of a user's own returns or is given: protocols, records and type aliases.
+
+A protocol is shown with its methods, a record with its fields; the text of a field is the string
+that follows it in the source, which `inspect` does not know.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Callable
+from types import FunctionType, ModuleType
+from typing import Any
+
+from iblf_jax.core import pytree
+from iblf_jax.simulation.signals import SIGNALS, Sample
+
+ALIASES = {"Leaf": pytree}
+"""Type alias at the top of the package -> the module that documents it."""
+
+
+def is_protocol(thing: Any) -> bool:
+    """Whether something is a protocol, the contract of a family."""
+    return inspect.isclass(thing) and getattr(thing, "_is_protocol", False)
+
+
+def is_record(thing: Any) -> bool:
+    """Whether something is a NamedTuple of arrays, or the sample that metrics see."""
+    return inspect.isclass(thing) and (hasattr(thing, "_fields") or thing is Sample)
+
+
+def types_of(module: ModuleType) -> dict[str, Any]:
+    """The public protocols and records of a family, protocols first."""
+    things = {name: thing for name, thing in vars(module).items() if _belongs_to(thing, name, module)}
+    protocols = {name: thing for name, thing in things.items() if is_protocol(thing)}
+    records = {name: thing for name, thing in things.items() if is_record(thing)}
+    return protocols | records
+
+
+def _belongs_to(thing: Any, name: str, module: ModuleType) -> bool:
+    """Whether a name of a family's module is one of its own: listed, defined there, or what its members see."""
+    listed = getattr(module, "__all__", None)
+    if listed is not None:
+        return name in listed
+    return getattr(thing, "__module__", None) == module.__name__ or thing is Sample
+
+
+def texts_of_fields(body: list[ast.stmt]) -> dict[str, str]:
+    """Name of every assignment in a body -> the string that follows it, "" if none does."""
+    texts = {}
+    for statement, after in zip(body, [*body[1:], None], strict=True):
+        target = getattr(statement, "target", None) or next(iter(getattr(statement, "targets", [])), None)
+        if not isinstance(target, ast.Name):
+            continue
+        follows = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        texts[target.id] = inspect.cleandoc(str(after.value.value)) if follows else ""
+    return texts
+
+
+def alias_text(module: ModuleType, name: str) -> str:
+    """What the source says of a type alias."""
+    return texts_of_fields(ast.parse(inspect.getsource(module)).body).get(name, "")
+
+
+def fields_of(record: type) -> dict[str, str]:
+    """Name of every field of a record -> what it is."""
+    texts = {name: f"{signal.meaning} [{signal.unit}]" for name, signal in SIGNALS.items()} if record is Sample else {}
+    definition = ast.parse(textwrap.dedent(inspect.getsource(record))).body[0]
+    assert isinstance(definition, ast.ClassDef)
+    return texts | texts_of_fields(definition.body)
+
+
+def page(thing: Any, name: str, level: int, body: Callable[[str], str]) -> str:
+    """A protocol or a record in Markdown; `body` writes a docstring."""
+    lines = [f"{'#' * level} {name}", "", body(inspect.getdoc(thing) or ""), ""]
+    if is_record(thing):
+        for field, text in fields_of(thing).items():
+            lines.append(f"- **{field}**: {' '.join(text.split())}" if text else f"- **{field}**")
+        lines.append("")
+    for member, value in vars(thing).items():
+        if member.startswith("_") or not isinstance(value, FunctionType | property):
+            continue
+        lines += [f"{'#' * (level + 1)} {name}.{member}", ""]
+        if isinstance(value, FunctionType):
+            lines += ["```python", f"{member}({', '.join(list(inspect.signature(value).parameters)[1:])})", "```", ""]
+        lines += [body(inspect.getdoc(value) or ""), ""]
+    for attribute, text in ({} if is_record(thing) else _attributes(thing)).items():
+        lines += [f"- **{attribute}**: {' '.join(text.split())}", ""]
+    return "\n".join(lines)
+
+
+def _attributes(protocol: type) -> dict[str, str]:
+    """Annotated attributes of a protocol -> what they are."""
+    definition = ast.parse(textwrap.dedent(inspect.getsource(protocol))).body[0]
+    assert isinstance(definition, ast.ClassDef)
+    return texts_of_fields(definition.body)

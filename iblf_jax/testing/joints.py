@@ -1,0 +1,140 @@
+"""How many joints a member is for, and arms and scenarios of that many joints to check it in."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from iblf_jax.bounds import Bounds, Sinusoid
+from iblf_jax.controllers import Backstepping
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.disturbances import Sinusoids
+from iblf_jax.observers import Printed
+from iblf_jax.presets import customary_two_link, zhang_yan_2024
+from iblf_jax.references import Sinusoid as SinusoidalReference
+from iblf_jax.robots import PlanarChain
+from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
+from iblf_jax.testing._contract import Findings
+
+T = TypeVar("T")
+
+USUAL = 2
+"""Joints of a member whose leaves are all scalars."""
+
+
+def joints_of(member: Any, default: int = USUAL) -> int:
+    """The number of joints of a member's leaves; the default if they are scalars or disagree."""
+    sizes = _sizes(member)
+    return sizes.pop() if len(sizes) == 1 else default
+
+
+def _sizes(member: Any) -> set[int]:
+    """Lengths of the leaves declared as one number a joint, or of all vectors if none is."""
+    declared = set(_declared_sizes(member))
+    if declared:
+        return declared
+    return {np.shape(leaf)[0] for leaf in _undeclared(member) if np.ndim(leaf) == 1}
+
+
+def _declared_sizes(member: Any) -> Iterator[int]:
+    if isinstance(member, tuple):
+        for part in member:
+            yield from _declared_sizes(part)
+    if not dataclasses.is_dataclass(member) or isinstance(member, type):
+        return
+    for field in dataclasses.fields(member):
+        value = getattr(member, field.name)
+        if not is_leaf_field(field):
+            yield from _declared_sizes(value)
+        elif field.metadata["shape"] == "joint" and np.ndim(value) == 1:
+            yield np.shape(value)[0]
+
+
+def _undeclared(member: Any) -> list[Any]:
+    """Leaves that no field declares: those of a class that was registered by hand."""
+    if dataclasses.is_dataclass(member) and any(map(is_leaf_field, dataclasses.fields(member))):
+        return []
+    return jax.tree.leaves(member)
+
+
+def check_number(n: int | None) -> None:
+    """Raises ValueError for what is neither None nor a number of joints."""
+    if n is not None:
+        checks.positive_integer("n", n, most=checks.MOST_JOINTS)
+
+
+def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:
+    """The number of joints to check for: `n`, or that of the leaves."""
+    if n is not None:
+        return n
+    sizes = sorted(set(_declared_sizes(member)))
+    if len(sizes) > 1:
+        listed = " and ".join(map(str, sizes))
+        remedy = "Give each one number, or all of them one number a joint"
+        findings.add(f"its leaves are for {listed} joints", remedy)
+        findings.stop_if_any()
+    return joints_of(member)
+
+
+def fitted_to(member: T, n: int, family: str) -> T:
+    """The member with its scalars repeated for n joints; ValueError where a leaf has others."""
+    return fit_joints(member, n, family)
+
+
+def arm_of(n: int) -> Any:
+    """An arm of n joints: the customary two-link arm, or a planar chain like it."""
+    if n == USUAL:
+        return customary_two_link()
+    shrink = 0.8 ** np.arange(n)
+    mass, length = 2.0 * shrink, 0.35 * shrink
+    return PlanarChain(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
+
+
+def scenario_of(n: int) -> Scenario:
+    """A scenario of n joints: the paper's, or one with its reference, bounds and gains."""
+    if n == USUAL:
+        return zhang_yan_2024()
+    quarter = np.pi / 2
+    phases = np.resize([0.0, quarter], n)
+    return Scenario(
+        plant=arm_of(n),
+        reference=SinusoidalReference(offset=0.5, amplitude=0.14, frequency=1.0, phase=phases),
+        bounds=Bounds(
+            lower=Sinusoid(offset=0.2, amplitude=0.14, frequency=1.0, phase=quarter - phases),
+            upper=Sinusoid(offset=0.9, amplitude=0.14, frequency=1.0, phase=quarter - phases),
+        ),
+        disturbance=Sinusoids(amplitude=0.01, frequency=1.0, phase=phases),
+        controller=Backstepping(k1=2.0, K2=20.0, o=0.1),
+        observer=Printed(kf=20.0),
+        initial=Initial(q=0.8, dq=0.0),
+    )
+
+
+def check_scenario(scenario: Any, n: int | None) -> None:
+    """Raises ValueError for no scenario (None is allowed), or for an `n` that it does not have."""
+    check_number(n)
+    if scenario is None:
+        return
+    if not isinstance(scenario, Scenario):
+        remedy = "Such as iblf_jax.presets.zhang_yan_2024()."
+        raise checks.fail("scenario", scenario, "a Scenario", remedy)
+    if n not in (None, scenario.n):
+        expected = f"{scenario.n}, the joints of the scenario"
+        raise checks.fail("n", n, expected, "Leave one of the two out.")
+
+
+def scenario_for(
+    findings: Findings,
+    member: Any,
+    scenario: Scenario | None,
+    n: int | None,
+) -> Scenario:
+    """The scenario to check a member in: the one given, or one of the member's number of joints."""
+    if scenario is not None:
+        return scenario
+    return scenario_of(number_of_joints(findings, member, n))

@@ -1,0 +1,96 @@
+"""The checks of what a law states of itself: the contract is `iblf_jax.controllers.LyapunovLaw`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.certificates.own_law import REQUIRED
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.testing._contract import Findings, in_dtype, probe, shape_of
+
+STATES = 16
+"""States at which V and W have to be nonnegative."""
+SPREAD = 0.3
+"""rad and rad/s.  How far these states are from the reference."""
+
+
+def check_claims(findings: Findings, scenario: Scenario) -> None:
+    """Checks V, W and T of a law that states a claim: shapes, types, derivatives, V, W >= 0.
+
+    The last is checked where the estimate is exact, f_tilde = 0.
+    """
+    law: Any = scenario.controller
+    stated = [name for name in REQUIRED if hasattr(law, name)]
+    if not stated:
+        return
+    remedy = "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
+    for name in REQUIRED:
+        findings.require(name in stated, f"it has {stated[0]} and no {name}", remedy)
+    findings.stop_if_any()
+    for dtype in ("float64", "float32"):
+        _shapes(findings, in_dtype(scenario, dtype))
+    findings.stop_if_any()
+    t, q, dq, f_tilde = _near_the_reference(scenario, np.random.default_rng(5))
+    setting = scenario.setting
+
+    def outputs(law, t, q, dq, f_tilde, setting):
+        own = law.init(q, dq, setting)
+        return {name: getattr(law, name)(t, q, dq, f_tilde, setting, own) for name in REQUIRED}
+
+    probe(findings, outputs, law, (t, q[0], dq[0], f_tilde, setting))
+
+    @jax.jit
+    def sums(q, dq):
+        found = outputs(law, t, q, dq, jnp.zeros_like(q), setting)
+        return jax.tree.map(jnp.sum, found)
+
+    for name, values in jax.vmap(sums)(q, dq).items():
+        lowest = float(jnp.min(values))
+        remedy = "V and W are nonnegative, or the inequality V' <= -W + T says nothing"
+        findings.require(lowest >= 0, f"{name} is {lowest:.3g} somewhere where f_tilde = 0", remedy)
+
+
+def _near_the_reference(
+    scenario: Scenario,
+    rng: np.random.Generator,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """A time, and states and an error of the estimate there: (), (STATES, n), (STATES, n), (n,)."""
+    t = jnp.asarray(0.7)
+    tube = scenario.setting.tube(t)
+    q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
+    width = jnp.minimum(tube.k_l, tube.k_u)
+    inside = tube.q_d + jnp.clip(q, -0.9 * width, 0.9 * width)
+    return t, inside, tube.dq_d + dq, jnp.linspace(0.1, 0.2, scenario.n)
+
+
+def _shapes(findings: Findings, scenario: Scenario) -> None:
+    law: Any = scenario.controller
+    setting, q, dq = scenario.setting, scenario.initial.q, scenario.initial.dq
+    t, zero = jnp.zeros((), q.dtype), jnp.zeros_like(q)
+    own = law.init(q, dq, setting)
+    arguments = (t, q, dq, zero, setting, own)
+    calls: dict[str, tuple[Any, tuple]] = {}
+    for name in REQUIRED:
+        calls[f"{name}(t, q, dq, f_tilde, setting, state)"] = (getattr(law, name), arguments)
+    if hasattr(law, "disturbance_terms"):
+        label = "disturbance_terms(t, q, dq, f_tilde, df, setting, state)"
+        calls[label] = (law.disturbance_terms, (t, q, dq, zero, zero, setting, own))
+    for label, (call, args) in calls.items():
+        got = shape_of(findings, label, call, *args)
+        if got is not None:
+            _is_summable(findings, label, got, q)
+
+
+def _is_summable(findings: Findings, label: str, got: Any, like: jax.Array) -> None:
+    """A finding unless a method gives one number, or one a joint, of the arguments' type."""
+    fits = hasattr(got, "shape") and got.shape in ((), like.shape)
+    remedy = f"It must be an array of shape () or {like.shape}, which is summed"
+    if not findings.require(fits, f"{label} gives {got}", remedy):
+        return
+    remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
+    same = got.dtype == like.dtype
+    findings.require(same, f"{label} gives {got.dtype} for {like.dtype} arguments", remedy)

@@ -1,0 +1,109 @@
+"""pyproject.toml, constraints.txt and the workflows name the same Pythons, and declare what the package imports."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import re
+import sys
+import tomllib
+
+import pytest
+from conftest import ROOT
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+REQUIRED = [Requirement(text) for text in PROJECT["dependencies"]]
+OPTIONAL = [Requirement(text) for extra in PROJECT["optional-dependencies"].values() for text in extra]
+PINS = {
+    canonicalize_name(name): version
+    for name, version in re.findall(r"^([\w.-]+)==([\w.]+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+}
+CLASSIFIED = [
+    tuple(map(int, match[1].split(".")))
+    for text in PROJECT["classifiers"]
+    if (match := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", text))
+]
+"""The Pythons of the classifiers, as (3, minor)."""
+DISTRIBUTION = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "tomli_w": "tomli-w"}
+"""Name of an import -> its distribution, where they differ."""
+COMES_WITH = {"jaxlib": "jax", "pandas": "xarray", "pillow": "matplotlib"}
+"""What the package imports without a declaration of its own -> the dependency that always brings it."""
+
+
+def imported(source: str) -> set[str]:
+    """Top-level names of what a file imports from outside the standard library, inside functions too."""
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            names.add(str(node.module))
+    return {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"iblf_jax"}
+
+
+def names_of(requirements: list[Requirement]) -> set[str]:
+    return {canonicalize_name(requirement.name) for requirement in requirements}
+
+
+def test_the_classifiers_are_the_pythons_that_are_required():
+    oldest = min(CLASSIFIED)
+    assert PROJECT["requires-python"] == f">={oldest[0]}.{oldest[1]}"
+    assert [(3, minor) for minor in range(oldest[1], max(CLASSIFIED)[1] + 1)] == CLASSIFIED, "none is left out"
+    assert sys.version_info[:2] >= oldest
+
+
+def test_the_documentation_names_the_oldest_python():
+    oldest = ".".join(map(str, min(CLASSIFIED)))
+    for page in ("README.md", "docs/guide.md", "docs/start.md"):
+        assert f"Python {oldest} or newer" in (ROOT / page).read_text(encoding="utf-8"), page
+
+
+def test_workflows_use_a_python_of_the_classifiers():
+    files = [*(ROOT / ".github").rglob("*.yml"), ROOT / ".readthedocs.yaml"]
+    used = [version for path in files for version in re.findall(r'python(?:-version)?: "(3\.\d+)"', path.read_text())]
+    assert used
+    assert {tuple(map(int, version.split("."))) for version in used} <= set(CLASSIFIED)
+
+
+def test_every_import_is_declared():
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "iblf_jax").rglob("*.py")]
+    distributions = {DISTRIBUTION.get(name, name) for source in sources for name in imported(source)}
+    declared = names_of(REQUIRED) | names_of(OPTIONAL)
+    undeclared = {canonicalize_name(name) for name in distributions} - declared - set(COMES_WITH)
+    assert not undeclared, f"declare {undeclared} in pyproject.toml"
+    for name, parent in COMES_WITH.items():
+        assert name in names_of(list(map(Requirement, importlib.metadata.requires(parent) or []))), (name, parent)
+
+
+@pytest.mark.parametrize("name", ["numpy", "scipy", "jax"])
+def test_what_every_part_of_the_package_imports_is_no_extra(name):
+    assert name in names_of(REQUIRED)
+
+
+def test_every_dependency_is_pinned_at_a_version_that_is_allowed():
+    for requirement in REQUIRED:
+        pin = PINS.get(canonicalize_name(requirement.name))
+        assert pin is not None, f"constraints.txt has no {requirement.name}"
+        assert requirement.specifier.contains(pin), (requirement, pin)
+    for requirement in OPTIONAL:
+        pin = PINS.get(canonicalize_name(requirement.name))
+        assert pin is None or requirement.specifier.contains(pin), (requirement, pin)
+
+
+def test_the_pinned_versions_install_on_the_oldest_python():
+    oldest = ".".join(map(str, min(CLASSIFIED)))
+    refused = []
+    for found in importlib.metadata.distributions():
+        pin = PINS.get(canonicalize_name(found.metadata["Name"]))
+        needs = found.metadata["Requires-Python"]
+        if pin == found.version and needs and not SpecifierSet(needs).contains(f"{oldest}.9"):
+            refused.append(f"{found.metadata['Name']} needs Python {needs}")
+    assert not refused
+
+
+def test_these_tests_can_fail():
+    assert imported("import os, made_up.part\ndef f():\n    from other import x\n    import iblf_jax") == {"made_up", "other"}
+    assert not SpecifierSet(">=3.12").contains("3.11.9")
