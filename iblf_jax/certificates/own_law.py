@@ -103,7 +103,7 @@ def why_not(whole: Any) -> str:
     actuator = whole.run.scenario.actuator
     if not isinstance(actuator, Ideal):
         about = "the law's own claim is about a torque that acts as it is commanded"
-        return f"{about}, not about a {type(actuator).__name__}"
+        return f"{about}, not about {checks.with_article(type(actuator).__name__)}"
     if whole.left_out == whole.samples:
         return "the guard or a torque limit was at work all the time"
     return whole.no_run
