@@ -32,7 +32,9 @@ def dataset_digests(data: xarray.Dataset) -> dict[str, str]:
     Returns:
       Name -> hexadecimal digest; "attributes" for what belongs to no variable.
     """
-    found = {f"variable {name}": _variable_digest(str(name), variable) for name, variable in data.variables.items()}
+    found = {}
+    for name, variable in data.variables.items():
+        found[f"variable {name}"] = _variable_digest(str(name), variable)
     found[ATTRIBUTES] = _hexadecimal([_plain(data.attrs), sorted(str(name) for name in data.coords)])
     return found
 
@@ -46,8 +48,10 @@ def stored_in(attributes: Mapping[str, Any], name: str) -> str | None:
     """The text with the digests among a file's attributes, even if damage has changed its name; None in older files."""
     if name in attributes:
         return str(attributes[name])
-    texts = [value for value in attributes.values() if isinstance(value, str) and f'"{ALGORITHM}"' in value]
-    return texts[0] if texts else None
+    for value in attributes.values():
+        if isinstance(value, str) and f'"{ALGORITHM}"' in value:
+            return value
+    return None
 
 
 def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
@@ -83,7 +87,10 @@ def _variable_digest(name: str, variable: Any) -> str:
 
 
 def _kind(values: np.ndarray) -> str:
-    """The kind of number; of floating-point numbers the precision too.  netCDF 3 shortens integers, so their width does not count."""
+    """The kind of number, with the precision of floating-point numbers.
+
+    netCDF 3 shortens integers, so their width does not count.
+    """
     if values.dtype.kind == "f":
         return f"f{values.dtype.itemsize}"
     if values.dtype.kind in "iu":
@@ -96,7 +103,8 @@ def _bytes(values: np.ndarray) -> bytes:
     if values.dtype.kind in "OUS":
         return json.dumps([_text(x) for x in values.ravel().tolist()]).encode()
     if values.dtype.kind == "f":
-        one_nan = np.where(np.isnan(values), values.dtype.type(np.nan), values)  # decoding replaces every NaN by this one
+        # Decoding replaces every NaN by this one.
+        one_nan = np.where(np.isnan(values), values.dtype.type(np.nan), values)
         return one_nan.astype(values.dtype.newbyteorder("<")).tobytes()
     if values.dtype.kind in "iu":
         return values.astype("<i8").tobytes()

@@ -7,9 +7,10 @@ hold it, its parameters as JSON, the versions.  In a batch, a parameter that dif
 On disk, several runs by name share one file.  They may differ in length, joints and states, so nothing is stacked: every variable
 and dimension is stored as `<name>.<variable>`, and `load_rollouts` gives one Dataset a name back.  netCDF is version 3, written by SciPy.
 
-netCDF 3 has no checksum, so the file's attribute `digest` holds one of each variable (`files.digest`), and `load_rollouts` compares it
-with what it reads.  The attribute belongs to the file: the Datasets that `load_rollouts` returns do not carry it, so it cannot become
-stale in them.  NumPy's format has a checksum of its own.
+netCDF 3 has no checksum, so the file's attribute `digest` holds one of each variable
+(`files.digest`), and `load_rollouts` compares it with what it reads.  The attribute belongs to the
+file: the Datasets that `load_rollouts` returns do not carry it, so it cannot become stale in them.
+NumPy's format has a checksum of its own.
 """
 
 from __future__ import annotations
@@ -241,7 +242,8 @@ def _write_netcdf(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> N
     import xarray
 
     attributes: dict[str, Any] = {"names": json.dumps(list(data))}
-    attributes[DIGEST] = digest.encoded({name: digest.dataset_digests(one) for name, one in data.items()})
+    digests = {name: digest.dataset_digests(one) for name, one in data.items()}
+    attributes[DIGEST] = digest.encoded(digests)
     renamed = []
     for name, one in data.items():
         attributes |= {f"{name}.{key}": value for key, value in one.attrs.items()}
@@ -267,8 +269,15 @@ def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
     return found
 
 
-def _verify(path: str | os.PathLike, attributes: Mapping[str, Any], found: Mapping[str, xarray.Dataset]) -> None:
-    """Raises DamagedFileError where Datasets are not those of the file's digest; files of older versions have none."""
+def _verify(
+    path: str | os.PathLike,
+    attributes: Mapping[str, Any],
+    found: Mapping[str, xarray.Dataset],
+) -> None:
+    """Raises DamagedFileError where Datasets are not those of the file's digest.
+
+    Files of older versions have no digest and are accepted.
+    """
     stored = digest.stored_in(attributes, DIGEST)
     if stored is None:
         return
@@ -281,13 +290,12 @@ def _verify(path: str | os.PathLike, attributes: Mapping[str, Any], found: Mappi
 
 
 def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
-    shown = ", ".join(different[:MOST_NAMED]) + (f" and {len(different) - MOST_NAMED} more" if len(different) > MOST_NAMED else "")
-    return checks.fail(
-        str(path),
-        Words(f"content that differs from its digest: {shown}"),
-        "what save_rollouts wrote",
-        f"The file was damaged: restore it or run again. If it was edited on purpose, delete its attribute {DIGEST!r} before saving.",
-    )
+    shown = ", ".join(different[:MOST_NAMED])
+    if len(different) > MOST_NAMED:
+        shown += f" and {len(different) - MOST_NAMED} more"
+    came = Words(f"content that differs from its digest: {shown}")
+    remedy = f"The file is damaged: restore it or run again. If it was edited on purpose, delete its attribute {DIGEST!r} before saving."
+    return checks.fail(str(path), came, "what save_rollouts wrote", remedy)
 
 
 def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:
