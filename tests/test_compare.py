@@ -10,7 +10,9 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import barriers, cli, controllers
+from iblf_jax.core.status import Status
 from iblf_jax.studies.compare import factor_nearest_one
+from iblf_jax.studies.equal_effort import Trials, search
 
 RUN = {"duration": 2.0, "dt": 1e-3, "record_every": 10}
 
@@ -239,3 +241,124 @@ def test_command_line(tmp_path, capsys, monkeypatch):
 def test_command_line_refuses_an_unknown_law(capsys):
     assert cli.main(["compare", "zhang_yan_2024", "--laws", "nonsense", "--duration", "0.1"]) == 2
     assert "one of 'integral'" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------- efforts that do not grow with the factor
+
+
+@ij.component
+class Wavy:
+    """A PD law whose stiffness falls and rises with its gain k, and which is stiff in a band of gains."""
+
+    gains = ("k",)
+    k: object = ij.leaf("1", sign="positive", shape="scalar", default=1.0)
+    low: object = ij.leaf("1", shape="scalar", default=1.17)
+    high: object = ij.leaf("1", shape="scalar", default=1.23)
+    damping: object = ij.leaf("N m s/rad", shape="scalar", default=4000.0)
+
+    def init(self, q, dq, setting):
+        return ()
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        tube, L = setting.tube(t), jnp.log(self.k)
+        Kp = 60.0 * jnp.maximum(1.0 + 2.0 * L + 0.7 * L**2, 0.05)
+        in_band = (self.k > self.low) & (self.k < self.high) | (self.k > 1.4) & (self.k < 1.6)
+        Kd = jnp.where(in_band, self.damping, 20.0)
+        tau = setting.model.gravity(q) - Kp * (q - tube.q_d) - Kd * (dq - tube.dq_d)
+        never = jnp.zeros(q.shape, bool)
+        return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
+
+
+BRIEF = {"duration": 0.5, "dt": 1e-3, "record_every": 50}
+
+
+@pytest.fixture(scope="module")
+def wavy():
+    return ij.compare(ij.presets.zhang_yan_2024(), {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}, **BRIEF)
+
+
+def test_the_factor_nearest_one_is_found_beyond_trials_that_fail(wavy):
+    """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from 1.4 to 1.6 fail."""
+    assert wavy.factors["at 1"] == pytest.approx(1.28, rel=1e-4)
+    found = wavy.searches["at 1"]
+    assert len(found.crossings) == 2
+    assert found.crossings[1] == pytest.approx(0.045, abs=0.002)
+    efforts = [float(run.metrics.effort_above_gravity) for run in wavy.equal_effort.values()]
+    np.testing.assert_allclose(efforts, efforts[0], rtol=1e-4)
+    assert all(1.17 <= factor <= 1.23 or factor >= 1.4 for factor in found.failed)
+    assert any(1.17 < factor < 1.23 for factor in found.failed)
+    assert all("time step is too large" in why for factor, why in found.failed.items() if factor < 1.23)
+
+
+def test_failed_trials_are_in_the_text_and_in_the_dictionary(wavy):
+    text, found = repr(wavy), wavy.searches["at 1"]
+    assert "of which 1.28 is the nearest to 1" in text
+    assert f"{len(found.factors)} factors from 0.0312 to 32 were run" in text
+    assert f"{len(found.failed)} of them fail" in text
+    assert "the time step is too large" in text
+    assert f"only the time step is to blame: with dt={found.smaller_dt:g}" in text and found.smaller_dt < 1e-3
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert data["factor"] == found.factor
+    assert len(data["trials"]["status"]) == len(found.factors)
+    assert {entry["factor"] for entry in data["failed"]} == set(found.failed)
+    assert "the time step is too large" in wavy._repr_html_()
+
+
+def banded(low, high, flags):
+    """Trials whose effort is the factor, and which fail between two factors."""
+
+    def run(factors):
+        inside = (factors > low) & (factors < high)
+        return Trials(factors.copy(), np.where(inside, int(flags), 0), np.where(inside, 5e3, 10.0), np.zeros(len(factors)))
+
+    return run
+
+
+def test_where_no_factor_is_found_the_nearest_trial_and_a_smaller_step_are_named():
+    def dt_for(trials):
+        assert np.all(trials.mode == 5e3)
+        return 2e-4
+
+    found = search(banded(1.1, 1.5, Status.STEP_TOO_LARGE | Status.NOT_FINITE), 1.32, dt_for)
+    assert math.isnan(found.factor)
+    factor, effort = found.nearest
+    assert factor == effort and (1.08 < factor <= 1.1 or 1.5 <= factor < 1.54)
+    best = np.min(np.abs(found.efforts[found.valid] - 1.32))
+    assert abs(effort - 1.32) == best
+    words = found.in_words()
+    assert f"its effort does not pass through 1.32 N m (0.03125 to 32); the nearest of them has {effort:.4g} N m, at {factor:.4g}" in words
+    assert "ran away" in words
+    assert "with dt=0.0002" in words and found.smaller_dt == 2e-4
+    # A violation is no matter of the step, and what lies beyond the factor that was found hides nothing nearer.
+    assert search(banded(1.1, 1.5, Status.BOUND_VIOLATED), 1.32, dt_for).smaller_dt is None
+    beyond = search(banded(1.4, 1.5, Status.STEP_TOO_LARGE), 1.32, dt_for)
+    assert beyond.factor == pytest.approx(1.32, rel=1e-6) and beyond.smaller_dt is None
+    hiding = search(banded(1.1, 1.2, Status.STEP_TOO_LARGE), 1.32, dt_for)
+    assert hiding.factor == pytest.approx(1.32, rel=1e-6) and hiding.smaller_dt == 2e-4
+
+
+def test_inaccurate_trials_count_only_where_the_given_runs_are_inaccurate_too():
+    run = banded(1.1, 1.5, Status.INACCURATE)
+    assert math.isnan(search(run, 1.32).factor)
+    found = search(run, 1.32, inaccurate=True)
+    assert found.factor == pytest.approx(1.32, rel=1e-6)
+    assert not found.failed and "inaccurate runs count" in found.in_words()
+
+
+@pytest.mark.parametrize(
+    ("effort", "target", "expected"),
+    [
+        (lambda c: 2.0 + math.sin(12.0 * math.log(c)), 2.5, math.exp(math.asin(0.5) / 12.0)),
+        (lambda c: 2.0 - (c - 0.71) ** 2, 2.0 - 1e-4, 0.72),  # turns back just beyond the target, between grid points
+        (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.35, 1.35),
+        (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.2, math.nan),
+        (lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2), 1.2, math.nan),  # a jump over the target is no factor
+        (lambda c: 1.0 / c, 0.3, 1.0 / 0.3),
+        (lambda c: abs(math.log(c)) + 0.1, 1.1, math.exp(-1.0)),  # 1/e and e are equally near: the first one
+    ],
+)
+def test_efforts_of_any_shape(effort, target, expected):
+    found = factor_nearest_one(effort, target)
+    if expected == math.exp(-1.0):
+        found = min(found, 1.0 / found)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)

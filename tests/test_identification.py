@@ -16,6 +16,7 @@ import pytest
 import tomli_w
 import xarray
 from conftest import ROOT
+from scipy.signal import savgol_filter
 
 import iblf_jax as ij
 from iblf_jax import cli
@@ -23,9 +24,11 @@ from iblf_jax.core.pytree import astype
 from iblf_jax.engine.replay import slopes
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
+from iblf_jax.identification._identify import _lacking_terms
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
 from iblf_jax.identification.shooting import Replay, Torque, windows
+from iblf_jax.identification.smoothing import smoothed
 from iblf_jax.identification.standstill import _joints, by_the_law, free_about_standstill
 from iblf_jax.simulation.scenario import canonical
 
@@ -276,6 +279,85 @@ def test_priors_and_limits(scenario, log):
         ij.identify(scenario, log, PATHS, priors={"plant.g": (9.81, 0.1)})
     with pytest.raises(ValueError, match=r"limits\['robot.mass'\].*a start between"):
         ij.identify(scenario, log, PATHS, limits={"robot.mass": (3.0, 4.0)})
+
+
+# ------------------------------------------------------------------------------------------- terms that were left out of the fit
+
+
+def with_friction(scenario, viscous, coulomb):
+    """The scenario with the masses of the robot that was logged, and friction."""
+    friction = ij.disturbances.Friction(viscous=viscous, coulomb=coulomb, width=WIDTH)
+    return ij.with_parameters(ij.with_parts(scenario, disturbance=friction), {"robot.mass": MASS})
+
+
+def lacking(scenario, log, paths):
+    """The terms that a fit lacks which ended at the scenario's numbers."""
+    with jax.enable_x64(True):
+        replayed, c = coordinates(canonical(astype(canonical(scenario), "float64")), paths, {})
+        seen = smoothed(read(log, 2), True)
+        return _lacking_terms(replayed, c, seen, np.append(to_z(c, c.x), 0.0), np.ones(len(c.x) + 1, bool))
+
+
+@pytest.fixture(scope="module")
+def other_logs():
+    """Logs of other motions."""
+    return [independent_log(duration=5.0, seed=seed) for seed in (11, 12)]
+
+
+def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is_marked(scenario, other_logs):
+    """Viscous friction is found about twice too large then: not "told", but biased, by about what it is too large."""
+    start = ij.with_parameters(scenario, {"disturbance.coulomb": 0.0})
+    known = ij.identify(start, other_logs[0], PATHS[:2])
+    found = [note for note in known.notes if "follows the sign of its velocity" in note]
+    assert len(found) == 2
+    sizes = {re.search(r"joint (\d)", note)[1]: float(re.search(r"has ([\d.]+) ", note)[1]) for note in found}
+    np.testing.assert_allclose([sizes["0"], sizes["1"]], COULOMB, rtol=0.2)
+    assert all("Add 'disturbance.coulomb' to the paths" in note for note in found)
+    for number, truth in zip(known.numbers[2:], VISCOUS, strict=True):
+        assert number.verdict in ("biased", "cannot be told")
+        if number.value is not None and number.value > 1.2 * truth:
+            assert 0.3 < number.bias / (number.value - truth) < 3.0
+    assert any(number.verdict == "biased" for number in known.numbers)
+    assert "biased" in repr(known) and "make up for what was left out" in repr(known)
+    assert "biased" in known.tables_html()["Numbers"]
+    assert not any("viscous" in path for path in known.perturbations)
+    assert json.dumps(known.to_dict(), allow_nan=False)
+
+
+def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
+    assert not any("What is left of the torque" in note or "biased" in note for note in known.notes)
+    assert all(number.bias is None for number in known.numbers)
+    for log in other_logs:
+        for paths in (PATHS, PATHS[:1]):
+            assert not lacking(with_friction(scenario, VISCOUS, COULOMB), log, paths).findings
+
+
+@pytest.mark.parametrize(
+    ("viscous", "coulomb", "paths", "kind", "sizes"),
+    [
+        (VISCOUS, 0.0, PATHS[:2], "sign", COULOMB),
+        (0.0, COULOMB, PATHS[:1], "velocity", VISCOUS),
+        (VISCOUS, [0.2, 0.0], PATHS[:2], "sign", [None, 0.1]),
+        (VISCOUS, 2.0 * COULOMB, PATHS[:2], "sign", -COULOMB),
+    ],
+)
+def test_what_was_left_out_is_named_by_joint_and_size(viscous, coulomb, paths, kind, sizes, scenario, other_logs):
+    for log in other_logs:
+        found = lacking(with_friction(scenario, viscous, coulomb), log, paths)
+        assert {(one.joint, one.kind) for one in found.findings} == {(j, kind) for j, size in enumerate(sizes) if size is not None}
+        for one in found.findings:
+            np.testing.assert_allclose(one.size, sizes[one.joint], rtol=0.25)
+            assert one.error < 0.2 * abs(one.size) and one.gain > 0.3
+
+
+def test_gravity_and_inertia_that_were_left_out_are_named(scenario, other_logs):
+    """Another payload's worth of gravity, and a rotor: of the torques that are logged, so that nothing else is wrong."""
+    truth, log = with_friction(scenario, VISCOUS, COULOMB), other_logs[0]
+    rate = np.gradient(np.gradient(log["q"], log["t"], axis=0), log["t"], axis=0)
+    gravity = {**log, "tau": log["tau"] + np.array([0.0, 0.4]) * np.cos(log["q"])}
+    assert {(one.joint, one.kind) for one in lacking(truth, gravity, PATHS[1:]).findings} == {(1, "cosine")}
+    rotor = {**log, "tau": log["tau"] + np.array([0.05, 0.0]) * savgol_filter(rate, 31, 2, axis=0)}
+    assert {(one.joint, one.kind) for one in lacking(truth, rotor, PATHS[1:]).findings} == {(0, "acceleration")}
 
 
 # ------------------------------------------------------------------------------------------------------- logs that are wrong

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
 from typing import ClassVar
 
 import jax
@@ -15,6 +17,7 @@ from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.testing import ContractError
 from iblf_jax.testing.metrics import samples
 from iblf_jax.tuning import quantities
+from iblf_jax.tuning.objectives import for_scenario
 from iblf_jax.tuning.quantities import MetricResult, Quantities
 
 TUNING = {"duration": 0.5, "dt": 1e-3, "report_runs": 1}
@@ -195,3 +198,197 @@ def test_a_metric_that_cannot_be_tuned_for():
 @pytest.mark.slow
 def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
     rejects(ij.objectives.tracking(after=1.0), "its value at the start", "scale of its own", scenario=paper, duration=0.5)
+
+
+# ------------------------------------------------------------------------------------ which joints, weights, limits of each
+
+
+def exact(objective, run):
+    """Each term's and requirement's number, from the samples of a run."""
+    return np.asarray(jax.jit(folded)((Quantities(objective.quantities),), run)["tuning_exact"])
+
+
+def excesses(requirements, run):
+    """g of each requirement, from the samples of a run."""
+    goal = ij.objectives.tracking()
+    for requirement in requirements:
+        goal += requirement
+    return np.asarray(goal.excesses(jnp.asarray(exact(goal, run))))
+
+
+@pytest.fixture(scope="module")
+def three_joints():
+    return samples(np.random.default_rng(11), 3, 0.01)
+
+
+SELECTIONS = [
+    ([0, 2], [0, 2]),
+    ((2, 0), [0, 2]),
+    (np.array([0, 2]), [0, 2]),
+    (1, [1]),
+    (-1, [2]),
+    (slice(1, None), [1, 2]),
+    ("0:3:2", [0, 2]),
+    (["joint 1", 2], [1, 2]),
+    ([True, False, True], [0, 2]),
+    (np.array([False, True, False]), [1]),
+    (range(2), [0, 1]),
+    (None, [0, 1, 2]),
+]
+
+
+@pytest.mark.parametrize(("joints", "expected"), SELECTIONS, ids=[str(joints) for joints, _ in SELECTIONS])
+def test_joints_selects_joints_everywhere(joints, expected, three_joints):
+    """Whole numbers are indices, never weights; against NumPy on the samples."""
+    o, run = ij.objectives, three_joints
+    parts = o.tracking(joints=joints) + o.effort(joints=joints) + o.metric(ij.metrics.Tracking(), "iae", joints=joints)
+    parts += o.peak_torque_below(5.0, joints=joints) + o.error_below(0.1, joints=joints) + o.margin_above(0.01, joints=joints)
+    tau, e1 = (np.abs(np.asarray(x))[:, expected] for x in (run.tau, run.e1))
+    inside = np.minimum(run.q - run.lower, run.upper - run.q)[:, expected]
+    found = exact(parts, run)
+    np.testing.assert_allclose(found[3:], [tau.max(), e1.max(), -np.min(inside)], rtol=1e-10)
+    # The integrals are those of a run in which the other joints stand still.
+    chosen = np.isin(np.arange(3), expected).astype(float)
+    others = dataclasses.replace(run, e1=run.e1 * chosen, tau=run.tau * chosen)
+    wanted = exact(o.tracking() + o.effort() + o.metric(ij.metrics.Tracking(), "iae"), others)
+    np.testing.assert_allclose(found[:3], wanted, rtol=1e-10)
+
+
+def test_limits_of_single_joints_and_weights(three_joints):
+    """A requirement with a limit for each joint is broken by the joint that is nearest to its own, or beyond."""
+    o, run = ij.objectives, three_joints
+    peak, error = (np.abs(np.asarray(x)).max(axis=0) for x in (run.tau, run.e1))
+    cases = np.array([[1.1, 1.2, 1.3], [1.1, 0.9, 1.3], [0.5, 2.0, 2.0]])
+    np.testing.assert_allclose(
+        excesses([o.peak_torque_below(c * peak) for c in cases] + [o.error_below(list(c * error)) for c in cases], run),
+        np.tile(np.max(1 / cases, axis=1) - 1, 2),
+        rtol=1e-9,
+    )
+    # Of some joints: a limit for each of these, or for all.
+    some = [o.peak_torque_below((c * peak)[[0, 2]], joints=[0, 2]) for c in cases]
+    same = [o.peak_torque_below(c * peak, joints=[0, 2]) for c in cases]
+    np.testing.assert_allclose(excesses(some + same, run), np.tile(np.max(1 / cases[:, [0, 2]], axis=1) - 1, 2), rtol=1e-9)
+    # Margins, of positions that are inside their bounds.
+    kept = dataclasses.replace(run, lower=run.q - 0.2, upper=run.q + jnp.array([0.1, 0.3, 0.4]))
+    found = excesses(
+        [o.margin_above([0.05, 0.1, 0.1]), o.margin_above([0.05, 0.25, 0.1]), o.margin_above([0.125, 0.1], joints=[0, 2])], kept
+    )
+    np.testing.assert_allclose(found, [1 - 2.0, 1 - 0.8, 1 - 0.8], rtol=1e-9)
+    weighted = exact(o.tracking(weights=[1.0, 0.5, 2.0]) + o.effort(joints=[0, 2], weights=[1.0, 3.0]), run)
+    scaled = dataclasses.replace(run, e1=run.e1 * jnp.array([1.0, 0.5, 2.0]), tau=run.tau * jnp.array([1.0, 0.0, 3.0]))
+    np.testing.assert_allclose(weighted, exact(o.tracking() + o.effort(), scaled), rtol=1e-10)
+    term = o.peak_torque(2.0 * peak).terms[0]
+    np.testing.assert_allclose(term.value(jnp.asarray(0.5)), np.log1p(np.exp(-10.0)) / 20.0, rtol=1e-9)
+
+
+def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joints):
+    with pytest.warns(DeprecationWarning, match=r"effort\(weights=...\)") as caught:
+        old = ij.objectives.effort(joints=[1.0, 0.0, 2.0])
+    assert caught[0].filename == __file__
+    np.testing.assert_array_equal(exact(old, three_joints), exact(ij.objectives.effort(weights=[1, 0, 2]), three_joints))
+    with pytest.raises(ValueError, match="weights="):
+        ij.objectives.effort(joints=[1.0, 0.0], weights=[1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda o: o.peak_torque_below(-5.0), r"peak_torque_below: limit: got -5.*> 0.*peak_torque_below\(limit=140.0\)"),
+        (lambda o: o.peak_torque_below("much"), r"peak_torque_below: limit: got 'much'"),
+        (lambda o: o.error_below([0.1, 0.0]), r"error_below: limit: got \[0.1"),
+        (lambda o: o.margin_above(0.0), "margin_above: limit"),
+        (lambda o: o.velocity_margin_above(np.nan), "velocity_margin_above: limit"),
+        (lambda o: o.peak_torque(0.0), "peak_torque: limit"),
+        (lambda o: o.margin(-0.1), "margin: target"),
+        (lambda o: o.effort(scale=0.0), "effort: scale"),
+        (lambda o: o.error_below(0.1, allowed=2.0), "error_below: allowed"),
+        (lambda o: o.violation_probability_below(1.5), "violation_probability_below: probability"),
+        (lambda o: o.tracking(joints=[True, 1]), "tracking: joints.*cannot be mixed"),
+        (lambda o: o.tracking(joints=True), "tracking: joints"),
+        (lambda o: o.tracking(joints=[]), "tracking: joints.*at least one joint"),
+        (lambda o: o.tracking(joints={0}), "tracking: joints"),
+        (lambda o: o.tracking(weights=[[1.0]]), "tracking: weights"),
+        (lambda o: o.peak_torque_below([1.0, 2.0], weights=[1.0, 2.0, 3.0]), "peak_torque_below: weights"),
+    ],
+)
+def test_errors_name_the_argument_of_the_function(call, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        call(ij.objectives)
+    assert "Peak." not in str(caught.value) and "Term." not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        (lambda o: o.tracking(joints=[0, 2]), "tracking: joints: got 2, expected an index from 0 to 1"),
+        (lambda o: o.tracking(joints=[1, 1]), "tracking: joints.*joint 1 twice.*weights="),
+        (lambda o: o.tracking(joints=[True]), "tracking: joints.*2 truth values"),
+        (lambda o: o.tracking(joints="joint 2"), "tracking: joints: got 'joint 2'.*Did you mean"),
+        (lambda o: o.tracking(joints="2:"), "tracking: joints.*at least one joint"),
+        (lambda o: o.tracking(weights=[1, 2, 3]), r"tracking: weights.*\(3,\)"),
+        (lambda o: o.tracking() + o.peak_torque_below([1, 2, 3]), r"peak_torque_below: limit: got \[1. 2. 3.\].*2, one for each"),
+        (lambda o: o.tracking() + o.error_below(0.1, joints=3), "error_below: joints: got 3"),
+    ],
+)
+def test_joints_that_the_robot_does_not_have(goal, message, paper):
+    with pytest.raises(ValueError, match=message):
+        ij.tune(paper, ["controller.k1"], goal(ij.objectives), **TUNING)
+
+
+def test_names_of_joints_become_indices():
+    scenario = ij.presets.ur5()
+    names = scenario.plant.joints
+    goal = ij.objectives.tracking(joints=[names[1], names[4]]) + ij.objectives.peak_torque_below([140, 27], joints=list(names[2:4]))
+    known = for_scenario(goal, scenario)
+    assert [quantity.joints for quantity in known.quantities] == [(1, 4), (2, 3)]
+    assert goal.requirements[0].name == f"peak torque of joints {names[2]}, {names[3]} < [140, 27] N m"
+
+
+WITH_JOINTS = FILE.replace('kind = "metric"', 'kind = "tracking"\n')
+
+
+def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
+    def loaded(words):
+        (tmp_path / "tune.toml").write_text(WITH_JOINTS + words)
+        return load_tuning_file(tmp_path / "tune.toml")["objective"].quantities[-1]
+
+    assert loaded("joints = [1]").joints == (1,)
+    assert loaded('joints = ["joint 0"]').joints == ("joint 0",)
+    assert loaded('joints = "1:"').joints == ("1:",)
+    limits = loaded('weights = [1.0, 0.5]\n[[requirement]]\nkind = "peak_torque_below"\nlimit = [14.0, 2.0]')
+    np.testing.assert_allclose(1 / limits.weights, [14.0, 2.0])
+    for old in ("[1.0, 0.5]", "[2, 2]", "[1, 3]"):  # what earlier versions meant, where it is no selection
+        with pytest.warns(DeprecationWarning, match="weights = "):
+            found = loaded(f"joints = {old}")
+        np.testing.assert_allclose(found.weights, eval(old))
+        assert found.joints is None
+    with pytest.warns(UserWarning, match="selects all joints"):
+        assert loaded("joints = [0, 1]").joints == (0, 1)
+
+
+def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
+    """A file of the version before `weights`: tracking, peak_torque, a metric, and two requirements."""
+    found = ij.load_tuning(Path(__file__).parent / "data" / "tuning_before_weights.json").setup.objective
+    weights = [np.asarray(quantity.weights).tolist() for quantity in found.quantities]
+    assert weights == [[1.0, 0.25], [1.0, 3.0], [0.0, 2.0], [0.0, 1.0], 1.0]
+    assert all(quantity.joints is None for quantity in found.quantities)
+
+
+@pytest.mark.slow
+def test_tuning_and_a_front_under_limits_of_single_joints(paper, tmp_path):
+    o = ij.objectives
+    limits = [16.0, 14.0]
+    goal = o.tracking(joints=[0]) + 0.1 * o.effort() + o.peak_torque_below(limits) + o.margin_above([0.02, 0.05])
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, iterations=25, **TUNING)
+    peaks = np.asarray(ij.simulate(best.scenario, duration=0.5, dt=1e-3).metrics.peak_torque)
+    assert np.all(peaks < np.array(limits) * 1.001)
+    assert "peak torque < [16, 14] N m" in str(best.report) and "% of its limit" in str(best.report)
+    best.save(tmp_path / "tuned.json")
+    again = ij.load_tuning(tmp_path / "tuned.json")
+    assert jax.tree.structure(again.setup.objective) == jax.tree.structure(best.setup.objective)
+    assert again.report.verdicts == best.report.verdicts
+    pair = (o.tracking(joints=[0]), o.effort() + o.peak_torque_below(limits))
+    front = ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, duration=0.5, dt=1e-3)
+    for i in range(len(front)):
+        assert np.all(np.asarray(ij.simulate(front.scenario(i), duration=0.5, dt=1e-3).metrics.peak_torque) < np.array(limits) * 1.001)
+    ij.testing.check_objective(goal, scenario=paper, duration=0.5)

@@ -166,6 +166,90 @@ def test_bad_files(ending, tmp_path):
             ij.load_rollouts(path)
 
 
+@pytest.fixture(scope="module")
+def stored(short_run, tmp_path_factory):
+    """A netCDF file of two runs, and what it loads as."""
+    path = tmp_path_factory.mktemp("stored") / "runs.nc"
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), short_run)
+    ij.save_rollouts({"one": short_run, "two runs": batch}, path)
+    return path, ij.load_rollouts(path)
+
+
+def _is_same(found, expected):
+    if found.keys() != expected.keys():
+        return False
+    types = all(found[name][label].dtype == x.dtype for name, one in expected.items() for label, x in one.variables.items())
+    return types and all(found[name].identical(one) for name, one in expected.items())
+
+
+def _damage(content, rng, kind):
+    """The content with one bit, one byte, a block of 64 bytes, or five bytes changed."""
+    damaged, at = bytearray(content), int(rng.integers(len(content)))
+    if kind == "bit":
+        damaged[at] ^= 1 << int(rng.integers(8))
+    elif kind == "byte":
+        damaged[at] ^= int(rng.integers(1, 256))
+    elif kind == "block":
+        damaged[at : at + 64] = bytes(len(damaged[at : at + 64]))
+    else:
+        for place in rng.integers(len(content), size=5):
+            damaged[int(place)] ^= 0xFF
+    return bytes(damaged)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("kind", ["bit", "byte", "block", "five"])
+def test_a_damaged_netcdf_file_is_refused_or_loads_as_it_was(kind, stored, rng, tmp_path):
+    path, expected = stored
+    content, refused = path.read_bytes(), 0
+    for _ in range(60):
+        (tmp_path / "damaged.nc").write_bytes(_damage(content, rng, kind))
+        try:
+            found = ij.load_rollouts(tmp_path / "damaged.nc")
+        except ValueError:
+            refused += 1
+            continue
+        assert _is_same(found, expected)
+    assert refused > 40  # a few of the bytes are padding
+
+
+def test_the_error_for_a_damaged_file_names_variable_and_remedy(stored, tmp_path):
+    path, _ = stored
+    data = xarray.load_dataset(path, engine="scipy")
+    data["one.q"][3, 1] += 1e-9
+    data.to_netcdf(tmp_path / "edited.nc", engine="scipy")
+    with pytest.raises(ValueError, match=r"edited.nc.*variable q of run 'one'.*'digest'") as caught:
+        ij.load_rollouts(tmp_path / "edited.nc")
+    assert "variable dq" not in str(caught.value)
+    del data.attrs["digest"]
+    data.to_netcdf(tmp_path / "edited.nc", engine="scipy")
+    found = ij.load_rollouts(tmp_path / "edited.nc")
+    np.testing.assert_array_equal(found["one"].q, data["one.q"])
+
+
+def test_files_without_a_digest_load_and_datasets_carry_none(stored, tmp_path):
+    """Files of older versions have none; a Dataset that a user edits and saves must not hold one that has become stale."""
+    path, expected = stored
+    older = xarray.load_dataset(path, engine="scipy")
+    assert "digest" in older.attrs
+    del older.attrs["digest"]
+    older.to_netcdf(tmp_path / "older.nc", engine="scipy")
+    assert _is_same(ij.load_rollouts(tmp_path / "older.nc"), expected)
+    assert not any("digest" in one.attrs for one in expected.values())
+
+
+def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_path):
+    """A NaN of the other sign, 64-bit integers and truth values are equal after a file of netCDF 3."""
+    values = short_run.metrics.values_by_name | {
+        "many": jnp.arange(3),
+        "is_so": jnp.array(True),
+        "none": jnp.array([-jnp.nan, -0.0, jnp.inf]),
+    }
+    run = dataclasses.replace(short_run, metrics=dataclasses.replace(short_run.metrics, values_by_name=values))
+    ij.save_rollouts(run, tmp_path / "a.nc")
+    assert bool(ij.load_rollouts(tmp_path / "a.nc")["run"]["is_so"])
+
+
 def test_the_package_imports_no_labels_and_no_figures():
     code = "import iblf_jax, sys; assert not {'xarray', 'matplotlib', 'optax', 'pandas', 'tomli_w'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -121,7 +121,7 @@ def test_reverse_mode_remembers_few_states(paper):
 @pytest.mark.slow
 def test_quantities_are_what_numpy_makes_of_the_records(paper):
     parts = (
-        TimeIntegral("error", joints=[1.0, 2.0], after=0.1),
+        TimeIntegral("error", weights=[1.0, 2.0], after=0.1),
         TimeIntegral("torque"),
         TimeIntegral("torque_rate"),
         TimeIntegral("outside", tolerance=0.05),

@@ -67,6 +67,7 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
         "iblf_jax_version": iblf_jax.__version__,
         "notes": result.notes,
         "factors": result.factors,
+        "searches": {name: found.to_dict() for name, found in result.searches.items()},
         "gains": {name: verdict(one) for name, one in result.rollouts.items()},
         "effort": {name: verdict(one) for name, one in result.equal_effort.items()},
     }

@@ -6,6 +6,11 @@ hold it, its parameters as JSON, the versions.  In a batch, a parameter that dif
 
 On disk, several runs by name share one file.  They may differ in length, joints and states, so nothing is stacked: every variable
 and dimension is stored as `<name>.<variable>`, and `load_rollouts` gives one Dataset a name back.  netCDF is version 3, written by SciPy.
+
+netCDF 3 has no checksum, so the file's attribute `digest` holds one of each variable
+(`files.digest`), and `load_rollouts` compares it with what it reads.  The attribute belongs to the
+file: the Datasets that `load_rollouts` returns do not carry it, so it cannot become stale in them.
+NumPy's format has a checksum of its own.
 """
 
 from __future__ import annotations
@@ -22,6 +27,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status, describe
+from iblf_jax.files import digest
 from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.files.values import Words
 from iblf_jax.simulation.paths import parameters
@@ -41,6 +47,10 @@ STATES = {
 
 ENDINGS = (".nc", ".npz")
 _ATTRIBUTES = "attributes"
+DIGEST = "digest"
+"""The attribute of a netCDF file that holds the digests of what is in it."""
+MOST_NAMED = 4
+"""How many damaged variables an error names."""
 
 
 def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
@@ -109,7 +119,7 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
       path: a ".nc" or ".npz" file.
 
     Raises:
-      ValueError: another ending, or a file that `save_rollouts` did not write.
+      ValueError: another ending, a file that `save_rollouts` did not write, or one that was damaged or changed since.
       OSError: the file cannot be read.
     """
     place = checks.file_path("path", path, "a file that ends in .nc or .npz")
@@ -118,8 +128,14 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
         pass
     try:
         return read(place)
+    except DamagedFileError:
+        raise
     except Exception as error:
         raise checks.fail(str(place), type(error).__name__, "a file written by save_rollouts", str(error)) from error
+
+
+class DamagedFileError(ValueError):
+    """The content of a file is not what its digest was made of."""
 
 
 # ------------------------------------------------------------------------------------------------------------ the Dataset
@@ -226,6 +242,8 @@ def _write_netcdf(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> N
     import xarray
 
     attributes: dict[str, Any] = {"names": json.dumps(list(data))}
+    digests = {name: digest.dataset_digests(one) for name, one in data.items()}
+    attributes[DIGEST] = digest.encoded(digests)
     renamed = []
     for name, one in data.items():
         attributes |= {f"{name}.{key}": value for key, value in one.attrs.items()}
@@ -247,7 +265,37 @@ def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
         mine = mine.rename({x: str(x).removeprefix(start) for x in labels})
         mine.attrs = {key.removeprefix(start): value for key, value in merged.attrs.items() if key.startswith(start)}
         found[name] = mine
+    _verify(path, merged.attrs, found)
     return found
+
+
+def _verify(
+    path: str | os.PathLike,
+    attributes: Mapping[str, Any],
+    found: Mapping[str, xarray.Dataset],
+) -> None:
+    """Raises DamagedFileError where Datasets are not those of the file's digest.
+
+    Files of older versions have no digest and are accepted.
+    """
+    stored = digest.stored_in(attributes, DIGEST)
+    if stored is None:
+        return
+    try:
+        different = digest.differences(stored, found)
+    except ValueError as error:
+        different = [str(error)]
+    if different:
+        raise DamagedFileError(str(_damaged(path, different)))
+
+
+def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
+    shown = ", ".join(different[:MOST_NAMED])
+    if len(different) > MOST_NAMED:
+        shown += f" and {len(different) - MOST_NAMED} more"
+    came = Words(f"content that differs from its digest: {shown}")
+    remedy = f"The file is damaged: restore it or run again. If it was edited on purpose, delete its attribute {DIGEST!r} before saving."
+    return checks.fail(str(path), came, "what save_rollouts wrote", remedy)
 
 
 def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:

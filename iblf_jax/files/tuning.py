@@ -19,9 +19,16 @@ A tuning file is a scenario file (`files.scenario`) with four more tables, of wh
     [[requirement]]
     kind = "margin_above"
     limit = 0.05
+    [[requirement]]                         # of some joints, by index, name or slice; a limit for each, or one for all
+    kind = "peak_torque_below"
+    joints = ["shoulder", "elbow"]          # or [0, 1], or "0:2"
+    limit = [140.0, 27.0]
     [perturbations]
     "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02, shared = true }
+
+In files of earlier versions `joints` was a list of weights, which is now `weights`.  Floating-point numbers are still read so, and
+so are whole numbers that are no selection of joints; both with a DeprecationWarning.
 
 Everything is checked; each refusal is a ValueError that names the dotted key.  A saved result is JSON with all its numbers in full.
 """
@@ -31,17 +38,20 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.joints import holds_weights
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
 from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, numbers
+from iblf_jax.robots import joint_names
 from iblf_jax.simulation import metrics
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -97,7 +107,7 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
     file = from_dict(data, source=source, other_tables=TABLES, folder=Path(path).parent)
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
-        goal = _objective(data.get("objective", []), data.get("requirement", []))
+        goal = _objective(data.get("objective", []), data.get("requirement", []), joint_names(file.scenario.plant, file.scenario.n))
         drawn = perturbations_of(data)
     except ValueError as error:
         raise checks.inside(source, error) from error
@@ -138,8 +148,9 @@ def _parameter(entry: Any, key: str) -> Any:
     return components.construct(tunable, {"path": path, **table, **limits}, key)
 
 
-def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, besides: tuple[str, ...] = ()) -> Any:
-    table = as_table(entry, key)
+def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, names: tuple[str, ...], besides: tuple[str, ...] = ()) -> Any:
+    """What a function of objectives makes of a table; `names` are those of the robot's joints."""
+    table = _with_weights(as_table(entry, key), key, names)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
     function = getattr(module, table["kind"])
     if function is objectives.metric and "fold" not in table:
@@ -156,7 +167,27 @@ _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
 """Arguments of objectives that are something else."""
 
 
+def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
+    """A table whose `joints` are a selection; those of earlier versions were weights."""
+    given: Any = table.get("joints")
+    whole = isinstance(given, list) and bool(given) and all(type(x) is int for x in given)
+    if not (holds_weights(given) or whole):
+        return table
+    n = len(names)
+    if whole and len(given) != n:  # earlier versions took one weight a joint, so this is a selection
+        return table
+    if whole and {x % n for x in given if -n <= x < n} == set(range(n)):
+        text = f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write weights = {given} if you mean these."
+        warnings.warn(text, UserWarning, stacklevel=2)
+        return table
+    text = f"{key}.joints selects joints now; {given} is read as weights, as in earlier versions: write weights = {given}."
+    warnings.warn(text, DeprecationWarning, stacklevel=2)
+    return {name: value for name, value in table.items() if name != "joints"} | {"weights": given}
+
+
 def _argument(name: str, value: Any, key: str) -> Any:
+    if name == "joints":
+        return value  # the function checks it
     if name == "fold":
         return components.decode({"kind": value} if isinstance(value, str) else value, metrics.Fold, key)
     return checks.word(key, value, _NO_NUMBERS[name]) if name in _NO_NUMBERS else numbers(value, key)
@@ -170,18 +201,19 @@ def _fold_of(result: Any, key: str) -> str:
     return owners[result]
 
 
-def _objective(terms: Any, requirements: Any) -> Objective:
+def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objective:
     if not isinstance(terms, list) or not terms:
         raise checks.fail("objective", terms or Words("nothing"), "at least one [[objective]] table", 'Such as kind = "tracking".')
     total = Objective()
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
-        term, weight = _called(objectives, OBJECTIVES, entry, key, ("weight",)), numbers(entry.get("weight", 1.0), f"{key}.weight")
+        term = _called(objectives, OBJECTIVES, entry, key, names, ("weight",))
+        weight = numbers(entry.get("weight", 1.0), f"{key}.weight")
         total += components.construct(term.__mul__, {"weight": weight}, key)
     if not isinstance(requirements, list):
         raise checks.fail("requirement", requirements, "[[requirement]] tables", 'Such as kind = "margin_above".')
     for i, entry in enumerate(requirements):
-        total += _called(objectives, REQUIREMENTS, entry, f"requirement[{i}]")
+        total += _called(objectives, REQUIREMENTS, entry, f"requirement[{i}]", names)
     return total
 
 
@@ -243,12 +275,24 @@ def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
     return np.asarray(entry["values"], entry["dtype"]).reshape(entry["shape"])
 
 
+def _with_new_names(table: Any) -> Any:
+    """The table of an objective in which the weights of a quantity, in earlier versions called `joints`, have their name."""
+    if isinstance(table, list):
+        return [_with_new_names(x) for x in table]
+    if not isinstance(table, dict):
+        return table
+    found = {key: _with_new_names(value) for key, value in table.items()}
+    if table.get("kind") in quantities.MEMBERS and holds_weights(table.get("joints")):
+        found["weights"] = found.pop("joints")
+    return found
+
+
 def _decoded(data: dict[str, Any]) -> TuneResult:
     """The result that `save_tuning` encoded."""
     start = from_dict(data["start"]).scenario
     values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
     setup = TuneSetup(
-        objective=checked(components.decode_fields(Objective, data["objective"], "objective")),
+        objective=checked(components.decode_fields(Objective, _with_new_names(data["objective"]), "objective")),
         perturbations={key: components.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
         risk=as_risk(Risk(*data["risk"])),
         **data["setup"]

@@ -6,7 +6,8 @@
 `log`           what was logged, read and checked            `coordinates`  what is looked for, so that bodies stay bodies
 `smoothing`, `regression`  the start                         `shooting`     simulation error over windows
 `search`        Gauss-Newton inside limits                   `statistics`   standard errors, and what cannot be told
-`result`        `Identification`                             `_excitation`  a reference that makes a log tell much
+`structure`     terms that the fit lacks                     `result`       `Identification`
+`_excitation`   a reference that makes a log tell much
 """
 
 from iblf_jax.identification._excitation import excitation as excitation

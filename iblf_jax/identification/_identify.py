@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
-from iblf_jax.engine.replay import slopes_under
+from iblf_jax.engine.replay import slopes, slopes_under
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import Log, Said, read
 from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
@@ -21,6 +22,7 @@ from iblf_jax.identification.result import FINEST, LACKS, Identification, judged
 from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
 from iblf_jax.identification.smoothing import Smoothed, smoothed
 from iblf_jax.identification.standstill import BETTER, HOPELESS, NONE, SLOW, WORSE, by_the_law, free_about_standstill
+from iblf_jax.identification.structure import LeftOut, left_out
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 
@@ -145,6 +147,7 @@ def identify(
             worse,
             tuple(x.name for x in logs),
             time.monotonic() - begin,
+            partial(_lacking_terms, replayed, c, seen),
         )
     return dataclasses.replace(result, scenario=astype(result.scenario, given.initial.q.dtype), start=given)
 
@@ -157,6 +160,14 @@ def _check_delay(delay: Any) -> None:
     if number.ndim != 0 or not abs(float(number)) <= LARGEST_DELAY:
         expected = f"one number [s], of a size of at most {LARGEST_DELAY:g} s"
         raise checks.fail("delay", delay, expected, "Leave it out to have it found from the log.")
+
+
+def _lacking_terms(scenario: Scenario, c: Coordinates, seen: Smoothed, z: np.ndarray, fitted: np.ndarray) -> LeftOut:
+    """The terms that a fit which ended at z, the delay last, lacks; `fitted` are the numbers that it moved, (p + 1,) bool."""
+    x, _ = to_x(c, z[:-1])
+    points = (jnp.asarray(a) for a in (x, seen.t, seen.q, seen.dq, seen.ddq))
+    at_end = slopes(scenario, *points, places=c.places)
+    return left_out(seen, np.asarray(at_end.torque), np.asarray(at_end.by_x), float(z[-1]), fitted)
 
 
 def _is_continuous(log: Any) -> bool:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,9 +17,11 @@ from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, to_x
 from iblf_jax.identification.regression import Start
 from iblf_jax.identification.shooting import Prior, Refined, Windows
 from iblf_jax.identification.statistics import UNKNOWN, Known, Whiteness, in_words, known, whiteness
+from iblf_jax.identification.structure import LeftOut, biased, remedy_for
+from iblf_jax.identification.structure import in_words as in_words_of
 from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
-from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.paths import parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.distributions import Perturbation, joint_normal, value
 
@@ -26,6 +29,8 @@ WHITE, SLIGHT = 1e-3, 0.05
 """Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is above the second."""
 LACKS, FINEST = 1.5, 1e-5
 """Times the positions' noise from which what is left is not noise, and the least noise that counts [rad]."""
+MORE_THAN_NOISE = 1.05
+"""Times the positions' noise from which terms are looked for that the fit lacks."""
 CLEARLY = 1.1
 """Times that standard errors are widened from which it is told."""
 SEEN = 1e-8
@@ -45,7 +50,10 @@ class Number(NamedTuple):
     error: float | None
     """Standard error."""
     verdict: str
-    """"told", "cannot be told", "at its limit", or "left free": the width of a friction that is not of this law."""
+    """"told", "cannot be told", "at its limit", "left free": the width of a friction that is not of this law, or "biased": a term that
+    was left out of the fit moves it by more than its standard error, or by more than 5 % of it."""
+    bias: float | None = None
+    """What the terms that were left out add to it, where it is biased."""
 
     @property
     def digits(self) -> str:
@@ -77,6 +85,11 @@ class Fit(NamedTuple):
     def lacking(self) -> float:
         """How many times the noise of the positions is left."""
         return self.after / max(self.noise, FINEST)
+
+    @property
+    def has_structure(self) -> bool:
+        """Whether what is left may follow something: it is more than the positions' noise, or coloured and no rounding."""
+        return self.lacking > MORE_THAN_NOISE or (not self.is_white and self.after > FINEST)
 
     @property
     def is_white(self) -> bool:
@@ -201,8 +214,8 @@ class Identification:
         return [self._heading(), *(line.strip() for line in self._lines())]
 
     def tables_html(self) -> dict[str, str]:
-        """Its tables as HTML, numbers that the log cannot tell in bold."""
-        bold = [i for i, number in enumerate(self.numbers) if number.verdict == UNTOLD]
+        """Its tables as HTML, numbers that the log cannot tell, or that are biased, in bold."""
+        bold = [i for i, number in enumerate(self.numbers) if number.verdict in (UNTOLD, BIASED)]
         return {"Numbers": tables.as_html(HEADING, self._rows(), bold), "Fit": tables.as_html(FIT, self._fits())}
 
     def _heading(self) -> str:
@@ -287,7 +300,7 @@ class Identification:
         return plotting.identification(self, **options)
 
 
-TOLD, UNTOLD, LIMITED, FREE = "told", "cannot be told", "at its limit", "left free"
+TOLD, UNTOLD, LIMITED, FREE, BIASED = "told", "cannot be told", "at its limit", "left free", "biased"
 """Verdicts."""
 GROUP = "identified"
 """Name of the draws that all identified numbers share."""
@@ -327,6 +340,7 @@ def judged(
     worse: float,
     logs: tuple[str, ...],
     seconds: float,
+    lacking_terms: Callable[[np.ndarray, np.ndarray], LeftOut],
 ) -> Identification:
     """The result.
 
@@ -343,6 +357,7 @@ def judged(
       worse: how many times as much the law of friction leaves as free torques about standstill; 0 without such.
       logs: their names.
       seconds: what it took.
+      lacking_terms: z and which of its numbers were fitted -> the terms that the fit lacks.
     """
     x, slope = to_x(c, end.z[:-1])
     p = len(x)
@@ -366,7 +381,11 @@ def judged(
     beyond = np.zeros(p + 1)
     beyond[looked] = asked_for
     x = np.where(end.free.held, c.x, x)
-    numbers = tuple(_number(c, i, float(x[i]), float(errors[i]), beyond[i], end, ends, scale) for i in range(p))
+    lacks = LeftOut((), np.zeros(p))
+    if any(one.has_structure for one in fit):
+        lacks = lacking_terms(end.z, looked & ~_at_limits(end, ends, scale))
+    bias = biased(lacks, x, errors[:p])
+    numbers = tuple(_number(c, i, float(x[i]), float(errors[i]), beyond[i], end, ends, scale, float(bias[i])) for i in range(p))
     combinations = tuple(in_words(direction, tuple(names)) for direction in found.directions.T)
     untold = tuple(words for words, size in zip(combinations, found.singular, strict=True) if not size > 1.0 / UNKNOWN)
     delay_error = float(errors[p]) if delay_found else None
@@ -391,7 +410,13 @@ def judged(
         w.t,
         w.kept,
         np.array([one.correlations for one in white]),
-        (*notes, *_limited(c, numbers, beyond, ends), *_notes(found, numbers, fit), *_freed(start, end, worse)),
+        (
+            *_left_out_in_words(start, lacks, numbers),
+            *notes,
+            *_limited(c, numbers, beyond, ends),
+            *_notes(found, numbers, fit),
+            *_freed(start, end, worse),
+        ),
         logs,
         end.steps,
         seconds,
@@ -404,8 +429,33 @@ def _without_limits(information: np.ndarray, scores: np.ndarray, scale: np.ndarr
     return -scale * np.linalg.lstsq(A, g, rcond=SEEN)[0]
 
 
+def _at_limits(end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray) -> np.ndarray:
+    """Which numbers, the delay last, are at an end of their range, (p + 1,) bool."""
+    return np.any([np.abs(end.z - side) < AT_END * scale for side in ends], axis=0)
+
+
+def _left_out_in_words(start: Scenario, lacks: LeftOut, numbers: tuple[Number, ...]) -> list[str]:
+    """What was left out, what to do, and which numbers make up for it."""
+    joints = joint_names(start.plant, start.n)
+    available = [p.path for p in parameters(start, named=False) if p.path.startswith(("plant.", "disturbance."))]
+    names = tuple(number.name for number in numbers)
+    lines = [in_words_of(one, joints[one.joint], remedy_for(one, available, names)) for one in lacks.findings]
+    moved = [f"{x.name} by about {x.bias:+.2g} {x.unit}" for x in numbers if x.verdict == BIASED]
+    if moved:
+        lines.append(f"These numbers make up for what was left out, and are biased: {', '.join(moved)}.")
+    return lines
+
+
 def _number(
-    c: Coordinates, i: int, x: float, error: float, beyond: float, end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray
+    c: Coordinates,
+    i: int,
+    x: float,
+    error: float,
+    beyond: float,
+    end: Refined,
+    ends: tuple[np.ndarray, ...],
+    scale: np.ndarray,
+    bias: float = 0.0,
 ) -> Number:
     def number(value, error, verdict):
         return Number(c.names[i], c.units[i], float(c.x[i]), value, error, verdict)
@@ -416,6 +466,8 @@ def _number(
     if not np.isfinite(error):
         pushed = (at_low and beyond < -AT_END * scale[i]) or (at_high and beyond > AT_END * scale[i])
         return number(x, None, LIMITED) if pushed else number(None, None, UNTOLD)
+    if bias and not (at_low or at_high):
+        return number(x, error, BIASED)._replace(bias=bias)
     return number(x, error, LIMITED if at_low or at_high else TOLD)
 
 

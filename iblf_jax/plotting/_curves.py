@@ -189,8 +189,11 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
 
 
 def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> int:
-    """`joint` if the robot has it; ValueError if not."""
+    """The index of a joint, given by its index or its name, if the robot has it; ValueError if not."""
     n = curves[0].run.n
+    names = joint_names(getattr(curves[0].run.scenario, "plant", None), n)
+    if isinstance(joint, str) and joint in names:
+        return names.index(joint)
     if isinstance(joint, bool) or not isinstance(joint, int | np.integer) or not 0 <= joint < n:
         raise checks.fail(field, joint, f"a joint, 0 to {n - 1}")
     return int(joint)

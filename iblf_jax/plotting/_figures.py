@@ -290,12 +290,12 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
 
 
 @_style.styled()
-def phase_portrait(runs: Runs, joints: tuple[int, int] = (0, 1)) -> Figure:
+def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> Figure:
     """Position of one joint against another's, with the reference: the paper's figure 6.
 
     Args:
       runs: one run, or a dict of runs by name.
-      joints: which two joints, from 0.
+      joints: which two joints, each by its index, from 0, or its name.
 
     Returns:
       The figure.
@@ -304,9 +304,12 @@ def phase_portrait(runs: Runs, joints: tuple[int, int] = (0, 1)) -> Figure:
       ValueError: no run, a batch, or not two joints that the robot has.
     """
     curves = curves_of(runs)
-    if not isinstance(joints, tuple | list) or len(joints) != 2 or joints[0] == joints[1]:
-        raise checks.fail("joints", joints, "two different joints, such as (0, 1)")
+    expected = "two different joints, such as (0, 1)"
+    if not isinstance(joints, tuple | list) or len(joints) != 2:
+        raise checks.fail("joints", joints, expected)
     pair = (check_joint(curves, joints[0], "joints"), check_joint(curves, joints[1], "joints"))
+    if pair[0] == pair[1]:
+        raise checks.fail("joints", joints, expected)
     figure = _style.new_figure(4.6, 4.9)
     draw_phase_portrait(figure.subplots(), curves, pair)
     _style.entitle(figure, "Phase portrait of the positions", curves)

@@ -56,8 +56,11 @@ def _numbers(axes: Axes, known: Identification) -> None:
             axes.text(1.01, i, number.verdict, color=colour, **beside)
             continue
         change, error = (number.value - number.start) / scale, 3.0 * number.error / scale
-        axes.errorbar(change, i, xerr=error, fmt="o", markersize=3.5, capsize=2, color=_style.colour(0))
-        axes.text(1.01, i, f"{number.digits} $\\pm$ {number.error:.2g} {number.unit}", **beside)
+        is_biased = number.verdict == "biased"
+        colour = _style.alarm() if is_biased else _style.colour(0)
+        axes.errorbar(change, i, xerr=error, fmt="o", markersize=3.5, capsize=2, color=colour)
+        words = f"{number.digits} $\\pm$ {number.error:.2g} {number.unit}" + (", biased" if is_biased else "")
+        axes.text(1.01, i, words, **beside)
     axes.axvline(0.0, color=_style.bound(), linewidth=0.8)
     axes.set_yticks(range(len(chosen)), [plain(number.name) for number in chosen], fontsize=_style.size(7))
     axes.set_ylim(len(chosen) - 0.5, -0.5)

@@ -2,42 +2,44 @@
 
 Two questions hide in "which law is better".  At equal gains k1 and K2, a law whose barrier term is larger works harder and looks
 better: the integral form's is twice the logarithmic one's (p = 1), identically.  So each law is also run at **equal effort**: its gains
-are scaled by one factor, the one nearest 1 at which the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2), is the first law's.
+are scaled by one factor at which the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2), is the first law's.
 
-The factor is sought outward from 1 on a geometric grid, and then by SciPy's brentq inside the bracket nearest to 1; a law
-for which there is none in the range is named with the reason.
+The factor is looked for on a grid from 1/32 to 32 whose runs are one batch, and every crossing is refined (`equal_effort`): the effort
+need not grow with the factor, and trials may fail.  Of several crossings the one nearest to 1, by |ln factor|, is taken.  What was
+searched, and which trials failed, is in the result.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.controllers import KEEPERS, LAWS, Controller, Saturated, law_by_name
 from iblf_jax.controllers.systems import observer_of
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.status import Status, describe
+from iblf_jax.core.status import Status
+from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.simulate import simulate
+from iblf_jax.engine.step import Run
 from iblf_jax.observers import NoObserver
-from iblf_jax.simulation.metrics import AboveGravity, standard, watched
+from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.comparison import NO_EFFORT, Comparison
-
-RATIO = math.sqrt(2.0)
-"""Grid of factors: powers of this."""
-RINGS = 10
-"""Powers tried on either side of 1: factors from 1/32 to 32."""
-ROOT_TOLERANCE = 1e-7
-EDGE_BISECTIONS = 4
-"""How closely the edge of the factors that work is approached."""
+from iblf_jax.studies.comparison import Comparison
+from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
+from iblf_jax.studies.recommended import needed_dt
 
 NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
@@ -56,7 +58,8 @@ def compare(
 ) -> Comparison:
     """Runs several laws on one scenario, at their gains and at equal effort.
 
-        factor_i = the c nearest 1 with  rms|tau - G0(q)| of law i at gains c k1, c K2  =  that of the first law
+        factor_i = the c of [1/32, 32] nearest to 1, by |ln c|, with
+                   rms|tau - G0(q)| of law i at gains c k1, c K2  =  that of the first law
 
     Args:
       scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; the k1, K2, o and reading of its own law
@@ -64,10 +67,11 @@ def compare(
       laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the name to show.  The first one sets the
         effort.
       duration, dt, method, record_every: as `simulate`.
-      equal_effort: whether to look for the factors; about ten further runs a law.
+      equal_effort: whether to look for the factors; a few batches of 89 further runs a law.
 
     Returns:
-      A `Comparison`: prints as two tables and says what was held equal; `rollouts`, `equal_effort`, `factors`, `plot()`, `to_pandas()`.
+      A `Comparison`: prints as two tables and says what was held equal; `rollouts`, `equal_effort`, `factors`, `searches` (which
+      factors were tried, and which failed), `plot()`, `to_pandas()`.
 
     Raises:
       ValueError: an unknown law, no law, or bad arguments of `simulate`.
@@ -79,17 +83,22 @@ def compare(
     scenarios = {name: _with_law(scenario, law) for name, law in named.items()}
     options: dict[str, Any] = {"duration": duration, "dt": dt, "method": method, "record_every": record_every}
     rollouts = {name: _run(one, options) for name, one in scenarios.items()}
-    factors: dict[str, float] = {}
-    reasons: dict[str, str] = {}
-    equal: dict[str, Rollout] = {}
-    if equal_effort:
-        for name, one in scenarios.items():
-            first, own = next(iter(rollouts.items())), rollouts[name]
-            factors[name], reasons[name], run = (1.0, "", own) if name == first[0] else _at_effort_of(first, one, own, options)
-            if run is not None:
-                equal[name] = run
     gains = {name: _gains_in_words(one.controller) for name, one in scenarios.items()}
-    return Comparison(rollouts, equal, factors, {name: why for name, why in reasons.items() if why}, gains)
+    if not equal_effort:
+        return Comparison(rollouts, {}, {}, {}, gains)
+    first = next(iter(rollouts))
+    others = {name: one for name, one in scenarios.items() if name != first}
+    found = {name: _at_effort_of(first, rollouts[first], rollouts[name], one, options) for name, one in others.items()}
+    found[first] = _Equal(1.0, rollouts[first])
+    ordered = {name: found[name] for name in rollouts}
+    return Comparison(
+        rollouts,
+        {name: one.run for name, one in ordered.items() if one.run is not None},
+        {name: one.factor for name, one in ordered.items()},
+        {name: one.reason for name, one in ordered.items() if one.reason},
+        gains,
+        {name: one.search for name, one in ordered.items() if one.search is not None},
+    )
 
 
 def _named_laws(laws: Laws) -> dict[str, str | Controller]:
@@ -154,107 +163,89 @@ def gain_names(law: Controller) -> tuple[str, ...]:
     return tuple(getattr(inner, "gains", None) or (name for name in ("k1", "K2") if getattr(inner, name, None) is not None))
 
 
-def _at_effort_of(
-    first: tuple[str, Rollout], scenario: Scenario, own: Rollout, options: Mapping[str, Any]
-) -> tuple[float, str, Rollout | None]:
-    """The factor at which a law has the first one's effort, or NaN and the reason; and the run there."""
-    title, reference = first
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Equal:
+    """A law at the first one's effort, or why there is no such thing."""
+
+    factor: float
+    run: Rollout | None = None
+    reason: str = ""
+    search: EffortSearch | None = None
+
+
+def _at_effort_of(title: str, reference: Rollout, own: Rollout, scenario: Scenario, options: Mapping[str, Any]) -> _Equal:
+    """A law with gains scaled so that it has the first one's effort."""
     if int(reference.status) & NO_EFFORT:
-        return math.nan, f"the first law, {title}, failed itself, so it sets no effort", None
+        return _Equal(float("nan"), reason=f"the first law, {title}, failed itself, so it sets no effort")
     names = gain_names(scenario.controller)
     if not names:
-        return math.nan, "it has no gains to scale: no k1, K2, and no class attribute `gains`", None
+        return _Equal(float("nan"), reason="it has no gains to scale: no k1, K2, and no class attribute `gains`")
+    target = float(reference.metrics.effort_above_gravity)
+    dt_for = partial(_dt_for, dt=options["dt"], method=options["method"])
+    inaccurate = bool((int(reference.status) | int(own.status)) & Status.INACCURATE)
+    found = search(_trials_of(scenario, names, options), target, dt_for, inaccurate)
+    for factor in found.crossings:
+        run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
+        if not int(run.status) & NO_EFFORT:
+            return _Equal(factor, run, search=found)
+    return _Equal(float("nan"), reason=found.in_words(), search=found)
+
+
+def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:
+    """Path -> gains times a factor, or times each of several factors, (N, ...)."""
     inner = unwrapped(scenario.controller)
-    runs: dict[float, Rollout] = {1.0: own}
+    gains = {f"controller.{name}": np.asarray(getattr(inner, name)) for name in names}
+    if np.ndim(factor) == 0:
+        return {path: gain * factor for path, gain in gains.items()}
+    return {path: np.asarray(factor).reshape(-1, *(1,) * gain.ndim) * gain for path, gain in gains.items()}
 
-    def effort(factor: float) -> float:
-        if factor not in runs:
-            scaled = {f"controller.{name}": np.asarray(getattr(inner, name)) * factor for name in names}
-            runs[factor] = _run(with_parameters(scenario, scaled), options)
-        return math.nan if int(runs[factor].status) & NO_EFFORT else float(runs[factor].metrics.effort_above_gravity)
 
-    factor = factor_nearest_one(effort, float(reference.metrics.effort_above_gravity))
-    return (factor, "", runs[factor]) if math.isfinite(factor) else (factor, _why_not(runs, reference), None)
+def _dt_for(trials: Trials, *, dt: float, method: str) -> float | None:
+    """A step that would do for trials, the smallest that one of them needs [s]."""
+    return needed_dt(trials.status, trials.mode, trials.error, dt, method)
+
+
+def _trials_of(scenario: Scenario, names: Sequence[str], options: Mapping[str, Any]) -> Callable[[np.ndarray], Trials]:
+    """A function of factors (N,) that runs all of them in one batch, of one size, so that it is compiled once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        scenario = canonical(scenario)
+    dtype, size = scenario.initial.q.dtype, len(grid())
+    folds = as_folds((AboveGravity(),), dtype, scenario)
+    steps = checks.whole_steps(options["duration"], options["dt"])
+    run = Run(steps, options["method"], mechanism=mechanism_of(scenario))
+    noise = noise_of(scenario, jax.random.PRNGKey(0), 0)
+
+    def trials(factors: np.ndarray) -> Trials:
+        padded = np.resize(factors, size)
+        varied = {path: jnp.asarray(x, dtype) for path, x in _scaled(scenario, names, padded).items()}
+        varied |= {name: jnp.broadcast_to(x, (size, *x.shape)) for name, x in noise.items()}
+        found = _batch(scenario, varied, folds, jnp.asarray(options["dt"], dtype), run=run)
+        columns = (found.metrics["effort_above_gravity"], found.status, found.fastest_mode, found.metrics[RELATIVE])
+        return Trials(*(np.asarray(x)[: len(factors)] for x in columns))
+
+    return trials
+
+
+@partial(jax.jit, static_argnames="run")
+def _batch(scenario: Scenario, varied: dict[str, jax.Array], folds: Any, dt: jax.Array, *, run: Run):
+    return run_batch(scenario, varied, folds, dt, run)
 
 
 def factor_nearest_one(effort: Callable[[float], float], target: float) -> float:
-    """The factor nearest 1, by |ln|, at which effort(factor) = target, or NaN if there is none in the range.
+    """The factor of [1/32, 32] nearest to 1, by |ln|, at which effort(factor) = target, or NaN if none was found.
 
     Args:
       effort: factor -> effort [N m], NaN for a run that failed.
       target: effort to reach [N m].
     """
-    if effort(1.0) == target:
-        return 1.0
-    excess = functools.partial(_excess, effort, target)
-    start = excess(0.0)
-    ends: dict[int, float | None] = {1: start, -1: start}
-    for ring in range(1, RINGS + 1):
-        roots = []
-        for sign, last in ends.items():
-            if last is None:  # beyond a run that failed
-                continue
-            power, here = float(sign * ring), excess(sign * ring)
-            ends[sign] = here
-            if here is None:
-                power, here = _last_sound(excess, sign * (ring - 1), last, sign * ring)
-            if last * here <= 0.0:
-                roots += _root(excess, sign * (ring - 1), power)
-        if roots:
-            return RATIO ** min(roots, key=abs)
-    return math.nan
 
+    def trials(factors: np.ndarray) -> Trials:
+        efforts = np.array([effort(float(factor)) for factor in factors], float)
+        none = np.zeros(len(factors))
+        return Trials(efforts, none.astype(int), none, none)
 
-def _excess(effort: Callable[[float], float], target: float, power: float) -> float | None:
-    """What the effort at RATIO^power is above the target, or None for a run that failed."""
-    value = effort(RATIO**power) - target
-    return value if math.isfinite(value) else None
-
-
-def _last_sound(excess: Callable[[float], float | None], inner: float, value: float, outer: float) -> tuple[float, float]:
-    """The outermost power, by bisection between one that works and one that fails, that works; and the excess there."""
-    for _ in range(EDGE_BISECTIONS):
-        middle = 0.5 * (inner + outer)
-        here = excess(middle)
-        if here is None:
-            outer = middle
-        else:
-            inner, value = middle, here
-    return inner, value
-
-
-def _root(excess: Callable[[float], float | None], a: float, b: float) -> list[float]:
-    """The root in a bracket, or none if a run inside it fails."""
-    from scipy.optimize import brentq
-
-    def sound(power: float) -> float:
-        value = excess(power)
-        if value is None:
-            raise FloatingPointError
-        return value
-
-    try:
-        return [brentq(sound, a, b, xtol=ROOT_TOLERANCE)]
-    except FloatingPointError:
-        return []
-
-
-def _why_not(runs: Mapping[float, Rollout], reference: Rollout) -> str:
-    """Why no factor was found, in words."""
-    target = float(reference.metrics.effort_above_gravity)
-    sound = {factor: run for factor, run in runs.items() if not int(run.status) & NO_EFFORT}
-    if not sound:
-        return "every run failed: " + describe(int(runs[1.0].status) & NO_EFFORT)
-    efforts = [float(run.metrics.effort_above_gravity) for run in sound.values()]
-    side = "stays below" if max(efforts) < target else "stays above" if min(efforts) > target else "misses"
-    where = f"{side} {target:.4g} N m ({min(efforts):.4g} to {max(efforts):.4g})"
-    text = f"its effort {where} for factors {min(sound):.3g} to {max(sound):.3g}"
-    failed = sorted((factor for factor in runs if factor not in sound), key=lambda factor: abs(math.log(factor)))
-    if failed:
-        status = Status(int(runs[failed[0]].status) & NO_EFFORT)
-        text += f"; at {failed[0]:.3g} the run fails: {describe(status)}"
-        text += " (a smaller dt may reach further)" if status & Status.STEP_TOO_LARGE else ""
-    return text
+    return search(trials, target).factor
 
 
 def _gains_in_words(law: Controller) -> str:

@@ -12,8 +12,9 @@ import numpy as np
 from iblf_jax.barriers import Integral
 from iblf_jax.core import tables
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.status import FAILED, describe
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch
 
 HELD = {"gains": "Gains as given", "effort": "Equal effort"}
 
@@ -52,9 +53,6 @@ class Row(NamedTuple):
     """sum |tau_k+1 - tau_k| [N m]."""
     status: str
 
-
-NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
-"""Flags of runs whose effort is not to be compared; constraints that a law does not know of are no obstacle."""
 
 OPTIONAL = ("velocity_margin", "region_margin")
 """Of constraints that not every scenario has."""
@@ -114,6 +112,13 @@ class Comparison:
     """Law -> why there is none."""
     gains: dict[str, str]
     """Law -> its gains in words."""
+    searches: dict[str, EffortSearch] = dataclasses.field(default_factory=dict)
+    """Law -> the search for its factor: all trials, with those that failed; without the first law."""
+
+    @property
+    def nearest(self) -> dict[str, tuple[float, float]]:
+        """Law without a factor -> factor and effort [N m] of the trial whose effort is nearest to the first law's."""
+        return {name: found.nearest for name, found in self.searches.items() if name not in self.equal_effort}
 
     @property
     def table(self) -> dict[str, tuple[Row, ...]]:
@@ -145,9 +150,20 @@ class Comparison:
             else:
                 effort = float(self.rollouts[first].metrics.effort_above_gravity)
                 held = f"Held equal: the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2) = {effort:.4g} N m, that of {first}."
-            scaled = "Each law's gains (k1 and K2, or its own) are scaled by one factor, the one nearest 1 that does it."
-            notes["effort"] = [f"{held} {scaled}", *(f"{name}: no factor; {why}." for name, why in self.reasons.items())]
+            scaled = (
+                "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found from 1/32 to 32 that do it, the one "
+                "nearest to 1 (by |ln factor|)."
+            )
+            notes["effort"] = [f"{held} {scaled}", *self._searches_in_words()]
         return notes
+
+    def _searches_in_words(self) -> list[str]:
+        """Why a law has no factor, and for the others what was searched where that says more than the factor."""
+        lines = [f"{name}: no factor; {why}." for name, why in self.reasons.items()]
+        for name, found in self.searches.items():
+            if name not in self.reasons and (found.failed or len(found.crossings) > 1):
+                lines.append(f"{name}: factor {self.factors[name]:.4g}; {found.in_words()}.")
+        return lines
 
     def __repr__(self) -> str:
         run = next(iter(self.rollouts.values()))

@@ -25,8 +25,8 @@ from iblf_jax.testing._contract import (
 )
 from iblf_jax.testing.joints import check_scenario, joints_of, scenario_for
 from iblf_jax.testing.metrics import LENGTH, at_rest, parts, samples, samples_from
-from iblf_jax.tuning.objectives import Objective, Requirement, complete
-from iblf_jax.tuning.quantities import Quantities, Quantity
+from iblf_jax.tuning.objectives import Objective, Requirement, complete, for_scenario
+from iblf_jax.tuning.quantities import MetricResult, Peak, Quantities, Quantity, TimeIntegral
 
 DIRECTIONS = 3
 """Directions in which second derivatives are looked at."""
@@ -55,18 +55,33 @@ def check_objective(objective: Any, *, scenario: Scenario | None = None, duratio
         limit: Any = 1.0
         with examine(objective, "Quantity", Quantity):
             objective = Objective((), (Requirement(objective, limit, limit),))
+    with examine(objective, "Objective", Objective) as findings:
+        scenario = scenario_for(findings, objective, scenario, n)
+    objective = _with_joints(objective, scenario)
     for quantity in objective.quantities:
+        selects = isinstance(quantity, TimeIntegral | Peak | MetricResult)
+        joints = scenario.n if selects else joints_of(quantity)
         with examine(quantity, "Quantity", Quantity) as findings:
-            _quantity(findings, in_dtype(quantity, "float64"), duration, joints_of(quantity))
+            _quantity(findings, in_dtype(quantity, "float64"), duration, joints)
     with examine(objective, "Objective", Objective) as findings:
         findings.require(objective.quantities, "it has neither terms nor requirements", "Such as ij.objectives.tracking()")
         findings.stop_if_any()
-        _on_a_run(findings, in_dtype(objective, "float64"), scenario_for(findings, objective, scenario, n), duration)
+        _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
 
 
-def _quantity(findings: Findings, quantity: Any, duration: float, joints: int) -> None:
+def _with_joints(objective: Objective, scenario: Scenario) -> Objective:
+    """The objective with the joints of the scenario's robot; a selection that does not fit it is a finding."""
+    with examine(objective, "Objective", Objective) as findings:
+        try:
+            return for_scenario(objective, scenario)
+        except ValueError as error:
+            findings.add(str(error))
+    return objective
+
+
+def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> None:
     step = duration / LENGTH
-    some = samples(np.random.default_rng(4), joints, step)
+    some = samples(np.random.default_rng(4), n, step)
     # Between whole steps, so that no sample stands where a quantity begins to count.
     some = dataclasses.replace(some, t=some.t + 0.5 * step)
     for dtype in ("float64", "float32"):

@@ -30,7 +30,7 @@ from iblf_jax.tuning import newton
 from iblf_jax.tuning import probes as probing
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
-from iblf_jax.tuning.objectives import Objective, check_signals, checked, complete, is_complete, is_smoothed
+from iblf_jax.tuning.objectives import Objective, check_signals, checked, complete, for_scenario, is_complete, is_smoothed
 from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, values_at
 from iblf_jax.tuning.probes import Probes
@@ -293,6 +293,7 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
         raise checks.fail("runs", runs, "1 without perturbations", "All runs would be the same: give perturbations.")
     blocks, box = layout(scenario, parameters, float(timing["dt"]), timing["method"])
     checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
+    goal = for_scenario(goal, scenario)
     check_signals(goal, scenario)
     fit_joints(goal, scenario.n, "objective")
     ones = complete(goal, np.ones(len(goal.terms)))

@@ -13,11 +13,19 @@ runs).  A requirement holds where
     g = (value - limit) / scale < 0        (its sign turned for "above" requirements);
 
 the tuning keeps g below zero (`newton`), in the report it passes or fails, with a confidence.
+
+In all functions `joints=` selects the joints that count, by index, name, slice or one truth value each (`core.joints`); `weights=` is one
+number, or one for each joint (or for each selected joint).  A limit may be one number for all joints, or one for each:
+
+    ij.objectives.peak_torque_below([140, 140, 140, 27, 27, 27]) + ij.objectives.error_below(0.01, joints=["wrist_1", "wrist_2"])
+
+Limits of single joints are kept as one requirement on the largest part of a limit, max_i |y_i| / limit_i < 1.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import jax
@@ -25,8 +33,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.joints import Selection, holds_weights, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine.derivatives import Outer as Outer
+from iblf_jax.robots import joint_names
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, TimeIntegral
@@ -79,6 +89,7 @@ class Requirement:
       allowed: share of perturbed runs that may break it, () [1], >= 0; 0.01 if not given.
       event: "value": broken where g >= 0; "violated": broken where the run left its bounds or ran away; "value" if not given.
       name: what reports call it; "requirement" if not given.
+      function: the one that made it, for messages; "" if not given.
     """
 
     quantity: Quantity
@@ -87,6 +98,7 @@ class Requirement:
     allowed: jax.Array = leaf("1", sign="nonnegative", shape="scalar", default=0.01)
     event: str = static(default="value")
     name: str = static(default="requirement")
+    function: str = static(default="")
 
     def check(self) -> None:
         """Raises ValueError for a share above 1, or another event."""
@@ -101,8 +113,10 @@ class Requirement:
     @property
     def measure(self) -> tuple[float, str]:
         """Sign and unit with which its numbers are shown: a deficit is shown as a margin."""
-        signal = getattr(self.quantity, "signal", "")
-        return -1.0 if signal in DEFICITS else 1.0, getattr(self.quantity, "units", {}).get(signal, "")
+        if not isinstance(self.quantity, Peak):
+            return 1.0, ""
+        sign = -1.0 if self.quantity.signal in DEFICITS else 1.0
+        return sign, self.quantity.unit
 
     def __add__(self, other: Any) -> Objective:
         return Objective((), (self,)) + other
@@ -212,7 +226,7 @@ def _completed(t: Term, x: Any) -> Term:
     limit = x if t.limit is None and t.shape == "above" else t.limit
     quantity = t.quantity
     if isinstance(quantity, Peak) and t.scale is None:
-        quantity = Peak(scale, quantity.signal, quantity.joints, quantity.after, quantity.smoothing)
+        quantity = dataclasses.replace(quantity, scale=scale)
     return Term(quantity, t.weight, scale, limit, t.sharpness, t.shape, t.name)
 
 
@@ -250,17 +264,180 @@ def _of_the_error(quantity: Quantity) -> bool:
     return isinstance(quantity, MetricResult) and isinstance(quantity.fold, Tracking | Settling)
 
 
-def _one_term(name: str, quantity: Quantity, scale: Any) -> Objective:
-    return Objective((Term(quantity, scale=scale, name=name),))
-
-
-def tracking(*, joints: Any = 1.0, after: Any = 0.0, scale: Any = None) -> Objective:
-    """Integral of the squared position error.
-
-        int |e1|^2 dt / scale
+def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
+    """The objective with its selections of joints as indices of the scenario's robot, weights and limits checked.
 
     Args:
-      joints: weight of each joint's error, one number or (n,).
+      objective: as the user composed it.
+      scenario: of the n joints that names, slices and numbers of weights refer to.
+
+    Raises:
+      ValueError: a joint that the robot does not have, or another number of weights or limits; the message names the function.
+    """
+    names = joint_names(scenario.plant, scenario.n)
+    terms = tuple(_part_of(t, t.name, names) for t in _composed(objective).terms)
+    requirements = tuple(_part_of(r, r.function or r.name, names) for r in objective.requirements)
+    return Objective(terms, requirements)
+
+
+def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:
+    """A term or a requirement whose quantity knows its joints."""
+    quantity = part.quantity
+    if not isinstance(quantity, TimeIntegral | Peak | MetricResult):
+        return part  # one of the user's own
+    if isinstance(quantity, Peak) and quantity.signal == "region_deficit":
+        return part  # regions belong to no joint
+    if isinstance(quantity, MetricResult):
+        function = "metric"
+        if quantity.joints is None:
+            return part  # its weights belong to the numbers of the metric, which may be other than the joints
+    chosen = indices(f"{function}: joints", quantity.joints, names)
+    _check_count(function, quantity, len(chosen), len(names))
+    if quantity.joints is None:
+        return part
+    return dataclasses.replace(part, quantity=dataclasses.replace(quantity, joints=chosen))
+
+
+def _check_count(function: str, quantity: Any, chosen: int, n: int) -> None:
+    shape = jnp.shape(quantity.weights)
+    if shape in ((), (chosen,), (n,)):
+        return
+    of_limits = isinstance(quantity, Peak) and quantity.relative
+    name = _LIMIT_OF.get(function, "limit") if of_limits else "weights"
+    came = 1.0 / quantity.weights if of_limits else quantity.weights
+    raise checks.fail(f"{function}: {name}", came, f"one number, or {chosen}, one for each of the joints", f"Its shape is {shape}.")
+
+
+_LIMIT_OF = {"margin": "target", "velocity_margin": "target", "region_margin": "target"}
+"""Functions whose limit has another name."""
+
+
+def _number(function: str, name: str, value: Any, sign: str | None = None, most: int = 0) -> jax.Array:
+    """An argument of one of these functions as an array of at most `most` dimensions; ValueError with the argument's name."""
+    field = f"{function}: {name}"
+    array = checks.as_floats(field, value)
+    if array.ndim > most:
+        expected = "one number, or one for each joint" if most else "one number"
+        raise checks.fail(field, value, expected, f"Its shape is {array.shape}.")
+    checks.check_values(field, array, sign)
+    return array
+
+
+def _optional(function: str, name: str, value: Any, sign: str | None = "positive") -> Any:
+    return None if value is None else _number(function, name, value, sign)
+
+
+def _limit(function: str, name: str, value: Any, example: str) -> jax.Array:
+    """The limit of a function, one number or one for each joint."""
+    try:
+        array = _number(function, name, value, "positive", most=1)
+    except ValueError as error:
+        raise ValueError(f"{error} Such as {function}({name}={example}), or one number for each joint.") from error
+    if array.ndim and not array.size:
+        raise checks.fail(f"{function}: {name}", value, "at least one number")
+    return array
+
+
+def _choice(function: str, joints: Any, weights: Any, stacklevel: int = 4) -> tuple[Selection, Any]:
+    """The joints that count, and their weights.
+
+    Floating-point numbers as `joints` were weights in earlier versions.  They are no indices, so they still mean that.
+    """
+    if holds_weights(joints):
+        if weights is not None:
+            raise checks.fail(f"{function}: joints", joints, "indices, names or a slice of joints", "The weights are in weights=.")
+        warnings.warn(
+            f"{function}(joints=...) selects joints by index, name or slice. Floating-point numbers are read as weights, as in earlier "
+            f"versions: write {function}(weights=...).",
+            DeprecationWarning,
+            stacklevel=stacklevel,
+        )
+        joints, weights = None, joints
+    chosen = selection(f"{function}: joints", joints)
+    return chosen, _number(function, "weights", 1.0 if weights is None else weights, most=1)
+
+
+def _in_words(values: Any, unit: str) -> str:
+    """A limit as names of requirements have it."""
+    numbers = np.asarray(values)
+    text = f"{numbers:g}" if numbers.ndim == 0 else f"[{', '.join(f'{x:g}' for x in numbers)}]"
+    return f"{text} {unit}"
+
+
+def _of_joints(chosen: Selection) -> str:
+    """Which joints a requirement is on, for its name."""
+    if chosen is None:
+        return ""
+    if isinstance(chosen[0], bool):
+        chosen = tuple(i for i, taken in enumerate(chosen) if taken)
+    word = "joint" if len(chosen) == 1 else "joints"
+    return f" of {word} {', '.join(map(str, chosen))}"
+
+
+def _peak(
+    function: str,
+    signal: str,
+    limit: Any,
+    joints: Any,
+    weights: Any,
+    after: Any = 0.0,
+    smoothing: Any = 0.01,
+) -> tuple[Peak, Any, Selection]:
+    """The peak of a signal under a limit that is one number, or one for each joint; and the limit of that peak."""
+    chosen, w = _choice(function, joints, weights)
+    after = _number(function, "after", after)
+    smoothing = _number(function, "smoothing", smoothing, "positive")
+    if jnp.ndim(limit) == 0:
+        return Peak(limit, signal, w, after, smoothing, joints=chosen), limit, chosen
+    if jnp.ndim(w) == 1 and jnp.shape(w) != jnp.shape(limit):
+        raise checks.fail(f"{function}: weights", w, f"one number, or {jnp.size(limit)}, as there are limits")
+    one: Any = 1.0
+    return Peak(one, signal, w / limit, after, smoothing, joints=chosen, relative=True), one, chosen
+
+
+def _below(function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str) -> Requirement:
+    """The requirement that a peak is below its limit."""
+    quantity, limit, _ = peak
+    return Requirement(quantity, limit, limit, _share(function, allowed), name=name, function=function)
+
+
+def _above(function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str) -> Requirement:
+    """The requirement that a margin, the negative of a peak, is above its limit."""
+    quantity, limit, _ = peak
+    return Requirement(quantity, -limit, limit, _share(function, allowed), name=name, function=function)
+
+
+def _share(function: str, allowed: Any) -> jax.Array:
+    share = _number(function, "allowed", allowed, "nonnegative")
+    if checks.is_concrete(share) and share > 1:
+        raise checks.fail(f"{function}: allowed", allowed, "a share of the runs, from 0 to 1")
+    return share
+
+
+def _one_term(function: str, quantity: Quantity, scale: Any, name: str = "") -> Objective:
+    return Objective((Term(quantity, scale=_optional(function, "scale", scale), name=name or function),))
+
+
+def _integral(function: str, signal: str, joints: Any, weights: Any, scale: Any, after: Any = 0.0, tolerance: Any = None) -> Objective:
+    chosen, w = _choice(function, joints, weights)
+    quantity = TimeIntegral(signal, w, _number(function, "after", after), tolerance, chosen)
+    return _one_term(function, quantity, scale)
+
+
+def _soft(function: str, peak: tuple[Peak, Any, Selection], scale: Any, limit: Any, sharpness: Any) -> Objective:
+    """A soft penalty on a peak above a limit."""
+    sharpness = _number(function, "sharpness", sharpness, "positive")
+    return Objective((Term(peak[0], scale=scale, limit=limit, sharpness=sharpness, shape="above", name=function),))
+
+
+def tracking(*, joints: Any = None, weights: Any = None, after: Any = 0.0, scale: Any = None) -> Objective:
+    """Integral of the squared position error.
+
+        int sum_i (w_i e1_i)^2 dt / scale
+
+    Args:
+      joints: which joints count: indices, names, a slice, or one truth value each; all if not given.
+      weights: w, one number, one for each joint, or one for each selected joint; 1 if not given.
       after: count from this time on [s].
       scale: in rad^2 s; the value at the starting gains if not given.
 
@@ -268,79 +445,93 @@ def tracking(*, joints: Any = 1.0, after: Any = 0.0, scale: Any = None) -> Objec
       An `Objective`, to be weighted and added to others.
 
     Raises:
-      ValueError: a scale that is not positive.
+      ValueError: a scale that is not positive, or joints that are no selection.
 
     Source: the ISE criterion, textbook.
     """
-    return _one_term("tracking", TimeIntegral("error", joints, after), scale)
+    return _integral("tracking", "error", joints, weights, scale, after)
 
 
-def effort(*, joints: Any = 1.0, scale: Any = None) -> Objective:
-    """Integral of the squared torque, int |tau|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2 s."""
-    return _one_term("effort", TimeIntegral("torque", joints), scale)
+def effort(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
+    """Integral of the squared torque, int sum_i (w_i tau_i)^2 dt / scale; arguments as `tracking`, scale in N^2 m^2 s."""
+    return _integral("effort", "torque", joints, weights, scale)
 
 
-def torque_rate(*, joints: Any = 1.0, scale: Any = None) -> Objective:
-    """Integral of the squared rate of the torque, int |tau'|^2 dt / scale; arguments as `tracking`, scale in N^2 m^2/s."""
-    return _one_term("torque_rate", TimeIntegral("torque_rate", joints), scale)
+def torque_rate(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
+    """Integral of the squared rate of the torque, int sum_i (w_i tau_i')^2 dt / scale; arguments as `tracking`, scale in N^2 m^2/s."""
+    return _integral("torque_rate", "torque_rate", joints, weights, scale)
 
 
-def settle(tolerance: Any = 0.01, *, joints: Any = 1.0, scale: Any = 1.0) -> Objective:
+def settle(tolerance: Any = 0.01, *, joints: Any = None, weights: Any = None, scale: Any = 1.0) -> Objective:
     """Time that the joints spend outside a tolerance, the smooth twin of the settling time, sum over joints / scale.
 
-        int sigmoid((|e1| - tolerance) / (0.1 tolerance)) dt / scale
+        int sum_i w_i^2 sigmoid((|e1_i| - tolerance) / (0.1 tolerance)) dt / scale
 
     Args:
       tolerance: on |e1| [rad].
-      joints: weight of each joint, one number or (n,).
+      joints, weights: as `tracking`.
       scale: in s.
     """
-    return _one_term("settle", TimeIntegral("outside", joints, tolerance=tolerance), scale)
+    tolerance = _number("settle", "tolerance", tolerance, "positive")
+    return _integral("settle", "outside", joints, weights, scale, tolerance=tolerance)
 
 
-def peak_torque(limit: Any = None, *, sharpness: Any = 20.0, smoothing: Any = 0.01, joints: Any = 1.0) -> Objective:
-    """Soft penalty on the largest torque above a limit, with the smooth maximum p.
+def peak_torque(
+    limit: Any = None,
+    *,
+    sharpness: Any = 20.0,
+    smoothing: Any = 0.01,
+    joints: Any = None,
+    weights: Any = None,
+) -> Objective:
+    """Soft penalty on the largest torque above a limit, with the smooth maximum p of w_i |tau_i|.
 
         softplus(sharpness (p / limit - 1)) / sharpness
 
     Args:
-      limit: in N m; the peak at the starting gains if not given.
+      limit: in N m, one number or one for each joint; the peak at the starting gains if not given.
       sharpness: of the corner at the limit.
       smoothing: of the maximum over time and joints, as a part of the limit.
-      joints: weight of each joint's torque, one number or (n,).
+      joints, weights: as `tracking`.
     """
-    scale: Any = 1.0 if limit is None else limit
-    quantity = Peak(scale, "torque", joints, smoothing=smoothing)
-    return Objective((Term(quantity, scale=limit, limit=limit, sharpness=sharpness, shape="above", name="peak_torque"),))
+    function = "peak_torque"
+    given = None if limit is None else _limit(function, "limit", limit, "140.0")
+    peak = _peak(function, "torque", 1.0 if given is None else given, joints, weights, smoothing=smoothing)
+    scale = None if given is None else peak[1]
+    return _soft(function, peak, scale, scale, sharpness)
 
 
-def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
+def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None) -> Objective:
     """Soft penalty on coming nearer to a bound than a target, softplus(sharpness (1 - margin / target)) / sharpness.
 
     Args:
-      target: in rad.
+      target: in rad, one number or one for each joint.
       sharpness, smoothing: as `peak_torque`, relative to the target.
+      joints: as `tracking`.
     """
-    quantity = Peak(target, "deficit", smoothing=smoothing)
-    return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="margin"),))
+    return _soft_margin("margin", "deficit", target, sharpness, smoothing, joints)
 
 
-def velocity_margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
+def velocity_margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None) -> Objective:
     """Soft penalty on velocities that come nearer to a bound than a target; as `margin`, in rad/s, for scenarios with `velocity_bounds`."""
-    quantity = Peak(target, "velocity_deficit", smoothing=smoothing)
-    return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="velocity_margin"),))
+    return _soft_margin("velocity_margin", "velocity_deficit", target, sharpness, smoothing, joints)
 
 
 def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
     """Soft penalty on coming nearer to a region's wall than a target; as `margin`, in m, for scenarios with `regions`."""
-    quantity = Peak(target, "region_deficit", smoothing=smoothing)
-    return Objective((Term(quantity, scale=target, limit=-target, sharpness=sharpness, shape="above", name="region_margin"),))
+    return _soft_margin("region_margin", "region_deficit", target, sharpness, smoothing, None)
 
 
-def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Objective:
+def _soft_margin(function: str, signal: str, target: Any, sharpness: Any, smoothing: Any, joints: Any) -> Objective:
+    given = _limit(function, "target", target, "0.05")
+    peak = _peak(function, signal, given, joints, None, smoothing=smoothing)
+    return _soft(function, peak, peak[1], -peak[1], sharpness)
+
+
+def metric(fold: Fold, name: str, *, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
     """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own, summed over the joints.
 
-        sum_i joints_i m_i / scale
+        sum_i w_i m_i / scale
 
     It has to be differentiable: integrals, rms values and peaks are; a time at which something happens has no slope, and is infinite
     where it does not happen (for the settling time there is `settle`).  `iblf_jax.testing.check_objective` looks at it.
@@ -348,7 +539,8 @@ def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Ob
     Args:
       fold: the metric, such as `iblf_jax.metrics.Tracking()`.
       name: which of the fold's results; one of its `units`.
-      joints: weight of each of its numbers, one number or as many as the result has.
+      joints: which of its numbers count, where it has one for each joint: indices, names, a slice, or one truth value each.
+      weights: w, one number or as many as the result, or the selection, has; 1 if not given.
       scale: in the result's unit; the value at the starting gains if not given.
 
     Returns:
@@ -359,40 +551,60 @@ def metric(fold: Fold, name: str, *, joints: Any = 1.0, scale: Any = None) -> Ob
 
     Source: design of this package.
     """
-    return _one_term(checks.word("name", name, "the name of one of the fold's results"), MetricResult(fold, name, joints), scale)
+    name = checks.word("name", name, "the name of one of the fold's results")
+    if holds_weights(joints):
+        chosen, w = _choice("metric", joints, weights, stacklevel=3)
+    else:
+        chosen, w = selection("metric: joints", joints), 1.0 if weights is None else weights
+    return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)
 
 
-def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:
+def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = None, weights: Any = None) -> Requirement:
     """|e1| < limit on every joint from a time on: `error_below(0.01, after=1.0)`.
 
+        w_i |e1_i(t)| < limit_i     for t >= after
+
     Args:
-      limit: in rad.
+      limit: in rad, one number or one for each joint (or for each selected joint).
       after: in s.
       allowed: share of perturbed runs that may break it.
-      joints: weight of each joint's error; 0 leaves a joint out.
+      joints: which joints count: indices, names, a slice, or one truth value each; all if not given.
+      weights: w, one number or one for each joint; 1 if not given.
     """
-    quantity = Peak(limit, "error", joints, after)
-    return Requirement(quantity, limit, limit, allowed, name=f"|e1| < {limit:g} rad" + (f" after {after:g} s" if after else ""))
+    given = _limit("error_below", "limit", limit, "0.01")
+    peak = _peak("error_below", "error", given, joints, weights, after)
+    name = f"|e1|{_of_joints(peak[2])} < {_in_words(given, 'rad')}" + (f" after {after:g} s" if after else "")
+    return _below("error_below", peak, allowed, name)
 
 
-def peak_torque_below(limit: Any, *, allowed: Any = 0.01, joints: Any = 1.0) -> Requirement:
-    """Largest |tau| < limit [N m]; arguments as `error_below`."""
-    return Requirement(Peak(limit, "torque", joints), limit, limit, allowed, name=f"peak torque < {limit:g} N m")
+def peak_torque_below(limit: Any, *, allowed: Any = 0.01, joints: Any = None, weights: Any = None) -> Requirement:
+    """Largest |tau| < limit [N m], one number or one for each joint; arguments as `error_below`."""
+    given = _limit("peak_torque_below", "limit", limit, "140.0")
+    peak = _peak("peak_torque_below", "torque", given, joints, weights)
+    name = f"peak torque{_of_joints(peak[2])} < {_in_words(given, 'N m')}"
+    return _below("peak_torque_below", peak, allowed, name)
 
 
-def margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
-    """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `allowed` as `error_below`."""
-    return Requirement(Peak(limit, "deficit"), -limit, limit, allowed, name=f"margin > {limit:g} rad")
+def margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
+    """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `limit`, `allowed` and `joints` as `error_below`."""
+    return _margin_above("margin_above", "deficit", "margin", limit, "rad", allowed, joints)
 
 
-def velocity_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
+def velocity_margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
     """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with `velocity_bounds`; as `margin_above`."""
-    return Requirement(Peak(limit, "velocity_deficit"), -limit, limit, allowed, name=f"velocity margin > {limit:g} rad/s")
+    return _margin_above("velocity_margin_above", "velocity_deficit", "velocity margin", limit, "rad/s", allowed, joints)
 
 
 def region_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
     """Minimum over time and regions of the distance to the wall > limit [m], for scenarios with `regions`; as `margin_above`."""
-    return Requirement(Peak(limit, "region_deficit"), -limit, limit, allowed, name=f"region margin > {limit:g} m")
+    return _margin_above("region_margin_above", "region_deficit", "region margin", limit, "m", allowed, None)
+
+
+def _margin_above(function: str, signal: str, words: str, limit: Any, unit: str, allowed: Any, joints: Any) -> Requirement:
+    given = _limit(function, "limit", limit, "0.05")
+    peak = _peak(function, signal, given, joints, None)
+    name = f"{words}{_of_joints(peak[2])} > {_in_words(given, unit)}"
+    return _above(function, peak, allowed, name)
 
 
 def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:
@@ -404,5 +616,10 @@ def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requi
       probability: the limit.
       scale: the margin that matters [rad].
     """
-    made = Requirement(Peak(scale, "deficit"), checks.as_floats("limit", 0.0), scale, probability, event="violated")
+    function = "violation_probability_below"
+    size = _number(function, "scale", scale, "positive")
+    share = _number(function, "probability", probability, "nonnegative")
+    if checks.is_concrete(share) and share > 1:
+        raise checks.fail(f"{function}: probability", probability, "a share of the runs, from 0 to 1")
+    made = Requirement(Peak(size, "deficit"), checks.as_floats("limit", 0.0), size, share, event="violated", function=function)
     return dataclasses.replace(made, name=f"violation probability < {probability:g}")

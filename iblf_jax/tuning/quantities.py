@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
+from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine.derivatives import Outer
 from iblf_jax.simulation.metrics import Fold
@@ -54,59 +55,103 @@ class Quantity(Protocol):
 
 
 DEFICITS = {"deficit": "rad", "velocity_deficit": "rad/s", "region_deficit": "m"}
-"""Signals of which the largest is minus a margin -> unit: no sizes, and no weights of the joints."""
+"""Signals of which the largest is minus a margin -> unit: they have a sign, so their size does not count."""
+OF_LIMIT = "of the limit"
+"""Unit of a peak that is measured in limits, one for each joint."""
 TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1"} | DEFICITS
 """Signal -> unit."""
 NEEDS = {"velocity_deficit": "dq_lower", "region_deficit": "region_margin"}
 """Signal -> the optional one of the run that it is made of."""
 
 
-def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax.Array:
-    """A signal at one sample, (n,), (2 n,) or one number a region.
+def chosen_of(values: jax.Array, joints: Selection, field: str) -> jax.Array:
+    """The entries (k,) of the joints that are selected, from one number for each joint, (n,)."""
+    if joints is None:
+        return values
+    names = tuple(f"joint {i}" for i in range(values.shape[-1]))
+    return jnp.stack([values[i] for i in indices(field, joints, names)])
+
+
+def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax.Array:
+    """The weights of the selected joints, () or (k,), from one number, one for each joint, or one for each selected joint.
+
+    Raises:
+      ValueError: another number of weights.
+    """
+    names = tuple(f"joint {i}" for i in range(n))
+    count = len(indices(field, joints, names))
+    if jnp.shape(weights) in ((), (count,)):
+        return weights
+    if jnp.shape(weights) == (n,):
+        return chosen_of(weights, joints, field)
+    expected = f"one number, or {count}, one for each of the joints that count"
+    raise checks.fail(field, weights, expected, f"Its shape is {jnp.shape(weights)}.")
+
+
+def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
+    """Raises ValueError for a selection that is not normalised, or weights that are no list of numbers."""
+    if joints is not None and (not isinstance(joints, tuple) or selection(f"{owner}.joints", joints) != joints):
+        raise checks.fail(f"{owner}.joints", joints, "a tuple of indices, names or truth values")
+    if jnp.ndim(weights) > 1:
+        raise checks.fail(f"{owner}.weights", weights, "one number, or one for each joint")
+
+
+def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any, joints: Selection = None) -> jax.Array:
+    """A signal of the selected joints at one sample, (k,), (2 k,) or one number a region.
 
     error e1; torque tau; torque_rate (tau - last tau) / dt; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose
     integral of squares is the time outside the tolerance; deficit (lower - q, q - upper), the largest of which is minus the margin;
     velocity_deficit the same of the velocities; region_deficit minus the distances to the walls of the regions.
     """
+
+    def of_joints(values: jax.Array) -> jax.Array:
+        return chosen_of(values, joints, "joints")
+
     if name == "error":
-        return sample.e1
+        return of_joints(sample.e1)
     if name == "torque":
-        return sample.tau
+        return of_joints(sample.tau)
     if name == "torque_rate":
-        return (sample.tau - last) / jnp.where(sample.dt > 0, sample.dt, 1.0)
+        return of_joints(sample.tau - last) / jnp.where(sample.dt > 0, sample.dt, 1.0)
     if name == "outside":
-        size = jnp.where(sample.e1 >= 0, sample.e1, -sample.e1)
+        e1 = of_joints(sample.e1)
+        size = jnp.where(e1 >= 0, e1, -e1)
         return jax.nn.sigmoid((size - tolerance) / (SOFT_EDGE * tolerance)) ** 0.5
     if name == "region_deficit":
         return -sample.region_margin
     if name == "velocity_deficit":
-        return jnp.concatenate([sample.dq_lower - sample.dq, sample.dq - sample.dq_upper])
-    return jnp.concatenate([sample.lower - sample.q, sample.q - sample.upper])
+        slow, fast = of_joints(sample.dq_lower - sample.dq), of_joints(sample.dq - sample.dq_upper)
+        return jnp.concatenate([slow, fast])
+    return jnp.concatenate([of_joints(sample.lower - sample.q), of_joints(sample.q - sample.upper)])
 
 
 @component
 class TimeIntegral:
-    """sum_k dt |y(t_k)|^2 over the samples with t >= after.
+    """sum_k dt sum_i (w_i y_i(t_k))^2 over the samples with t >= after and the joints i that are selected.
 
     Args:
       signal: "error", "torque", "torque_rate" or "outside"; "error" if not given.
-      joints: weight of each joint, () or (n,) [1]; 1 if not given.
+      weights: w, () or (n,), or one for each selected joint [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       tolerance: for "outside", on |e1|, () [rad], > 0; none if not given.
+      joints: which ones count, a tuple of indices, names or truth values (`core.joints`); None, all, if not given.
     """
 
     signal: str = static(default="error")
-    joints: jax.Array = leaf("1", default=1.0)
+    weights: jax.Array = leaf("1", shape="any", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     tolerance: jax.Array | None = leaf("rad", sign="positive", shape="scalar", default=None)
+    joints: tuple | None = static(default=None)
     units: ClassVar[dict[str, str]] = {"error": "rad^2 s", "torque": "N^2 m^2 s", "torque_rate": "N^2 m^2/s", "outside": "s"}
 
     def check(self) -> None:
-        """Raises ValueError for an unknown signal."""
+        """Raises ValueError for an unknown signal, or a selection that is none."""
         checks.one_of("TimeIntegral.signal", self.signal, tuple(self.units))
+        _check_choice("TimeIntegral", self.joints, self.weights)
 
     def _at(self, acc, sample: Sample) -> jax.Array:
-        y = self.joints * signal_of(self.signal, sample, acc[1], self.tolerance)
+        weights = weights_of(self.weights, self.joints, sample.q.size, "TimeIntegral.weights")
+        y = weights * signal_of(self.signal, sample, acc[1], self.tolerance, self.joints)
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y, 0.0)
 
     def init(self, sample: Sample):
@@ -133,7 +178,7 @@ class TimeIntegral:
 
 @component
 class Peak:
-    """max over time and joints of a signal (of its size for error and torque), over the samples with t >= after.
+    """max over time and joints of w_i y_i (of its size for error and torque), over the samples with t >= after.
 
     Its pieces are the maxima of each entry of the signal within each window of time.  In a term of the objective it is
     T log sum exp(piece / T) with T = smoothing scale: above the maximum by at most T times the logarithm of the number of pieces that come
@@ -142,18 +187,22 @@ class Peak:
     Args:
       scale: the size of y that matters, () in its unit, > 0.
       signal: "error", "torque", "torque_rate", "deficit", "velocity_deficit" or "region_deficit"; "torque" if not given.
-      joints: weight of each joint, () or (n,) [1]; 1 if not given.
+      weights: w, () or (n,), or one for each selected joint [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       smoothing: T as a part of the scale, () [1], > 0; 0.01 if not given.
       windows: when each window of time after the first begins, (W,) [s]; one window if not given.  `tune` sets them.
+      joints: which ones count, a tuple of indices, names or truth values (`core.joints`); None, all, if not given.
+      relative: whether the weights are 1 / limit of each joint, so that the peak is a number of limits; False if not given.
     """
 
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
     signal: str = static(default="torque")
-    joints: jax.Array = leaf("1", default=1.0)
+    weights: jax.Array = leaf("1", shape="any", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     smoothing: jax.Array = leaf("1", sign="positive", shape="scalar", default=0.01)
     windows: jax.Array | None = leaf("s", shape="any", default=None)
+    joints: tuple | None = static(default=None)
+    relative: bool = static(default=False)
     units: ClassVar[dict[str, str]] = {name: unit for name, unit in TUNED_SIGNALS.items() if name != "outside"}
 
     @property
@@ -162,21 +211,39 @@ class Peak:
         return NEEDS.get(self.signal)
 
     def check(self) -> None:
-        """Raises ValueError for an unknown signal."""
+        """Raises ValueError for an unknown signal, or a selection that is none."""
         checks.one_of("Peak.signal", self.signal, tuple(self.units))
+        _check_choice("Peak", self.joints, self.weights)
+        if self.signal == "region_deficit" and self.joints is not None:
+            raise checks.fail("Peak.joints", self.joints, "None for regions", "A region does not belong to a joint.")
+
+    @property
+    def unit(self) -> str:
+        """Of its values."""
+        return OF_LIMIT if self.relative else self.units[self.signal]
 
     def _at(self, acc, sample: Sample) -> jax.Array:
-        y = signal_of(self.signal, sample, acc[1], None)
+        y = signal_of(self.signal, sample, acc[1], None, self.joints)
+        count = y.size if self.signal == "region_deficit" else sample.q.size
+        weights = weights_of(self.weights, self.joints, count, "Peak.weights")
         if self.signal not in DEFICITS:
-            y = self.joints * y
+            y = weights * y
             y = jnp.concatenate([y, -y])
+        elif jnp.ndim(weights) == 1:  # margins have no weights but limits of their own
+            one_side = self.signal == "region_deficit"
+            y = y * (weights if one_side else jnp.concatenate([weights, weights]))
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
 
     def init(self, sample: Sample):
-        """Below everything, (W, 2 n), or (W, m) for m regions; the first torque has no predecessor but itself."""
+        """Below everything, (W, 2 k) for k joints, or (W, m) for m regions; the first torque has no predecessor but itself."""
         count = 1 if self.windows is None else 1 + self.windows.size
-        size = sample.region_margin.size if self.signal == "region_deficit" else 2 * sample.q.size
-        return jnp.full((count, size), -FAR, sample.t.dtype), sample.tau
+        return jnp.full((count, self._entries(sample)), -FAR, sample.t.dtype), sample.tau
+
+    def _entries(self, sample: Sample) -> int:
+        """How many numbers the signal has at one sample."""
+        if self.signal == "region_deficit":
+            return sample.region_margin.size
+        return 2 * chosen_of(sample.q, self.joints, "joints").size
 
     def update(self, acc, sample: Sample):
         """Adds one sample to the window that it is in."""
@@ -206,24 +273,28 @@ class Peak:
 
 @component
 class MetricResult:
-    """sum_i joints_i m_i of a named result m of a metric's fold; m is one number or one a joint.
+    """sum_i w_i m_i of a named result m of a metric's fold; m is one number or one a joint.
 
     It offers no matrix of second derivatives: `tune` learns that from the gradients along the way.
 
     Args:
       fold: the metric, any `iblf_jax.metrics.Fold`.
       name: which of its results; one of `fold.units`.
-      joints: weight of each number of m, () or as m [1]; 1 if not given.
+      weights: w, () or (k,) as m has k numbers [1]; 1 if not given.
+      joints: which entries of m count, a tuple of indices, names or truth values; all if not given.
     """
 
     fold: Fold
     name: str = static()
-    joints: jax.Array = leaf("1", shape="any", default=1.0)
+    weights: jax.Array = leaf("1", shape="any", default=1.0)
+    joints: tuple | None = static(default=None)
 
     def check(self) -> None:
         """Raises ValueError for something that is not a fold, or a name that it does not return."""
         checks.conforms("MetricResult.fold", self.fold, Fold, "iblf_jax.metrics has them; iblf_jax.testing.check_fold looks at your own.")
         checks.one_of("MetricResult.name", self.name, tuple(self.fold.units))
+        if self.joints is not None:
+            _check_choice("MetricResult", self.joints, 1.0)
 
     @property
     def needs(self) -> str | None:
@@ -243,10 +314,20 @@ class MetricResult:
         found = self.fold.finish(acc)[self.name]
         if not jnp.issubdtype(found.dtype, jnp.floating):
             raise checks.fail("MetricResult.name", self.name, "a result that can be differentiated", f"This one is {found.dtype}.")
-        if jnp.shape(self.joints) not in ((), found.shape):
-            raise checks.fail("MetricResult.joints", self.joints, f"one number, or shape {found.shape} as {self.name!r} has")
-        value = jnp.sum(self.joints * found)
+        value = jnp.sum(self._weights(found.shape) * self._chosen(found))
         return value, value, value[None]
+
+    def _chosen(self, found: jax.Array) -> jax.Array:
+        if self.joints is not None and found.ndim != 1:
+            expected = f"None, as {self.name!r} is not one number a joint"
+            raise checks.fail("MetricResult.joints", self.joints, expected, f"Its shape is {found.shape}.")
+        return chosen_of(found, self.joints, "MetricResult.joints")
+
+    def _weights(self, shape: tuple[int, ...]) -> jax.Array:
+        if self.joints is None and jnp.shape(self.weights) not in ((), shape):
+            expected = f"one number, or shape {shape} as {self.name!r} has"
+            raise checks.fail("MetricResult.weights", self.weights, expected, f"Its shape is {jnp.shape(self.weights)}.")
+        return self.weights if self.joints is None else weights_of(self.weights, self.joints, shape[0], "MetricResult.weights")
 
 
 MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult}

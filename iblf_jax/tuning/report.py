@@ -35,6 +35,7 @@ from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.problem import Rollouts, drawn, rollouts
+from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
 
 
@@ -84,12 +85,26 @@ class Verdict:
     def __str__(self) -> str:
         text = self._verdict()
         if np.isfinite(self.value):
-            text += f"; {self.value:.5g} {self.unit}"
-            away = self.value - self.limit
-            text += f", {abs(away):.3g} {self.unit} {'above' if away > 0 else 'below'} the limit" if self.verdict == "fail" else ""
+            text += self._of_limits() if self.unit == OF_LIMIT else self._of_units()
         if self.price is not None and self.verdict != "fail" and self.price > 0:
-            text += f"; the objective would fall by {self.price:.3g} for each {self.unit} that the limit is loosened by"
+            text += self._price_in_words(self.price)
         return text
+
+    def _of_units(self) -> str:
+        text = f"; {self.value:.5g} {self.unit}"
+        if self.verdict != "fail":
+            return text
+        away = self.value - self.limit
+        return f"{text}, {abs(away):.3g} {self.unit} {'above' if away > 0 else 'below'} the limit"
+
+    def _of_limits(self) -> str:
+        """Where each joint has a limit of its own, the value is that of the worst joint, in limits."""
+        return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
+
+    def _price_in_words(self, price: float) -> str:
+        if self.unit == OF_LIMIT:
+            return f"; the objective would fall by {price / 100:.3g} for each percent that the limits are loosened by"
+        return f"; the objective would fall by {price:.3g} for each {self.unit} that the limit is loosened by"
 
     def _verdict(self) -> str:
         if self.after.runs == 1:

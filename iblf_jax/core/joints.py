@@ -1,0 +1,152 @@
+"""What an argument `joints=` selects, with one meaning everywhere: indices, names, slices or truth values.
+
+    joints=None             all joints
+    joints=[0, 1]           joints 0 and 1; joints=-1 is the last one
+    joints="elbow"          by name, as in the robot's file
+    joints=slice(0, 3)      or "0:3" in a file
+    joints=[True, False]    one truth value for each joint
+
+A selection is structure, not a number: it is kept as a hashable tuple and becomes indices where the robot is known.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks
+
+Selection: TypeAlias = "tuple[int | str, ...] | None"
+"""Indices, names, slices as text, or truth values; None for all joints."""
+
+EXPECTED = "indices, names or a slice of joints, or one truth value for each joint"
+SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?")
+"""A slice as text."""
+
+
+def holds_weights(joints: Any) -> bool:
+    """Whether an argument holds floating-point numbers, which earlier versions read as weights."""
+    if isinstance(joints, bool | str | slice) or joints is None:
+        return False
+    if isinstance(joints, jax.Array | np.ndarray | np.generic):
+        return bool(np.issubdtype(np.dtype(joints.dtype), np.floating))
+    if isinstance(joints, list | tuple):
+        return any(isinstance(x, float | np.floating) for x in joints)
+    return isinstance(joints, float)
+
+
+def selection(field: str, joints: Any) -> Selection:
+    """What a user gave as a hashable tuple, with what needs no robot checked.
+
+    Args:
+      field: what messages call it.
+      joints: an index, a name, a slice, a sequence of these, or one truth value for each joint; None for all joints.
+
+    Raises:
+      ValueError: something else, numbers that are not whole, or nothing.
+    """
+    if joints is None:
+        return None
+    if isinstance(joints, jax.core.Tracer):
+        raise checks.fail(field, joints, EXPECTED, "It decides what is compiled, so it cannot be traced.")
+    if holds_weights(joints):
+        raise checks.fail(field, joints, EXPECTED, "Weights have an argument of their own, weights=.")
+    entries = _entries(field, joints)
+    found = tuple(_entry(field, joints, x) for x in entries)
+    if not found:
+        raise checks.fail(field, joints, "at least one joint")
+    truths = sum(isinstance(x, bool) for x in found)
+    if truths not in (0, len(found)):
+        raise checks.fail(field, joints, EXPECTED, "Truth values cannot be mixed with indices.")
+    return found
+
+
+def _entries(field: str, joints: Any) -> Sequence[Any]:
+    if isinstance(joints, bool | np.bool_):
+        raise checks.fail(field, joints, EXPECTED, "Give one truth value for each joint, in a list.")
+    if isinstance(joints, jax.Array | np.ndarray | np.generic):
+        array = np.asarray(joints)
+        if array.ndim > 1:
+            raise checks.fail(field, joints, EXPECTED, f"Its shape is {array.shape}.")
+        return np.atleast_1d(array).tolist()
+    if isinstance(joints, int | str | slice):
+        return [joints]
+    if isinstance(joints, list | tuple | range):
+        return joints
+    raise checks.fail(field, joints, EXPECTED)
+
+
+def _entry(field: str, joints: Any, entry: Any) -> int | str:
+    if isinstance(entry, bool | np.bool_):
+        return bool(entry)
+    if isinstance(entry, int | np.integer):
+        return int(entry)
+    if isinstance(entry, str):
+        return entry
+    if isinstance(entry, slice):
+        return _slice_as_text(field, entry)
+    raise checks.fail(field, joints, EXPECTED)
+
+
+def _slice_as_text(field: str, given: slice) -> str:
+    parts = (given.start, given.stop, given.step)
+    if not all(x is None or (isinstance(x, int | np.integer) and not isinstance(x, bool)) for x in parts):
+        raise checks.fail(field, given, "a slice of whole numbers", "Name single joints in a list.")
+    words = ["" if x is None else str(int(x)) for x in parts]
+    return ":".join(words if given.step is not None else words[:2])
+
+
+def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, ...]:
+    """The joints of a selection, from 0, in the order in which they were given.
+
+    Args:
+      field: what messages call it.
+      chosen: what `selection` gave.
+      names: what each of the n joints is called.
+
+    Raises:
+      ValueError: a joint that the robot does not have, one that is given twice, or none.
+    """
+    n = len(names)
+    if chosen is None:
+        return tuple(range(n))
+    if isinstance(chosen[0], bool):
+        if len(chosen) != n:
+            raise checks.fail(field, list(chosen), f"{n} truth values, one for each joint")
+        found = [i for i, taken in enumerate(chosen) if taken]
+    else:
+        found = [i for entry in chosen for i in _indices_of(field, entry, names)]
+    if not found:
+        raise checks.fail(field, list(chosen), "at least one joint")
+    twice = next((i for i in found if found.count(i) > 1), None)
+    if twice is not None:
+        remedy = "Weights have an argument of their own, weights=."
+        raise checks.fail(field, list(chosen), f"each joint once, but it holds joint {twice} twice", remedy)
+    return tuple(found)
+
+
+def _indices_of(field: str, entry: int | str, names: Sequence[str]) -> list[int]:
+    n = len(names)
+    if isinstance(entry, int):
+        if not -n <= entry < n:
+            remedy = "Weights have an argument of their own, weights=."
+            raise checks.fail(field, entry, f"an index from 0 to {n - 1}, as the robot has {n} joints", remedy)
+        return [entry % n]
+    if entry in names:
+        same = [i for i, name in enumerate(names) if name == entry]
+        if len(same) > 1:
+            raise checks.fail(field, entry, "the name of one joint", f"Joints {same} are called so: give indices.")
+        return same
+    if SLICE.fullmatch(entry):
+        parts = [int(x) if x else None for x in entry.split(":")]
+        if len(parts) == 3 and parts[2] == 0:
+            raise checks.fail(field, entry, "a slice whose step is not 0")
+        return list(range(n))[slice(*parts)]
+    close = difflib.get_close_matches(entry, names, n=1)
+    remedy = f"Did you mean {close[0]!r}?" if close else f"There are: {', '.join(names)}."
+    raise checks.fail(field, entry, "the name of a joint", remedy)

@@ -1,0 +1,344 @@
+"""The factor at which a law has a given effort, looked for among all factors of a range.
+
+The effort need not grow with the factor, and trials may fail, so nothing is concluded from a few of them:
+
+1. A grid of factors is run in one batch: 2^(i / 16) from 1/4 to 4, and 2^(i / 4) beyond, to 1/32 and 32.
+2. Between neighbours that are both valid and have the target between them there is a crossing; it is refined by further batches until
+   the factor is known to 1e-6, and rejected if the effort jumps over the target there.  Refined too are the places where a crossing may
+   hide: next to failed trials, and around an effort that turns back just before the target.
+3. Of all crossings the one nearest to 1, by |ln factor|, is chosen.
+
+A trial is valid if its run did not fail and is accurate.  Where the law's own run, or the one that sets the target, is flagged inaccurate
+itself, inaccurate trials count as well, and the result says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.core.status import FAILED, WORDS, Status, describe
+
+FINE, FINE_END = 16, 2
+"""Grid points in a factor of two, and the powers of two up to which the grid has so many."""
+COARSE, END = 4, 5
+"""The same beyond: factors from 1/32 to 32."""
+CLOSE = 1e-6
+"""Width of a bracket, in powers of two, from which a straight line gives the crossing."""
+ROUNDS = 9
+"""Batches of refinement at most: a bracket takes three or four."""
+LOOKS = 2
+"""Batches in which places are refined where a crossing may hide."""
+JUMP = 1e-3
+"""Part of the target by which a trial must come near it for a crossing to be none of a jump."""
+
+MOST_NAMED = 4
+"""Crossings, and groups of failed trials, that the text names."""
+
+NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
+"""Flags of runs whose effort is not to be compared; constraints that a law does not know of are no obstacle."""
+OF_STEP = Status.STEP_TOO_LARGE | Status.INACCURATE
+"""Flags for which the time step is to blame."""
+
+
+class Trials(NamedTuple):
+    """What a batch of factors gave, (N,) each."""
+
+    effort: np.ndarray
+    """RMS torque above gravity [N m]."""
+    status: np.ndarray
+    mode: np.ndarray
+    """Fastest mode [1/s]."""
+    error: np.ndarray
+    """Estimated error relative to the tube [1]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EffortSearch:
+    """Which factors were tried for a law, what they gave, and where its effort is the target."""
+
+    target: float
+    """[N m]."""
+    factors: np.ndarray
+    """Of all trials, growing, (N,)."""
+    efforts: np.ndarray
+    """[N m], (N,), of failed trials too."""
+    status: np.ndarray
+    """Flags of `Status` of each trial, (N,)."""
+    crossings: tuple[float, ...]
+    """All factors found at which the effort is the target, the nearest to 1 first."""
+    accepts_inaccurate: bool
+    """Whether trials flagged INACCURATE count as valid, as the runs at the gains given are."""
+    smaller_dt: float | None = None
+    """A step [s] for the failed trials that may hide a better factor, where nothing but the step is to blame; None without such."""
+
+    @property
+    def factor(self) -> float:
+        """The crossing nearest to 1 by |ln factor|; NaN where there is none."""
+        return self.crossings[0] if self.crossings else math.nan
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Which trials count, (N,) bool."""
+        return is_valid(self.efforts, self.status, self.accepts_inaccurate)
+
+    @property
+    def nearest(self) -> tuple[float, float]:
+        """Factor and effort [N m] of the valid trial whose effort is nearest to the target; NaN where no trial is valid."""
+        if not np.any(self.valid):
+            return math.nan, math.nan
+        away = np.where(self.valid, np.abs(self.efforts - self.target), np.inf)
+        i = int(np.argmin(away))
+        return float(self.factors[i]), float(self.efforts[i])
+
+    @property
+    def failed(self) -> dict[float, str]:
+        """Factor -> why its run is not valid, in words."""
+        why = NO_EFFORT if self.accepts_inaccurate else NO_EFFORT | Status.INACCURATE
+        bad = zip(self.factors[~self.valid].tolist(), self.status[~self.valid].tolist(), strict=True)
+        return {factor: describe(int(status) & int(why)) for factor, status in bad}
+
+    def in_words(self) -> str:
+        """What was searched, what failed and what was found, in one line."""
+        count, low, high = len(self.factors), self.factors[0], self.factors[-1]
+        searched = f"{count} factors from {low:.3g} to {high:.3g} were run"
+        return "; ".join([self._found(), searched, *self._failures()])
+
+    def _found(self) -> str:
+        if not self.crossings:
+            return self._nothing_found()
+        text = f"the effort is {self.target:.4g} N m at {_few([f'{x:.4g}' for x in self.crossings])}"
+        if len(self.crossings) > 1:
+            text += f", of which {self.factor:.4g} is the nearest to 1"
+        return text + (" (inaccurate runs count, as those at the gains given are inaccurate)" if self.accepts_inaccurate else "")
+
+    def _nothing_found(self) -> str:
+        efforts = self.efforts[self.valid]
+        if not efforts.size:
+            return f"none of them is valid, so no effort can be compared with {self.target:.4g} N m"
+        if efforts.max() < self.target:
+            side = "stays below"
+        elif efforts.min() > self.target:
+            side = "stays above"
+        else:
+            side = "does not pass through"
+        factor, effort = self.nearest
+        where = f"its effort {side} {self.target:.4g} N m ({efforts.min():.4g} to {efforts.max():.4g})"
+        return f"{where}; the nearest of them has {effort:.4g} N m, at {factor:.4g}"
+
+    def _failures(self) -> list[str]:
+        """Each group of neighbouring trials that failed for one reason."""
+        if not self.failed:
+            return []
+        nearest = sorted(self.failed_groups(), key=lambda group: min(abs(math.log(x)) for x in group[0]))
+        groups = [f"{_range(factors)} ({_reasons(status)})" for factors, status in nearest]
+        words = [f"{len(self.failed)} of them fail: {_few(groups)}"]
+        if self.smaller_dt is not None:
+            words.append(f"nearest to 1 only the time step is to blame: with dt={self.smaller_dt:g} these trials may be valid")
+        return words
+
+    def failed_groups(self) -> list[tuple[list[float], list[int]]]:
+        """Neighbouring trials that failed, from the smallest factor on: their factors, and the flags for which they count as failed."""
+        why = int(NO_EFFORT if self.accepts_inaccurate else NO_EFFORT | Status.INACCURATE)
+        groups: list[tuple[list[float], list[int]]] = []
+        after_valid = True
+        for factor, status, fine in zip(self.factors.tolist(), self.status.tolist(), self.valid.tolist(), strict=True):
+            if not fine and after_valid:
+                groups.append(([], []))
+            if not fine:
+                groups[-1][0].append(factor)
+                groups[-1][1].append(status & why)
+            after_valid = fine
+        return groups
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain numbers and strings for strict JSON."""
+        factor, effort = self.nearest
+        return {
+            "target": self.target,
+            "factor": _number_or_none(self.factor),
+            "crossings": list(self.crossings),
+            "searched": [float(self.factors[0]), float(self.factors[-1])],
+            "accepts_inaccurate": self.accepts_inaccurate,
+            "nearest": {"factor": _number_or_none(factor), "effort": _number_or_none(effort)},
+            "trials": {
+                "factor": self.factors.tolist(),
+                "effort": [_number_or_none(x) for x in self.efforts.tolist()],
+                "status": self.status.tolist(),
+            },
+            "failed": [{"factor": factor, "why": why} for factor, why in self.failed.items()],
+            "smaller_dt": self.smaller_dt,
+        }
+
+
+def is_valid(efforts: np.ndarray, status: np.ndarray, inaccurate: bool) -> np.ndarray:
+    """Which trials count, (N,) bool.
+
+    Args:
+      efforts, status: of the trials, (N,).
+      inaccurate: whether those count that are flagged INACCURATE.
+    """
+    bad = int(NO_EFFORT if inaccurate else NO_EFFORT | Status.INACCURATE)
+    return np.isfinite(efforts) & (status & bad == 0)
+
+
+def grid() -> np.ndarray:
+    """Powers of two of the factors that are tried first, growing; 0, the factor 1, is among them."""
+    fine = np.arange(-FINE * FINE_END, FINE * FINE_END + 1) / FINE
+    outer = np.arange(COARSE * FINE_END + 1, COARSE * END + 1) / COARSE
+    return np.concatenate([-outer[::-1], fine, outer])
+
+
+def search(
+    run: Callable[[np.ndarray], Trials],
+    target: float,
+    needed_dt: Callable[[Trials], float | None] = lambda trials: None,
+    inaccurate: bool = False,
+) -> EffortSearch:
+    """Looks for all factors at which an effort is the target.
+
+    Args:
+      run: factors (N,) -> what their runs gave; called with at most as many factors as the grid has.
+      target: the effort to reach [N m].
+      needed_dt: trials whose step is too large -> one that would do [s].
+      inaccurate: whether trials flagged INACCURATE count as valid.
+    """
+    powers = grid()
+    trials = run(2.0**powers)
+    powers, trials, crossings = _refined(run, target, powers, trials, inaccurate)
+    ordered = tuple(2.0**power for power in sorted(crossings, key=abs))
+    valid = is_valid(trials.effort, trials.status, inaccurate)
+    hidden = _hidden(powers, trials, valid, crossings)
+    dt = needed_dt(Trials(*(x[hidden] for x in trials))) if np.any(hidden) else None
+    return EffortSearch(target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt)
+
+
+def _hidden(powers: np.ndarray, trials: Trials, valid: np.ndarray, crossings: Sequence[float]) -> np.ndarray:
+    """The failed trials that may hide a crossing nearer to 1, with nothing but their step known to be to blame, (N,) bool.
+
+    Where the step is beyond its stability limit the other flags say nothing.  Where no crossing was found the trials are those
+    nearest to 1 on each side.
+    """
+    unstable = trials.status & int(Status.STEP_TOO_LARGE) != 0
+    only_inaccurate = (trials.status & int(Status.INACCURATE) != 0) & (trials.status & int(NO_EFFORT) == 0)
+    blamed = ~valid & (unstable | only_inaccurate)
+    if crossings:
+        return blamed & (np.abs(powers) < min(map(abs, crossings)))
+    nearest = np.zeros_like(blamed)
+    for side in (powers <= 0, powers >= 0):
+        own = np.flatnonzero(blamed & side)
+        if len(own):
+            nearest[own[np.argmin(np.abs(powers[own]))]] = True
+    return nearest
+
+
+def _refined(
+    run: Callable[[np.ndarray], Trials],
+    target: float,
+    powers: np.ndarray,
+    trials: Trials,
+    inaccurate: bool,
+) -> tuple[np.ndarray, Trials, list[float]]:
+    """The trials with those of the refinement among them, growing, and the powers of the crossings."""
+    for count in range(ROUNDS):
+        excess = _excess(trials, target, inaccurate)
+        places = _open_brackets(powers, excess)
+        if count < LOOKS:
+            places += _hiding_places(powers, excess)
+        if not places:
+            break
+        further = _between(powers, places, len(grid()))
+        new = run(2.0**further)
+        order = np.argsort(np.concatenate([powers, further]), kind="stable")
+        powers = np.concatenate([powers, further])[order]
+        trials = Trials(*(np.concatenate(pair)[order] for pair in zip(trials, new, strict=True)))
+    return powers, trials, _crossings(powers, _excess(trials, target, inaccurate), target)
+
+
+def _excess(trials: Trials, target: float, inaccurate: bool) -> np.ndarray:
+    """Effort less target, NaN where a trial is not valid, (N,)."""
+    valid = is_valid(trials.effort, trials.status, inaccurate)
+    return np.where(valid, trials.effort - target, np.nan)
+
+
+def _open_brackets(powers: np.ndarray, excess: np.ndarray) -> list[int]:
+    """The intervals, by the number of their lower end, with a crossing that is not yet known well enough."""
+    opposite = excess[:-1] * excess[1:] < 0.0
+    return np.flatnonzero(opposite & (np.diff(powers) > CLOSE)).tolist()
+
+
+def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
+    """The intervals in which a crossing may hide: at the edge of what is valid, and where the effort turns back before the target."""
+    finite = np.isfinite(excess)
+    found = set(np.flatnonzero(finite[:-1] != finite[1:]).tolist())
+    for i in range(1, len(powers) - 1):
+        before, here, after = excess[i - 1 : i + 2]
+        turns = abs(here) <= min(abs(before), abs(after)) and min(before * here, here * after) > 0.0
+        if turns:
+            found |= {i - 1, i}
+    valid = np.flatnonzero(finite)
+    for a, b in zip(valid[:-1].tolist(), valid[1:].tolist(), strict=True):
+        if excess[a] * excess[b] < 0.0 and b > a + 1:  # the crossing is somewhere among failed trials
+            found |= set(range(a, b))
+    brackets = set(_open_brackets(powers, excess))
+    return sorted(found - brackets)
+
+
+def _between(powers: np.ndarray, places: list[int], most: int) -> np.ndarray:
+    """Powers inside these intervals, equally many in each, of those nearest to 1 if there are too many."""
+    chosen = sorted(places, key=lambda i: min(abs(powers[i]), abs(powers[i + 1])))[:most]
+    each = max(1, most // len(chosen))
+    share = np.arange(1, each + 1) / (each + 1)
+    return np.concatenate([powers[i] + share * (powers[i + 1] - powers[i]) for i in chosen])
+
+
+def _crossings(powers: np.ndarray, excess: np.ndarray, target: float) -> list[float]:
+    """The powers at which the excess is zero, by straight lines between neighbours of opposite sign."""
+    found = powers[excess == 0.0].tolist()
+    for i in np.flatnonzero(excess[:-1] * excess[1:] < 0.0).tolist():
+        a, b = excess[i], excess[i + 1]
+        if min(abs(a), abs(b)) > JUMP * abs(target):
+            continue  # a jump
+        found.append(float(powers[i] - a * (powers[i + 1] - powers[i]) / (b - a)))
+    return _distinct(found)
+
+
+def _distinct(powers: list[float]) -> list[float]:
+    """Without repetitions: rounding makes several crossings of one."""
+    kept: list[float] = []
+    for power in sorted(powers, key=abs):
+        if all(abs(power - other) > 10.0 * CLOSE for other in kept):
+            kept.append(power)
+    return kept
+
+
+def _few(words: Sequence[str]) -> str:
+    """The first few of some words, and how many more there are."""
+    more = len(words) - MOST_NAMED
+    return ", ".join(words[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _range(factors: Sequence[float]) -> str:
+    if len(factors) == 1:
+        return f"at {factors[0]:.4g}"
+    return f"{len(factors)} from {factors[0]:.4g} to {factors[-1]:.4g}"
+
+
+def _reasons(status: Sequence[int]) -> str:
+    """Why some trials failed, each reason with the number of trials if not all of them failed for it."""
+    words = []
+    for flag, text in WORDS.items():
+        count = sum(bool(x & flag) for x in status)
+        if count == len(status):
+            words.append(text)
+        elif count:
+            words.append(f"{count} times {text}")
+    return "; ".join(words) or "the effort is not finite"
+
+
+def _number_or_none(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None
