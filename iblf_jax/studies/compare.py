@@ -12,7 +12,6 @@ searched, and which trials failed, is in the result.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -207,8 +206,7 @@ def _dt_for(trials: Trials, *, dt: float, method: str) -> float | None:
 
 def _trials_of(scenario: Scenario, names: Sequence[str], options: Mapping[str, Any]) -> Callable[[np.ndarray], Trials]:
     """A function of factors (N,) that runs all of them in one batch, of one size, so that it is compiled once."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
+    with notices.muted(UserWarning):
         scenario = canonical(scenario)
     dtype, size = scenario.initial.q.dtype, len(grid())
     folds = as_folds((AboveGravity(),), dtype, scenario)
