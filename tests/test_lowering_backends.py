@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import stat
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from made_up_runs import ALWAYS
+from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
 from iblf_jax.core.cache import directory
-from iblf_jax.engine import execute, native, plan
-from iblf_jax.engine.step import Run
+from iblf_jax.engine import execute, executors, native, plan
+from iblf_jax.engine.batch import Batch
+from iblf_jax.engine.step import Inputs, Run, TimeStep, start
 from iblf_jax.lowering import packed, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
@@ -70,6 +74,42 @@ def test_native_agrees_with_the_reference(dtype):
     found, expected = batch(dtype), batch(dtype, "vmap")
     assert_same(found, expected, TOLERANCE[dtype])
     np.testing.assert_array_equal(found.status, expected.status)
+
+
+@pytest.fixture(scope="module")
+def recorded_steps():
+    """Steps of 19 runs with a record of every fifth one, as a function of an executor; and what the scan gives."""
+    inputs = Inputs(canonical(ij.presets.zhang_yan_2024()), (), jnp.asarray(1e-3), jnp.asarray(40.0))
+    step = TimeStep("euler")
+
+    def steps(executor, values):
+        batch = Batch.of(inputs, values)
+        carry = batch.each(lambda inputs: start(inputs, "euler", jnp.zeros((6, 6))))
+        return executor(step, batch, carry, 40, 5)
+
+    values = {k: jnp.asarray(v) for k, v in draws(19).items()}
+    return steps, values, jax.jit(partial(steps, executors.scan))(values)
+
+
+@pytest.mark.parametrize("family", ["g++", "clang++", "ziglang"])
+def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_steps, family):
+    """Flags and pragmas suit GCC and Clang; the compilers optimise here, as a user's do."""
+    if family == "ziglang":
+        pytest.importorskip("ziglang")
+        monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", ZIG_CACHE)
+    elif not shutil.which(family):
+        pytest.skip(f"there is no {family} here")
+    monkeypatch.setenv("CXX", ziglang_script(tmp_path) if family == "ziglang" else family)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    steps, values, expected = recorded_steps
+    native.kernel.cache_clear()
+    compiled = jax.jit(partial(steps, executors.lowered_on(native.run)))
+    found = jax.tree.map(np.asarray, compiled(values))
+    assert_same(found, jax.tree.map(np.asarray, expected), 1e-12)
+    fewer = jax.tree.map(np.asarray, compiled({k: v[2:] for k, v in values.items()}))
+    for x, y in zip(jax.tree.leaves(fewer), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(x, y[2:])
+    native.kernel.cache_clear()
 
 
 @pytest.mark.slow

@@ -28,6 +28,9 @@ from iblf_jax.lowering.toolchain import ToolchainError
 SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { return 41; }'
 OTHER = SOURCE.replace("41", "42")
 
+ZIG_CACHE = os.environ.get("ZIG_GLOBAL_CACHE_DIR") or str(Path.home() / ".cache" / "zig")
+"""Where ziglang keeps what it makes of its own libraries, which takes it four seconds; of one place for all tests."""
+
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 
 
@@ -446,6 +449,77 @@ def fake(folder, monkeypatch, script):
 def compiles(script: str, version: str = "echo fake 1.0") -> str:
     """A compiler that says its version and else does what `script` does, with $out the file that it is to write."""
     return f'[ "$1" = --version ] && {{ {version}; exit 0; }}\nfor o; do [ "$p" = -o ] && out=$o; p=$o; done\n{script}'
+
+
+def ziglang_script(folder: Path) -> str:
+    """The path of a script that wraps ziglang's compiler, as a user would write it for $CXX."""
+    path = folder / "zig-c++"
+    path.write_text(f'#!/bin/sh\nexec {sys.executable} -m ziglang c++ "$@"\n')
+    path.chmod(0o755)
+    return str(path)
+
+
+VERSIONS = {
+    "c++ (Debian 12.2.0-14) 12.2.0\nCopyright (C) 2022 Free Software Foundation, Inc.": "gcc",
+    "clang-less (GCC) 14.1\nCopyright (C) 2024 Free Software Foundation, Inc.": "gcc",
+    "Debian clang version 14.0.6\nTarget: x86_64-pc-linux-gnu\nThread model: posix\nInstalledDir: /usr/bin": "clang",
+    "Apple clang version 15.0.0 (clang-1500.3.9.4)\nTarget: arm64-apple-darwin23": "clang",
+    "Intel(R) oneAPI DPC++/C++ Compiler 2024.0\nTarget: x86_64\nInstalledDir: /opt/intel/bin": "clang",
+    "\n  a wrapper 1.0\n": "other",
+}
+
+
+@pytest.mark.parametrize("text", VERSIONS)
+def test_the_flags_follow_the_kind_of_compiler(text):
+    version = toolchain.Version.of(text)
+    assert (version.line, version.kind) == (next(filter(None, text.splitlines())).strip(), VERSIONS[text])
+    flags = toolchain.flags_of(version.kind)
+    assert ("-fcaller-saves" in flags) == (version.kind == "gcc")
+    assert ("-fslp-vectorize" in flags) == (version.kind == "clang")
+
+
+@pytest.mark.parametrize(
+    ("machine", "kind", "flag"), [("arm64", "clang", "-mcpu"), ("aarch64", "gcc", "-march"), ("x86_64", "clang", "-march")]
+)
+def test_the_flag_of_the_processor(monkeypatch, machine, kind, flag):
+    monkeypatch.setattr(toolchain.platform, "machine", lambda: machine)
+    assert f"{flag}=native" in toolchain.flags_of(kind)
+
+
+@needs_compiler
+def test_a_compiler_is_identified_once(cache, tmp_path, monkeypatch):
+    """Not at the import; again where another program has taken its place."""
+    for _ in range(2):
+        fake(tmp_path, monkeypatch, compiles('exec "$REAL" "$@"', f"echo once >> {tmp_path}/calls; echo fake 1.0"))
+        os.utime(os.environ["CXX"], ns=(len(os.listdir(tmp_path)),) * 2)
+        assert [value(), value(OTHER)] == [41, 42]
+    assert (tmp_path / "calls").read_text().split() == ["once", "once"]
+
+
+@needs_compiler
+def test_the_first_arguments_of_a_compiler(cache, tmp_path, monkeypatch):
+    """$CXX may be a program and its first arguments, as `make` takes it."""
+    calls = tmp_path / "calls"
+    fake(tmp_path, monkeypatch, f'echo "$1" >> {calls}; shift; exec "$REAL" "$@"')
+    monkeypatch.setenv("CXX", f"'{os.environ['CXX']}' c++")
+    assert value() == 41
+    assert set(calls.read_text().split()) == {"c++"}
+    for wrong in ("no-such-compiler c++", "'open", " "):
+        monkeypatch.setenv("CXX", wrong)
+        with pytest.raises(ToolchainError, match=r"there is no C\+\+ compiler .*CXX"):
+            toolchain.compiler()
+
+
+def test_ziglang_where_the_system_has_no_compiler(cache, tmp_path, monkeypatch):
+    """With the wheel there is a compiler, without it the message names the wheel."""
+    pytest.importorskip("ziglang")
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", ZIG_CACHE)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    assert native.unavailable() is None
+    assert value() == 41
+    monkeypatch.setattr(toolchain.importlib.util, "find_spec", lambda name: None)
+    assert "pip install ziglang" in native.unavailable()
 
 
 COMPILERS = {
