@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -15,8 +16,10 @@ import warnings
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from conftest import ROOT
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax import cli
 from iblf_jax.core import drafts
@@ -74,7 +77,7 @@ def flipped(data: bytes, bit: int) -> bytes:
 def damages():
     """Ways in which a file comes to hold something else, as functions of the folder and the file."""
     draw = random.Random(0)
-    cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1], [draw.random() for _ in range(8)]
+    cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1.0], [draw.random() for _ in range(8)]
     ways = {f"cut at {x:.3f}": lambda _, f, x=x: f.write_bytes(f.read_bytes()[: int(x * f.stat().st_size) if x >= 0 else -1]) for x in cuts}
     ways |= {f"bit at {x:.3f}": lambda _, f, x=x: f.write_bytes(flipped(f.read_bytes(), int(x * 8 * f.stat().st_size))) for x in bits}
     ways |= {
@@ -253,6 +256,75 @@ def test_nothing_is_removed_through_a_link(cache, tmp_path, monkeypatch):
     (cache / "xla-old").symlink_to(tmp_path / "elsewhere")
     assert chosen_cache(monkeypatch)[0] is None
     assert precious.exists()
+
+
+@pytest.fixture
+def programs(cache):
+    """The folder in which JAX keeps what it compiles, as in a user's process."""
+    names = ("compilation_cache_dir", "enable_compilation_cache", "persistent_cache_min_compile_time_secs")
+    names = [f"jax_{name}" for name in (*names, "persistent_cache_min_entry_size_bytes")]
+    before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update("jax_compilation_cache_dir", None)
+    jax.config.update("jax_enable_compilation_cache", True)
+    keep_programs.cache_clear()
+    keep_programs()
+    yield Path(jax.config.jax_compilation_cache_dir)
+    for name, x in before.items():
+        jax.config.update(name, x)
+    reset_cache()
+    keep_programs.cache_clear()
+
+
+def values_of_programs():
+    """What three programs give that JAX has not compiled in this process; two of them take the same arguments."""
+    x = np.arange(3.0)
+    return [
+        float(jax.jit(lambda x, y: x + y)(x, 2.0)[1]),
+        float(jax.jit(lambda x, y: x * y)(x, 5.0)[1]),
+        float(jax.jit(lambda x: x - 4.0)(x)[1]),
+    ]
+
+
+@contextlib.contextmanager
+def at_most(seconds):
+    """Fails if what is done takes longer, even if it waits for ever."""
+    before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail(f"took longer than {seconds} s"))
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
+@pytest.mark.parametrize("damage", ["swapped", "a pipe", "a folder", "text", "cut at -1.000", "longer", "zeros"])
+def test_a_damaged_program_of_jax_is_compiled_again(programs, damage):
+    """Of another program, it ends in a foreign ValueError, or gives that program's numbers; at a pipe, a reader waits."""
+    expected = values_of_programs()
+    entries = sorted(programs.glob("*-cache"))
+    whole = [entry.read_bytes() for entry in entries]
+    assert len(entries) >= 3
+    if damage == "swapped":
+        for entry, content in zip(entries, whole[1:] + whole[:1], strict=True):
+            entry.write_bytes(content)
+    else:
+        for entry in entries:
+            DAMAGES[damage](programs, entry)
+    with at_most(20), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert values_of_programs() == expected
+        made = [entry.lstat().st_mtime_ns for entry in entries]
+        assert values_of_programs() == expected
+    assert [entry.lstat().st_mtime_ns for entry in entries] == made, "what was compiled again is kept"
+
+
+@pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
+def test_a_whole_program_of_jax_is_used(programs):
+    expected = values_of_programs()
+    made = [entry.stat().st_mtime_ns for entry in sorted(programs.glob("*-cache"))]
+    assert values_of_programs() == expected
+    assert [entry.stat().st_mtime_ns for entry in sorted(programs.glob("*-cache"))] == made
 
 
 def wait_for(path):
