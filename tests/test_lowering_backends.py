@@ -377,3 +377,30 @@ def test_one_run_on_the_native_backend_is_the_run(paper):
             np.testing.assert_allclose(one.metrics[name], other.metrics[name], rtol=1e-9, atol=1e-12)
     with pytest.raises(ValueError, match="backend"):
         ij.simulate(paper, duration=0.5, dt=1e-3, backend="fortran")
+
+
+@needs_compiler
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
+    """Python sees Ctrl-C between them; the numbers are bit for bit those of one call."""
+    options = {"duration": 0.5, "dt": 1e-3, "record_every": every, "method": "euler", "backend": "native"}
+    scenario = ij.presets.zhang_yan_2024()
+    whole = ij.simulate(scenario, **options)
+    calls = []
+    monkeypatch.setattr(plan, "NATIVE_UNSEEN", 1.0)
+    monkeypatch.setattr(plan, "native_stretch", lambda nodes, steps, every: calls.append(nodes) or 21 * 7)
+    parts = ij.simulate(scenario, **options)
+    assert len(calls) == 1
+    assert calls[0] > 100
+    for x, y in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(np.asarray(x), np.asarray(y))
+
+
+@pytest.mark.parametrize(
+    ("nodes", "steps", "every"), [(1800, 20_001, 1), (1800, 20_000_001, 1000), (1800, 20_000_001, None), (60_000, 10**6, 10**5)]
+)
+def test_a_stretch_is_short_and_whole(nodes, steps, every):
+    stretch = plan.native_stretch(nodes, steps, every)
+    assert stretch == steps or stretch % (every or 1) == 0
+    assert stretch * nodes <= max(plan.NATIVE_UNSEEN, nodes * (every or 1))
+    assert (stretch == steps) == (steps * nodes < plan.NATIVE_UNSEEN)
