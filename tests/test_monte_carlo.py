@@ -461,7 +461,9 @@ def test_an_interrupted_study_ends_without_a_crash(what):
     """XLA compiles in threads of its own, which go on after Ctrl-C: the end of the interpreter crashed or hung."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-c", INTERRUPTED, what]
-    process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # XLA compiles as it does for users: longer, and on several threads.
+    environment = os.environ | {"PYTHONPATH": path, "XLA_FLAGS": os.environ["TESTER_XLA_FLAGS"]}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "compiles\n"
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)
