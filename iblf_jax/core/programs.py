@@ -11,7 +11,6 @@ from __future__ import annotations
 import gc
 import threading
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -52,7 +51,7 @@ class ProgramBound:
         """Programs to compile before maps are counted: to count ten thousands of them takes as long as a small program."""
         self._lock = threading.Lock()
 
-    def __call__(self, event: str, duration: float, **details: Any) -> None:
+    def __call__(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """Listens to JAX's events."""
         if event != COMPILED:
             return

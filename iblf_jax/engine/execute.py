@@ -365,8 +365,8 @@ def _nodes_by_structure(way: Way, run: Run, shapes: tuple) -> int:
 @partial(jax.jit, static_argnums=(0, 1))
 def _stretch(way: Way, run: Run, leaves: list, carry: Carry, first: jax.Array) -> tuple[Carry, Any]:
     """`run.steps` steps of one run from step `first` on, by the kernel for many steps."""
-    executor, batch = executor_named(way.executor), way.batch(leaves, run)
-    carry, records = executor(TimeStep.of(run), batch, carry, run.steps, run.record_every, first=first, narrow=True)
+    executor = lowered_on(partial(native.run, first=first, narrow=True), native.pack, native.unpack)
+    carry, records = executor(TimeStep.of(run), way.batch(leaves, run), carry, run.steps, run.record_every)
     return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
 
 

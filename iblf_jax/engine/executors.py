@@ -105,18 +105,15 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
 
 
 def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]], pack: Callable = pack, unpack: Callable = unpack) -> Executor:
-    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`, `xla.run`), between `pack` and `unpack`.
+    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`, `xla.run`), between `pack` and `unpack`."""
 
-    What it is given besides an executor's arguments goes to `run_program`.
-    """
-
-    def executor(step: Any, batch: Batch, carry: Any, steps: int, every: int | None, **more: Any) -> tuple[Any, Any]:
+    def executor(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
         found, runs, dtype = program_of(step, batch, carry), batch.runs or 1, batch.dtype
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
         shared = pack([x[None] for x in batch.leaves.shared], Shapes.of(batch.leaves.shared), dtype, 1).floats[:, 0]
         lane = pack(batch.leaves.lane, Shapes.of(batch.leaves.lane, 1), dtype, runs).floats
-        after, arrays = run_program(found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every, **more)
+        after, arrays = run_program(found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every)
         records = unpacked_records(found.records, arrays) if every else ()
         return jax.tree.unflatten(treedef, unpack(after, shapes, runs)), records
 

@@ -19,5 +19,5 @@ def wait_until_ready(outputs: Any) -> None:
     """
     begin = time.monotonic()
     for array in jax.tree.leaves(outputs):
-        while isinstance(array, jax.Array) and not array.is_ready():
+        while isinstance(array, jax.Array) and not array.is_ready():  # type: ignore[attr-defined]
             time.sleep(min(SHARE * (time.monotonic() - begin), LONGEST))
