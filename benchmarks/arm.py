@@ -87,7 +87,7 @@ def with_pinocchio(runs: int, steps: int) -> tuple[float, float, float, float]:
         library = Path(folder) / "arm_loop.so"
         text = Path(__file__).parent / "peers" / "arm_loop.cc"
         options = ["-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-w", "-fPIC", "-shared", "-pthread"]
-        subprocess.run([toolchain.compiler(), *options, str(text), *pinocchio_flags(), "-o", str(library)], check=True)
+        subprocess.run([*toolchain.compiler(), *options, str(text), *pinocchio_flags(), "-o", str(library)], check=True)
         loop = ctypes.CDLL(str(library)).arm_loop
 
     def run() -> np.ndarray:

@@ -22,6 +22,8 @@ from iblf_jax.bounds import Bounds as Bounds
 from iblf_jax.core import linalg as linalg
 from iblf_jax.core import pytree as pytree
 from iblf_jax.core import status as status
+from iblf_jax.core.process_end import finish_at_exit as _finish_at_exit
+from iblf_jax.core.programs import bound_programs as _bound_programs
 from iblf_jax.core.pytree import Leaf as Leaf
 from iblf_jax.core.pytree import astype as astype
 from iblf_jax.core.pytree import component as component
@@ -58,6 +60,8 @@ from iblf_jax.studies.distributions import uniform as uniform
 from iblf_jax.studies.distributions import value as value
 
 __version__ = _version("iblf_jax")
+_bound_programs()
+_finish_at_exit()
 
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates

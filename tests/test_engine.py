@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from functools import partial
 
 import jax
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.core import programs
 from iblf_jax.core.status import Status
 from iblf_jax.engine import execute, machine_function, plan
 from iblf_jax.engine.batch import Batch, run_all
@@ -162,3 +165,35 @@ def test_large_sums_are_left_to_loops_of_xla(size):
     A = np.random.default_rng(size).standard_normal((size, size))
     found = jax.jit(machine_function.machine_function(stability.spectral_radius))(A)
     assert float(found) == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), rel=1e-3)
+
+
+MANY_STRUCTURES = """
+import jax
+import jax.numpy as jnp
+import iblf_jax as ij
+from iblf_jax.core import programs
+from jax._src import monitoring
+(own,) = [x for x in monitoring.get_event_duration_listeners() if isinstance(x, programs.ProgramBound)]
+print(own.limit, own.bound)
+before = programs.count_maps()
+low = programs.ProgramBound(before + 400, before + 100)
+jax.monitoring.register_event_duration_secs_listener(low)
+most = 0
+for joints in range(2, 52):
+    q = jnp.full(joints, 0.5)
+    value = jnp.mean(ij.bounds.Constant(jnp.cos(q) ** 2 + jnp.sin(q) ** 2).at(jnp.zeros(()), q))
+    most = max(most, programs.count_maps())
+print(before, most, low.released, float(value))
+"""
+
+
+@pytest.mark.skipif(programs.most_maps() is None, reason="this system has no limit of memory maps")
+def test_programs_are_released_before_the_memory_maps_run_out():
+    """Each compiled program takes some, and Linux gives a process 65,530: a process with a few dozen arms ended in a segmentation fault."""
+    found = subprocess.run([sys.executable, "-c", MANY_STRUCTURES], capture_output=True, text=True, check=True, timeout=200).stdout
+    limit, bound, before, most, released, value = map(float, found.split())
+    assert limit == programs.most_maps()
+    assert bound < 0.7 * limit
+    assert released >= 2
+    assert most < before + 400
+    assert value == pytest.approx(1.0)

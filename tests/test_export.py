@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.deployment.c_names import number
 from iblf_jax.deployment.control_law import Told, control_law, sample, start
 from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, written
 from iblf_jax.simulation.scenario import canonical
@@ -399,3 +400,54 @@ def test_the_command_line_exports(tmp_path, capsys):
     assert "ok: torque within" in built_and_run(tmp_path, "-O2")
     assert main(["export", "zhang_yan_2024", "--out", str(tmp_path), "--target", "exe"]) == 2
     assert "target" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------------------------ no numbers
+
+
+@pytest.mark.parametrize(
+    ("path", "size", "options"),
+    [
+        ("controller.K2", 1e308, {}),
+        ("controller.k1", 3e307, {}),
+        ("observer.kf", 1.1e308, {"reference": "told"}),
+        pytest.param("controller.K2", 3e37, {"dtype": "float"}, marks=pytest.mark.slow),
+        ("controller.K2", 1e308, {"target": "fmu-loop"}),
+        ("controller.k1", 1e308, {"target": "wasm", "period": None}),
+    ],
+)
+def test_a_law_that_yields_no_numbers_is_refused(tmp_path, monkeypatch, path, size, options):
+    """Its self-test would hold `nan`, which no compiler of C takes."""
+    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
+    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(), {path: size})
+    expected = rf"{path}: got .*e\+3.*finite numbers\. With it the torque tau\[.\] is (nan|-?inf) at t = "
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match=expected):
+            ij.export(scenario, tmp_path / "out", **{"period": 2e-3} | options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_parameter_of_ordinary_size_is_not_blamed(tmp_path, monkeypatch):
+    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
+
+    class Broken(ij.presets.zhang_yan_2024().controller.__class__):
+        """A law that forgets a guard."""
+
+        def command(self, t, *more):
+            command, rate = super().command(t, *more)
+            return command._replace(tau=command.tau / jnp.where(t > 0.005, 0.0, 1.0)), rate
+
+    law = ij.presets.zhang_yan_2024().controller
+    broken = ij.component(Broken)(law.k1, law.K2, law.o)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=broken)
+    with pytest.raises(ValueError, match=r"scenario: got .*yields no numbers: the torque tau\[0\] is -?inf at t = 0\.006 s"):
+        ij.export(scenario, tmp_path, period=2e-3)
+
+
+@pytest.mark.parametrize("is_float", [False, True])
+def test_every_number_is_a_literal_of_c(is_float):
+    found = [number(x, is_float) for x in (np.nan, np.inf, -np.inf, 1e300, 0.1)]
+    large, tenth = ("INFINITY", "0.10000000149011612f") if is_float else ("1e+300", "0.1")
+    assert found == ["NAN", "INFINITY", "-INFINITY", large, tenth]

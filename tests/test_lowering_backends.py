@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import stat
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from made_up_runs import ALWAYS
+from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
 from iblf_jax.core.cache import directory
-from iblf_jax.engine import execute, native, plan
-from iblf_jax.engine.step import Run
+from iblf_jax.engine import execute, executors, native, plan
+from iblf_jax.engine.batch import Batch
+from iblf_jax.engine.step import Inputs, Run, TimeStep, start
 from iblf_jax.lowering import packed, toolchain
 from iblf_jax.lowering.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
@@ -70,6 +74,42 @@ def test_native_agrees_with_the_reference(dtype):
     found, expected = batch(dtype), batch(dtype, "vmap")
     assert_same(found, expected, TOLERANCE[dtype])
     np.testing.assert_array_equal(found.status, expected.status)
+
+
+@pytest.fixture(scope="module")
+def recorded_steps():
+    """Steps of 19 runs with a record of every fifth one, as a function of an executor; and what the scan gives."""
+    inputs = Inputs(canonical(ij.presets.zhang_yan_2024()), (), jnp.asarray(1e-3), jnp.asarray(40.0))
+    step = TimeStep("euler")
+
+    def steps(executor, values):
+        batch = Batch.of(inputs, values)
+        carry = batch.each(lambda inputs: start(inputs, "euler", jnp.zeros((6, 6))))
+        return executor(step, batch, carry, 40, 5)
+
+    values = {k: jnp.asarray(v) for k, v in draws(19).items()}
+    return steps, values, jax.jit(partial(steps, executors.scan))(values)
+
+
+@pytest.mark.parametrize("family", ["g++", "clang++", "ziglang"])
+def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_steps, family):
+    """Flags and pragmas suit GCC and Clang; the compilers optimise here, as a user's do."""
+    if family == "ziglang":
+        pytest.importorskip("ziglang")
+        monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", ZIG_CACHE)
+    elif not shutil.which(family):
+        pytest.skip(f"there is no {family} here")
+    monkeypatch.setenv("CXX", ziglang_script(tmp_path) if family == "ziglang" else family)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    steps, values, expected = recorded_steps
+    native.kernel.cache_clear()
+    compiled = jax.jit(partial(steps, executors.lowered_on(native.run)))
+    found = jax.tree.map(np.asarray, compiled(values))
+    assert_same(found, jax.tree.map(np.asarray, expected), 1e-12)
+    fewer = jax.tree.map(np.asarray, compiled({k: v[2:] for k, v in values.items()}))
+    for x, y in zip(jax.tree.leaves(fewer), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(x, y[2:])
+    native.kernel.cache_clear()
 
 
 @pytest.mark.slow
@@ -337,3 +377,30 @@ def test_one_run_on_the_native_backend_is_the_run(paper):
             np.testing.assert_allclose(one.metrics[name], other.metrics[name], rtol=1e-9, atol=1e-12)
     with pytest.raises(ValueError, match="backend"):
         ij.simulate(paper, duration=0.5, dt=1e-3, backend="fortran")
+
+
+@needs_compiler
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
+    """Python sees Ctrl-C between them; the numbers are bit for bit those of one call."""
+    options = {"duration": 0.5, "dt": 1e-3, "record_every": every, "method": "euler", "backend": "native"}
+    scenario = ij.presets.zhang_yan_2024()
+    whole = ij.simulate(scenario, **options)
+    calls = []
+    monkeypatch.setattr(plan, "NATIVE_UNSEEN", 1.0)
+    monkeypatch.setattr(plan, "native_stretch", lambda nodes, steps, every: calls.append(nodes) or 21 * 7)
+    parts = ij.simulate(scenario, **options)
+    assert len(calls) == 1
+    assert calls[0] > 100
+    for x, y in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(np.asarray(x), np.asarray(y))
+
+
+@pytest.mark.parametrize(
+    ("nodes", "steps", "every"), [(1800, 20_001, 1), (1800, 20_000_001, 1000), (1800, 20_000_001, None), (60_000, 10**6, 10**5)]
+)
+def test_a_stretch_is_short_and_whole(nodes, steps, every):
+    stretch = plan.native_stretch(nodes, steps, every)
+    assert stretch == steps or stretch % (every or 1) == 0
+    assert stretch * nodes <= max(plan.NATIVE_UNSEEN, nodes * (every or 1))
+    assert (stretch == steps) == (steps * nodes < plan.NATIVE_UNSEEN)

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 import zlib
 
 import jax
@@ -11,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import study_cases as cases
+from conftest import ROOT
 from scipy import stats
 
 import iblf_jax as ij
@@ -425,3 +431,45 @@ def test_progress_is_shown_when_asked(capsys):
     assert "300/300" in shown
     cases.study(runs=300)
     assert capsys.readouterr().err == ""
+
+
+INTERRUPTED = """
+import sys
+import jax
+import iblf_jax as ij
+import study_cases
+
+def seen(event, duration, **details):
+    if "jaxpr_to_mlir" in event and "_execute" in str(details):
+        print("compiles", flush=True)
+
+jax.monitoring.register_event_duration_secs_listener(seen)
+def study():
+    ij.monte_carlo(ij.presets.zhang_yan_2024(), study_cases.perturbations(), runs=20_000, duration=20.0, dt=1e-3, backend="xla")
+if sys.argv[1] == "caught":
+    try:
+        study()
+    except KeyboardInterrupt:
+        print("caught", flush=True)
+else:
+    study()
+"""
+
+
+@pytest.mark.parametrize("what", ["left", pytest.param("caught", marks=pytest.mark.slow)])
+def test_an_interrupted_study_ends_without_a_crash(what):
+    """XLA compiles in threads of its own, which go on after Ctrl-C: the end of the interpreter crashed or hung."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-c", INTERRUPTED, what]
+    # XLA compiles as it does for users: longer, and on several threads.
+    environment = os.environ | {"PYTHONPATH": path, "XLA_FLAGS": os.environ["TESTER_XLA_FLAGS"]}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "compiles\n"
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    begin = time.monotonic()
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == (0 if what == "caught" else -signal.SIGINT), err[-2000:]
+    assert "KeyboardInterrupt" in err if what == "left" else out == "caught\n"
+    if what == "left":
+        assert time.monotonic() - begin < 30

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -15,8 +16,10 @@ import warnings
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from conftest import ROOT
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax import cli
 from iblf_jax.core import drafts
@@ -27,6 +30,9 @@ from iblf_jax.lowering.toolchain import ToolchainError
 
 SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { return 41; }'
 OTHER = SOURCE.replace("41", "42")
+
+ZIG_CACHE = os.environ.get("ZIG_GLOBAL_CACHE_DIR") or str(Path.home() / ".cache" / "zig")
+"""Where ziglang keeps what it makes of its own libraries, which takes it four seconds; of one place for all tests."""
 
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 
@@ -71,7 +77,7 @@ def flipped(data: bytes, bit: int) -> bytes:
 def damages():
     """Ways in which a file comes to hold something else, as functions of the folder and the file."""
     draw = random.Random(0)
-    cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1], [draw.random() for _ in range(8)]
+    cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1.0], [draw.random() for _ in range(8)]
     ways = {f"cut at {x:.3f}": lambda _, f, x=x: f.write_bytes(f.read_bytes()[: int(x * f.stat().st_size) if x >= 0 else -1]) for x in cuts}
     ways |= {f"bit at {x:.3f}": lambda _, f, x=x: f.write_bytes(flipped(f.read_bytes(), int(x * 8 * f.stat().st_size))) for x in bits}
     ways |= {
@@ -250,6 +256,75 @@ def test_nothing_is_removed_through_a_link(cache, tmp_path, monkeypatch):
     (cache / "xla-old").symlink_to(tmp_path / "elsewhere")
     assert chosen_cache(monkeypatch)[0] is None
     assert precious.exists()
+
+
+@pytest.fixture
+def programs(cache):
+    """The folder in which JAX keeps what it compiles, as in a user's process."""
+    names = ("compilation_cache_dir", "enable_compilation_cache", "persistent_cache_min_compile_time_secs")
+    names = [f"jax_{name}" for name in (*names, "persistent_cache_min_entry_size_bytes")]
+    before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update("jax_compilation_cache_dir", None)
+    jax.config.update("jax_enable_compilation_cache", True)
+    keep_programs.cache_clear()
+    keep_programs()
+    yield Path(jax.config.jax_compilation_cache_dir)
+    for name, x in before.items():
+        jax.config.update(name, x)
+    reset_cache()
+    keep_programs.cache_clear()
+
+
+def values_of_programs():
+    """What three programs give that JAX has not compiled in this process; two of them take the same arguments."""
+    x = np.arange(3.0)
+    return [
+        float(jax.jit(lambda x, y: x + y)(x, 2.0)[1]),
+        float(jax.jit(lambda x, y: x * y)(x, 5.0)[1]),
+        float(jax.jit(lambda x: x - 4.0)(x)[1]),
+    ]
+
+
+@contextlib.contextmanager
+def at_most(seconds):
+    """Fails if what is done takes longer, even if it waits for ever."""
+    before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail(f"took longer than {seconds} s"))
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
+@pytest.mark.parametrize("damage", ["swapped", "a pipe", "a folder", "text", "cut at -1.000", "longer", "zeros"])
+def test_a_damaged_program_of_jax_is_compiled_again(programs, damage):
+    """Of another program, it ends in a foreign ValueError, or gives that program's numbers; at a pipe, a reader waits."""
+    expected = values_of_programs()
+    entries = sorted(programs.glob("*-cache"))
+    whole = [entry.read_bytes() for entry in entries]
+    assert len(entries) >= 3
+    if damage == "swapped":
+        for entry, content in zip(entries, whole[1:] + whole[:1], strict=True):
+            entry.write_bytes(content)
+    else:
+        for entry in entries:
+            DAMAGES[damage](programs, entry)
+    with at_most(20), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert values_of_programs() == expected
+        made = [entry.lstat().st_mtime_ns for entry in entries]
+        assert values_of_programs() == expected
+    assert [entry.lstat().st_mtime_ns for entry in entries] == made, "what was compiled again is kept"
+
+
+@pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
+def test_a_whole_program_of_jax_is_used(programs):
+    expected = values_of_programs()
+    made = [entry.stat().st_mtime_ns for entry in sorted(programs.glob("*-cache"))]
+    assert values_of_programs() == expected
+    assert [entry.stat().st_mtime_ns for entry in sorted(programs.glob("*-cache"))] == made
 
 
 def wait_for(path):
@@ -446,6 +521,77 @@ def fake(folder, monkeypatch, script):
 def compiles(script: str, version: str = "echo fake 1.0") -> str:
     """A compiler that says its version and else does what `script` does, with $out the file that it is to write."""
     return f'[ "$1" = --version ] && {{ {version}; exit 0; }}\nfor o; do [ "$p" = -o ] && out=$o; p=$o; done\n{script}'
+
+
+def ziglang_script(folder: Path) -> str:
+    """The path of a script that wraps ziglang's compiler, as a user would write it for $CXX."""
+    path = folder / "zig-c++"
+    path.write_text(f'#!/bin/sh\nexec {sys.executable} -m ziglang c++ "$@"\n')
+    path.chmod(0o755)
+    return str(path)
+
+
+VERSIONS = {
+    "c++ (Debian 12.2.0-14) 12.2.0\nCopyright (C) 2022 Free Software Foundation, Inc.": "gcc",
+    "clang-less (GCC) 14.1\nCopyright (C) 2024 Free Software Foundation, Inc.": "gcc",
+    "Debian clang version 14.0.6\nTarget: x86_64-pc-linux-gnu\nThread model: posix\nInstalledDir: /usr/bin": "clang",
+    "Apple clang version 15.0.0 (clang-1500.3.9.4)\nTarget: arm64-apple-darwin23": "clang",
+    "Intel(R) oneAPI DPC++/C++ Compiler 2024.0\nTarget: x86_64\nInstalledDir: /opt/intel/bin": "clang",
+    "\n  a wrapper 1.0\n": "other",
+}
+
+
+@pytest.mark.parametrize("text", VERSIONS)
+def test_the_flags_follow_the_kind_of_compiler(text):
+    version = toolchain.Version.of(text)
+    assert (version.line, version.kind) == (next(filter(None, text.splitlines())).strip(), VERSIONS[text])
+    flags = toolchain.flags_of(version.kind)
+    assert ("-fcaller-saves" in flags) == (version.kind == "gcc")
+    assert ("-fslp-vectorize" in flags) == (version.kind == "clang")
+
+
+@pytest.mark.parametrize(
+    ("machine", "kind", "flag"), [("arm64", "clang", "-mcpu"), ("aarch64", "gcc", "-march"), ("x86_64", "clang", "-march")]
+)
+def test_the_flag_of_the_processor(monkeypatch, machine, kind, flag):
+    monkeypatch.setattr(toolchain.platform, "machine", lambda: machine)
+    assert f"{flag}=native" in toolchain.flags_of(kind)
+
+
+@needs_compiler
+def test_a_compiler_is_identified_once(cache, tmp_path, monkeypatch):
+    """Not at the import; again where another program has taken its place."""
+    for _ in range(2):
+        fake(tmp_path, monkeypatch, compiles('exec "$REAL" "$@"', f"echo once >> {tmp_path}/calls; echo fake 1.0"))
+        os.utime(os.environ["CXX"], ns=(len(os.listdir(tmp_path)),) * 2)
+        assert [value(), value(OTHER)] == [41, 42]
+    assert (tmp_path / "calls").read_text().split() == ["once", "once"]
+
+
+@needs_compiler
+def test_the_first_arguments_of_a_compiler(cache, tmp_path, monkeypatch):
+    """$CXX may be a program and its first arguments, as `make` takes it."""
+    calls = tmp_path / "calls"
+    fake(tmp_path, monkeypatch, f'echo "$1" >> {calls}; shift; exec "$REAL" "$@"')
+    monkeypatch.setenv("CXX", f"'{os.environ['CXX']}' c++")
+    assert value() == 41
+    assert set(calls.read_text().split()) == {"c++"}
+    for wrong in ("no-such-compiler c++", "'open", " "):
+        monkeypatch.setenv("CXX", wrong)
+        with pytest.raises(ToolchainError, match=r"there is no C\+\+ compiler .*CXX"):
+            toolchain.compiler()
+
+
+def test_ziglang_where_the_system_has_no_compiler(cache, tmp_path, monkeypatch):
+    """With the wheel there is a compiler, without it the message names the wheel."""
+    pytest.importorskip("ziglang")
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", ZIG_CACHE)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    assert native.unavailable() is None
+    assert value() == 41
+    monkeypatch.setattr(toolchain.importlib.util, "find_spec", lambda name: None)
+    assert "pip install ziglang" in native.unavailable()
 
 
 COMPILERS = {

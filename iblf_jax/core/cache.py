@@ -3,6 +3,9 @@
 It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of processor.  It is used from the first run
 of a process on, unless JAX has been given a folder of its own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used
 longest ago is removed once all takes more than LIMIT; removing the folder loses nothing but time.
+
+JAX loads whatever it finds under the name of a program.  In our folder each of its entries therefore ends in a digest of its name and its
+content: one that is damaged, or belongs to another program, or is no file, is removed, and the program is compiled again.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import contextlib
 import hashlib
 import os
 import platform
+import shutil
 import stat
 import time
 from functools import cache
@@ -24,8 +28,12 @@ from iblf_jax.core import notices
 
 LIMIT = 2 * 2**30
 """Bytes."""
-SUFFIXES = ("-cache", "-atime", ".so", ".cubin")
+JAX_SUFFIX = "-cache"
+"""Of the names of JAX's entries."""
+SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin")
 """Of the names of what may be removed: JAX's and ours."""
+DIGEST_SIZE = 32
+"""Bytes of a digest."""
 IN_USE = 3600.0
 """Seconds for which nobody removes what was used: another process may be about to load it."""
 
@@ -50,6 +58,72 @@ def directory() -> Path:
     except (OSError, RuntimeError) as error:
         raise OSError(f"the cache {path or '~/.cache/iblf_jax'} cannot be made: {error}") from None
     return path
+
+
+class VerifiedCache:
+    """JAX's cache of compiled programs (`base`, in `folder`), of which only entries that are whole and in their own place are used.
+
+    It offers what JAX asks of a cache: `get` and `put`.
+    """
+
+    def __init__(self, base: Any, folder: Path) -> None:
+        self._base = base
+        self._path = folder
+
+    def get(self, key: str) -> bytes | None:
+        """The entry of a key; None, after its removal, if it is not what was put there."""
+        path = self._entry(key)
+        try:
+            is_file = stat.S_ISREG(path.lstat().st_mode)
+        except OSError:
+            return None
+        # Only a file is opened: at a pipe, a reader waits.
+        whole = self._base.get(key) if is_file else None
+        if whole is not None:
+            image, digest = whole[:-DIGEST_SIZE], whole[-DIGEST_SIZE:]
+            if digest == entry_digest(key, image):
+                return image
+        _remove(path)
+        return None
+
+    def put(self, key: str, value: bytes) -> None:
+        """Keeps an entry."""
+        self._base.put(key, value + entry_digest(key, value))
+
+    def _entry(self, key: str) -> Path:
+        return self._path / f"{key}{JAX_SUFFIX}"
+
+
+def entry_digest(key: str, image: bytes) -> bytes:
+    """What an entry ends in: entries that change places do not fit it."""
+    return hashlib.sha256(key.encode() + b"\0" + image).digest()
+
+
+def _remove(path: Path) -> None:
+    """Removes what is in the place of a file, a link itself."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISDIR(path.lstat().st_mode):
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink()
+
+
+def _verify_entries(folder: Path) -> None:
+    """Has JAX use `VerifiedCache` for its folder.
+
+    JAX has no public way to hand it a cache.  A release that keeps its own elsewhere is left as it is: its entries are then not verified
+    (`tests/test_toolchain.py` notices).
+    """
+    try:
+        from jax._src import compilation_cache
+
+        base, _ = compilation_cache.get_file_cache(str(folder))  # type: ignore[misc]
+        holds_cache = hasattr(compilation_cache, "_cache") and hasattr(compilation_cache, "_cache_initialized")
+    except (ImportError, AttributeError, TypeError):
+        return
+    if holds_cache:
+        compilation_cache._cache = VerifiedCache(base, folder)  # type: ignore[assignment]
+        compilation_cache._cache_initialized = True
 
 
 @cache
@@ -78,6 +152,7 @@ def keep_programs() -> None:
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         reset_cache()  # what JAX has compiled before this has made it decide that it keeps nothing
+        _verify_entries(folder)
 
 
 @cache

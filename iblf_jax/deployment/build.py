@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.lowering.toolchain import ToolchainError, has_ziglang, ziglang
 
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""
@@ -26,16 +24,16 @@ def c_compiler() -> list[str]:
         path = shutil.which(name)
         if path:
             return [path]
-    if not wanted and importlib.util.find_spec("ziglang"):
+    if not wanted and has_ziglang():
         return zig()
     raise ToolchainError("there is no C compiler" + (f" {wanted!r} ($CC)" if wanted else " (cc, gcc, clang; pip install ziglang has one)"))
 
 
 def zig() -> list[str]:
     """The command of ziglang's C compiler; ToolchainError if it is not installed."""
-    if not importlib.util.find_spec("ziglang"):
+    if not has_ziglang():
         raise ToolchainError('ziglang is not installed: pip install ziglang, or ".[export]" in a clone')
-    return [sys.executable, "-m", "ziglang", "cc"]
+    return list(ziglang("cc"))
 
 
 def build(command: Sequence[str], folder: Path) -> None:

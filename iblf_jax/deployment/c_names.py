@@ -56,10 +56,14 @@ def comment(text: str) -> str:
 
 
 def number(x: float, is_float: bool) -> str:
-    """A C literal of exactly this number."""
-    if math.isinf(x):
-        return "-INFINITY" if x < 0 else "INFINITY"
-    return f"{float(np.float32(x)) if is_float else float(x)!r}{'f' if is_float else ''}"
+    """A C literal of exactly this number, as a float or a double; what is not finite is a name of `math.h`."""
+    with np.errstate(over="ignore"):
+        value = float(np.float32(x)) if is_float else float(x)
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "-INFINITY" if value < 0 else "INFINITY"
+    return f"{value!r}{'f' if is_float else ''}"
 
 
 class Field(NamedTuple):

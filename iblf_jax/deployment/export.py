@@ -19,6 +19,7 @@ from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.deployment.c_names import FILES, RESERVED
 from iblf_jax.deployment.control_law import Told, control_law, sample, start
 from iblf_jax.deployment.cosimulate import check_single, with_period
+from iblf_jax.deployment.finite import check_finite
 from iblf_jax.deployment.fmu import law_fmu, loop_fmu
 from iblf_jax.deployment.loop_program import loop_program
 from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, operations_of, told, written
@@ -26,6 +27,7 @@ from iblf_jax.deployment.write_loop import loop_files, wasm_files
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.lowering.program import UnsupportedError
+from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -34,6 +36,8 @@ TARGETS = ("c", "fmu", "fmu-loop", "wasm")
 TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
 """Seconds of the run that the self-test compares with."""
+SAMPLES_AT_START = 3
+"""Samples of a law in a closed loop that are looked at before the loop is written: the first torque comes back by the observer."""
 DECIMALS = 9
 LONGEST_STEP = 1e-3
 """Seconds of that run's steps, at most."""
@@ -102,7 +106,7 @@ def export(
       An `Exported`: files, sizes and operations of a call; prints as a table.
 
     Raises:
-      ValueError: bad arguments, or what cannot be written out; the message says why.
+      ValueError: bad arguments, what cannot be written out, or a law that yields no finite torque; the message says why.
       ToolchainError: no compiler for an FMU (cc, gcc, clang) or for WebAssembly (`ziglang`, of the extra `export`), or it failed.
 
     Source: design of this package; FMI standard 3.0, Modelica Association, 2022.
@@ -148,6 +152,7 @@ def _law(scenario: Scenario, folder: Path, target: str, name: str, is_told: bool
 
 def _loop(scenario: Scenario, folder: Path, target: str, name: str, dt: float, method: str, seed: int) -> Exported:
     check_step(scenario, dt)
+    _check_start(scenario)
     loop = loop_program(scenario, method)
     made = loop_files(scenario, loop, name, method, tuple(getattr(scenario.plant, "joints", ())))
     settings = [dt, *(np.asarray(noise_key(jax.random.key(seed)), float).tolist() if has_noise(scenario) else [])]
@@ -215,12 +220,6 @@ def vectors(scenario: Scenario, told_reference: bool) -> Vectors:
     samples = max(2, round(VECTORS_DURATION / period))
     with notices.muted():
         run = simulate(scenario, duration=samples * period, dt=period / steps, record_every=steps)
-    status = int(run.status)
-    if status & int(FAILED | Status.SAMPLING_TOO_SLOW):
-        notices.warn(
-            f"the simulated run with this law every {period:g} s: {describe(status)}. What is written is that law; "
-            "ij.recommended_period(scenario) says how long a period may be."
-        )
     dtype = run.q.dtype
     t = jnp.asarray(np.arange(samples) * period, dtype)
     asked = Told(t, *(_rounded(x, samples, dtype) for x in (run.measured.q, run.measured.dq)))
@@ -228,10 +227,49 @@ def vectors(scenario: Scenario, told_reference: bool) -> Vectors:
     if told_reference:
         asked, first = ((Told(*x[:3], *(_rounded(y, samples, dtype) for y in _reference(scenario, x.t)))) for x in (asked, first))
     first = jax.tree.map(lambda x: x[0], first)
-    tau = np.asarray(_answers(scenario, first, asked))[::CHECKED]
+    torques = np.asarray(_answers(scenario, first, asked))
+    _check_answers(scenario, first, asked, torques, " of the simulated run")
+    status = int(run.status)
+    if status & int(FAILED | Status.SAMPLING_TOO_SLOW):
+        notices.warn(
+            f"the simulated run with this law every {period:g} s: {describe(status)}. What is written is that law; "
+            "ij.recommended_period(scenario) says how long a period may be."
+        )
+    tau = torques[::CHECKED]
     given = tuple(np.asarray(x) for x in asked[3:]) if told_reference else ()
     begin = tuple(np.asarray(x) for x in first[1:] if not isinstance(x, tuple))
     return Vectors(begin, np.asarray(asked.q), np.asarray(asked.dq), given, tau)
+
+
+def _check_answers(scenario: Scenario, first: Told, asked: Told, torques: np.ndarray, where: str) -> None:
+    """Refuses a law that yields no numbers, from its torques (K, n) at K samples; ValueError says why and `where`."""
+    wrong = ~np.isfinite(torques).all(axis=1)
+    if not wrong.any():
+        return
+    until = int(np.argmax(wrong)) + 1
+    told = jax.tree.map(lambda x: x[:until], asked)
+    instant = f"at t = {float(told.t[-1]):g} s{where}"
+    check_finite(scenario, lambda changed: _answers(changed, first, told), torques[:until], instant)
+
+
+def _check_start(scenario: Scenario) -> None:
+    """Refuses a closed loop whose law yields no numbers at its start; ValueError says why."""
+    if scenario.sampling is None:
+        check_finite(scenario, _first_torque, np.asarray(_first_torque(scenario)), "at t = 0 s")
+        return
+    q, dq = scenario.initial.q, scenario.initial.dq
+    count = (SAMPLES_AT_START, 1)
+    t = jnp.arange(SAMPLES_AT_START, dtype=q.dtype) * scenario.sampling.period
+    told = Told(t, jnp.tile(q, count), jnp.tile(dq, count))
+    first = jax.tree.map(lambda x: x[0], told)
+    _check_answers(scenario, first, told, np.asarray(_answers(scenario, first, told)), "")
+
+
+@jax.jit
+def _first_torque(scenario: Scenario) -> jax.Array:
+    """The torque of a law that is not sampled at t = 0, (1, n) [N m]; what it accelerates a joint by where that is not finite."""
+    rate, found = evaluate(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
+    return jnp.where(jnp.isfinite(rate.dq), found.tau, rate.dq)[None]
 
 
 def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:

@@ -29,6 +29,7 @@ from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.mechanism import Mechanism, mechanism_of
 from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, Run, TimeStep
+from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.lowering.packed import Shapes
 from iblf_jax.lowering.passes import written_out
 from iblf_jax.lowering.program import Program, UnsupportedError
@@ -242,7 +243,7 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
         try:
             with _compilers_stop_with_it():
                 carry, at_start = _before_steps(way, around, leaves)
-                carry, records = _steps(way, run, leaves, carry)
+                carry, records = _all_steps(way, run, leaves, carry)
                 return _after_steps(way, around, leaves, carry, at_start)._replace(records=records)
         except ToolchainError as error:
             if not isinstance(error, StoppedError):
@@ -254,7 +255,9 @@ def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend:
         tell(_slower(unsupported))
     if _failed:
         names = tuple(name for name in names if (name, structure, shapes) not in _failed)
-    return _first_that_can(names, in_parts, lambda: _one_by_scan(structure, run, leaves), tell)
+    outcome = _first_that_can(names, in_parts, lambda: _one_by_scan(structure, run, leaves), tell)
+    wait_until_ready(outcome)
+    return outcome
 
 
 _failed: set[tuple] = set()
@@ -323,6 +326,46 @@ def _before_steps(way: Way, run: Run, leaves: list) -> tuple[Carry, Probed]:
 @partial(jax.jit, static_argnums=(0, 1))
 def _steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
     carry, records = executor_named(way.executor)(TimeStep.of(run), way.batch(leaves, run), carry, run.steps + 1, run.record_every)
+    return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
+
+
+def _all_steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
+    """All steps of one run, in calls that are short enough for Python to see Ctrl-C between them; the numbers are those of one call."""
+    steps = run.steps + 1
+    if way.executor != "native" or steps * plan.LONGEST_ONE_RUN["native"] <= plan.NATIVE_UNSEEN:
+        return _steps(way, run, leaves, carry)
+    stretch = plan.native_stretch(_nodes_of(way, run, leaves), steps, run.record_every)
+    if stretch == steps:
+        return _steps(way, run, leaves, carry)
+    parts = []
+    for first in range(0, steps, stretch):
+        part = run._replace(steps=min(stretch, steps - first))
+        carry, records = _stretch(way, part, leaves, carry, np.int32(first))
+        jax.block_until_ready(carry)
+        parts.append(records)
+    if run.record_every is None:
+        return carry, None
+    return carry, jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
+
+
+def _nodes_of(way: Way, run: Run, leaves: list) -> int:
+    """Nodes of a step's program, which is traced once."""
+    shapes = tuple((x.shape, x.dtype) for x in leaves)
+    return _nodes_by_structure(way, run._replace(steps=0, record_every=run.record_every and 1), shapes)
+
+
+@lru_cache(maxsize=256)
+def _nodes_by_structure(way: Way, run: Run, shapes: tuple) -> int:
+    found = list[int]()
+    jax.eval_shape(lambda leaves: found.append(_program(way.batch(leaves, run), run).size), [jax.ShapeDtypeStruct(*x) for x in shapes])
+    return found[0]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _stretch(way: Way, run: Run, leaves: list, carry: Carry, first: jax.Array) -> tuple[Carry, Any]:
+    """`run.steps` steps of one run from step `first` on, by the kernel for many steps."""
+    executor = lowered_on(partial(native.run, first=first, narrow=True), native.pack, native.unpack)
+    carry, records = executor(TimeStep.of(run), way.batch(leaves, run), carry, run.steps, run.record_every)
     return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
 
 

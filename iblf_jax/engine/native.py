@@ -96,7 +96,14 @@ def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
 
 
 def run(
-    program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None
+    program: Program,
+    shared: jax.Array,
+    lane: jax.Array,
+    carry: Packed,
+    steps: int,
+    every: int | None,
+    first: jax.Array | int = 0,
+    narrow: bool | None = None,
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs.
 
@@ -107,13 +114,18 @@ def run(
       carry: rows before the first step.
       steps: how many.
       every: sample every so-many-th step, or None.
+      first: number of the first step, () int32, a multiple of `every`.
+      narrow: whether the kernel is the one for few runs of many steps; by the number of steps if not given.
 
     Returns:
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every `every`-th step.
     """
     runs = carry.floats.shape[1]
-    name = kernel(program, shared.size, lane.shape[0], _is_narrow(program, runs, steps))
+    narrow = _is_narrow(program, runs, steps) if narrow is None else narrow
+    name = kernel(program, shared.size, lane.shape[0], narrow)
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(program, runs, steps, every)
-    settings = np.asarray([[0, steps, every or 0, threads()]], np.int32)
-    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, jnp.asarray(settings))
+    settings = jnp.asarray(np.asarray([[0, steps, every or 0, threads()]], np.int32))
+    if not isinstance(first, int) or first:
+        settings = settings.at[0, 0].set(first)
+    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, settings)
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]

@@ -66,6 +66,9 @@ NATIVE_STRETCH, NATIVE_GROUP = 128, 32
 512 steps and 8 to 128 blocks take the same time within 5 % (the paper's loop)."""
 NATIVE_NARROW = 16
 """Bytes of the runs of a batch up to which they are stepped in vectors of that length: a processor's longest would be mostly copies."""
+NATIVE_UNSEEN = 4e8
+"""Nodes times steps of one run that a kernel makes before Python sees whether Ctrl-C was pressed: a tenth of a second, and two tenths of a
+per cent of time for the calls.  The paper's loop: 220,000 steps."""
 NATIVE_FEW = 80
 """Steps up to which they are not: so few take less time than a build of their own, and a `Probe` of a run serves a batch too."""
 GPU_STRETCH = 8192
@@ -201,6 +204,13 @@ def native_build(nodes: int, narrow: bool) -> tuple[int | None, tuple[str, ...]]
     """
     sizes = (f"-DSTRETCH={NATIVE_STRETCH}", f"-DGROUP={NATIVE_GROUP}", *((f"-DVECTOR_BYTES={NATIVE_NARROW}",) if narrow else ()))
     return NATIVE_SEGMENT if nodes > NATIVE_LONG else None, sizes
+
+
+def native_stretch(nodes: int, steps: int, every: int | None) -> int:
+    """Steps of one run that a kernel makes in one call, a multiple of `every` unless that is all steps."""
+    unit = every or 1
+    most = max(int(NATIVE_UNSEEN / max(nodes, 1)) // unit, 1) * unit
+    return min(steps, max(most, NATIVE_FEW + 1))
 
 
 def gpu_threads(runs: int, processors: int) -> int:

@@ -38,13 +38,12 @@ from __future__ import annotations
 import inspect
 import json
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import holds_weights
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.files import components
@@ -178,10 +177,10 @@ def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> di
         return table
     if whole and {x % n for x in given if -n <= x < n} == set(range(n)):
         text = f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write weights = {given} if you mean these."
-        warnings.warn(text, UserWarning, stacklevel=2)
+        notices.warn(text)
         return table
     text = f"{key}.joints selects joints now; {given} is read as weights, as in earlier versions: write weights = {given}."
-    warnings.warn(text, DeprecationWarning, stacklevel=2)
+    notices.warn(text, DeprecationWarning)
     return {name: value for name, value in table.items() if name != "joints"} | {"weights": given}
 
 

@@ -1,4 +1,7 @@
-"""The system's C++ compiler: found, run without a shell, its results kept by content in a directory that only the user can write.
+"""The C++ compiler: found, run without a shell, its results kept by content in a directory that only the user can write.
+
+It is the system's, GCC or Clang, or Clang as the wheel `ziglang` brings it.  The flags depend on which of them it is, which
+its version text tells; each compiler prints that text once in a process.
 
 The key of a kernel is a hash of its source, the flags, the compiler's version, the processor and the header of XLA's interface, so a
 stale kernel is never loaded.  A kernel is made in a draft, written out to the disk and renamed, so that two processes do not disturb each
@@ -12,18 +15,22 @@ import atexit
 import contextlib
 import ctypes
 import hashlib
+import importlib.util
 import os
 import platform
+import shlex
 import shutil
 import signal
 import stat
 import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 
@@ -33,18 +40,30 @@ from iblf_jax.core.cache import directory, processor
 from iblf_jax.core.drafts import draft, remove_abandoned
 from iblf_jax.core.progress import told
 
-COMPILER_FLAGS = (
-    "-x", "c++", "-std=gnu++17", "-nostdinc++", "-O1", "-fexpensive-optimizations", "-fcaller-saves", "-ftree-loop-vectorize",
-    "-march=native", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fno-exceptions",
-    "-fno-rtti", "-fvisibility=hidden", "-w",
+COMMON_FLAGS = (
+    "-x", "c++", "-std=gnu++17", "-nostdinc++", "-O1", "-fPIC", "-shared", "-pthread",
+    "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
+    "-fno-exceptions", "-fno-rtti", "-fvisibility=hidden", "-w",
 )  # fmt: skip
-"""Of -O3 what the generated text gains by: the paper's loop runs as fast (1 % either way, one run 3 % slower) and builds in 0.6 s instead
-of 2.7.  Products and sums are one operation by the second flag, and a large angle's sine would lose digits without; numbers stay in
-registers across what is called rarely by the third (a step of seven joints takes 5 to 25 % longer without); the fourth makes one
-instruction of a root of many runs.
+"""Flags that GCC and Clang share.
 
-NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  The headers are C's: C++ makes of `math.h` a tenth of a
-second more to read."""
+NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  Without `-ffp-contract=fast`, which makes one
+operation of a product and a sum, the sine of a large angle would lose digits.  The headers are C's: C++ makes of `math.h` a
+tenth of a second more to read."""
+FLAGS_OF_KIND = {
+    "gcc": ("-fexpensive-optimizations", "-fcaller-saves", "-ftree-loop-vectorize"),
+    "clang": ("-fvectorize", "-fslp-vectorize", "-fno-sanitize=undefined", "-nostdlib++"),
+    "other": (),
+}
+"""Flags that only one kind of compiler knows, by kind.
+
+GCC: of -O3 what the generated text gains by.  The paper's loop runs as fast (1 % either way, one run 3 % slower) and builds in
+0.6 s instead of 2.7.  The first flag is needed for products and sums to become one operation; with the second, numbers stay in
+registers across rare calls (a step of seven joints takes 5 to 25 % longer without); the third makes one instruction of a root
+of many runs.
+
+Clang: the first two make one instruction of a root of many runs.  `ziglang` adds checks of undefined behaviour to what is not
+optimised, and its own C++ library, of which a kernel uses nothing; the other two flags leave both out."""
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""
 VERSION_TIMEOUT = 20.0
@@ -65,45 +84,114 @@ class StoppedError(ToolchainError):
     """Stopped by this process itself: another try may do."""
 
 
-def compiler() -> str:
-    """The path of a C++ compiler: $CXX if it is set, else c++, g++ or clang++; ToolchainError if there is none."""
+def compiler() -> tuple[str, ...]:
+    """The command of a C++ compiler: $CXX if it is set, else c++, g++, clang++ or that of the wheel `ziglang`.
+
+    Raises:
+      ToolchainError: there is none.
+    """
     wanted = os.environ.get("CXX")
-    for name in [wanted] if wanted else ["c++", "g++", "clang++"]:
+    if wanted:
+        return _command_of(wanted)
+    for name in ("c++", "g++", "clang++"):
         path = shutil.which(name)
         if path:
-            return path
-    raise ToolchainError("there is no C++ compiler" + (f" {wanted!r} ($CXX)" if wanted else " (c++, g++, clang++)"))
+            return (path,)
+    if has_ziglang():
+        return ziglang("c++")
+    raise ToolchainError("there is no C++ compiler (c++, g++, clang++; pip install ziglang has one)")
 
 
-def _version(path: str) -> str:
-    """What a compiler says of itself in its first line."""
+def _command_of(wanted: str) -> tuple[str, ...]:
+    """The command that $CXX names: a program, or a program and its first arguments."""
+    path = shutil.which(wanted)
+    if path:
+        return (path,)
+    with contextlib.suppress(ValueError):  # an open quotation mark
+        program, *arguments = shlex.split(wanted) or [""]
+        path = shutil.which(program)
+        if path:
+            return (path, *arguments)
+    raise ToolchainError(f"there is no C++ compiler {wanted!r} ($CXX)")
+
+
+def has_ziglang() -> bool:
+    """Whether the wheel `ziglang`, which holds Clang, is installed."""
+    return importlib.util.find_spec("ziglang") is not None
+
+
+def ziglang(language: str) -> tuple[str, ...]:
+    """The command of ziglang's compiler for a language, "cc" or "c++"."""
+    return (sys.executable, "-m", "ziglang", language)
+
+
+def _name_of(command: Sequence[str]) -> str:
+    """What messages call a compiler."""
+    return "ziglang" if tuple(command[1:3]) == ("-m", "ziglang") else Path(command[0]).name
+
+
+class Version(NamedTuple):
+    """What a compiler prints about itself."""
+
+    line: str
+    """The first line of it."""
+    kind: str
+    """A key of FLAGS_OF_KIND."""
+
+    @staticmethod
+    def of(text: str) -> Version | None:
+        """From the whole text; None if there is nothing in it."""
+        line = next((line.strip() for line in text.splitlines() if line.strip()), None)
+        if line is None:
+            return None
+        if "Free Software Foundation" in text:
+            return Version(line, "gcc")
+        # All compilers that are made of Clang name the folder that they are installed in.
+        is_clang = "clang" in text.lower() or "InstalledDir:" in text
+        return Version(line, "clang" if is_clang else "other")
+
+
+def _version(command: tuple[str, ...]) -> Version:
+    """The version of a compiler; ToolchainError if it prints none."""
     try:
-        version = _version_of(path, os.stat(path).st_mtime_ns)
+        version = _version_of(command, os.stat(command[0]).st_mtime_ns)
     except OSError as error:
-        raise ToolchainError(f"{Path(path).name} could not be run: {error.strerror}") from None
+        raise ToolchainError(f"{_name_of(command)} could not be run: {error.strerror}") from None
     if isinstance(version, ToolchainError):
         raise version
     return version
 
 
 @cache
-def _version_of(path: str, changed: int) -> str | ToolchainError:
-    """The version, or why there is none: a compiler that hangs is asked once."""
+def _version_of(command: tuple[str, ...], changed: int) -> Version | ToolchainError:
+    """The version, or why there is none: a compiler that hangs is started once."""
     try:
-        lines = _run([path, "--version"], "stdout", VERSION_TIMEOUT).decode().splitlines()
+        text = _run([*command, "--version"], "stdout", VERSION_TIMEOUT).decode()
     except ToolchainError as error:
         return error
     except UnicodeDecodeError:
-        return ToolchainError(f"{Path(path).name} --version prints what is no text")
-    return next((line.strip() for line in lines if line.strip()), None) or ToolchainError(f"{Path(path).name} --version prints nothing")
+        return ToolchainError(f"{_name_of(command)} --version prints what is no text")
+    return Version.of(text) or ToolchainError(f"{_name_of(command)} --version prints nothing")
+
+
+def flags_of(kind: str) -> tuple[str, ...]:
+    """The flags of a kernel for a kind of compiler, a key of FLAGS_OF_KIND."""
+    is_arm = platform.machine().lower() in ("arm64", "aarch64")
+    # Clang before version 16 does not know the first form there.
+    processor_flag = "-mcpu=native" if is_arm and kind == "clang" else "-march=native"
+    return (*COMMON_FLAGS, processor_flag, *FLAGS_OF_KIND[kind])
 
 
 def built_for() -> dict[str, str]:
     """What a kernel is tied to, in words; ToolchainError if there is no compiler."""
-    found, path = processor(), compiler()
+    found = processor()
+    command = compiler()
     names = [line.partition(":")[2].strip() for line in found.splitlines() if line.startswith(("model name", "CPU part"))]
     features = hashlib.sha256(found.encode()).hexdigest()[:8]
-    return {"processor": f"{', '.join(names) or platform.machine()}, features {features}", "compiler": f"{_version(path)}, {path}"}
+    return {
+        "processor": f"{', '.join(names) or platform.machine()}, features {features}",
+        "compiler": f"{_version(command).line}, {shlex.join(command)}",
+    }
 
 
 _running: set[int] = set()
@@ -140,7 +228,8 @@ def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
 
 def _run(command: list[str], stream: str, seconds: float) -> bytes:
     """What a command says on one of its streams; ToolchainError if it fails, or takes too long, it and all that it has started."""
-    name, said = Path(command[0]).name, list[bytes]()
+    name = _name_of(command)
+    said = list[bytes]()
     out, err = (subprocess.PIPE if stream == x else subprocess.DEVNULL for x in ("stdout", "stderr"))
     try:
         process = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
@@ -179,16 +268,19 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
 
 def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
     """The shared library of a source and its key, compiled unless it is in the cache; ToolchainError on failure."""
-    path = compiler()
+    command = compiler()
+    version = _version(command)
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    flags = [*COMPILER_FLAGS, *extra]
-    content = [source, *flags, path, _version(path), processor(), header.read_text()]
+    flags = [*flags_of(version.kind), *extra]
+    content = [source, *flags, *command, version.line, processor(), header.read_text()]
 
     def compile_to(result: Path) -> None:
         text = result.with_suffix(".cc")
         text.write_text(source)
-        with told(f"{Path(path).name} is compiling a step of {source.count(chr(10)):,} lines: once, the result is kept"):
-            _run([path, *flags, f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"], "stderr", TIMEOUT)
+        files = [f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"]
+        lines = source.count("\n")
+        with told(f"{_name_of(command)} is compiling a step of {lines:,} lines: once, the result is kept"):
+            _run([*command, *flags, *files], "stderr", TIMEOUT)
 
     return kept(content, ".so", compile_to)
 

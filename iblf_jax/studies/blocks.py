@@ -28,6 +28,7 @@ from iblf_jax.engine import plan
 from iblf_jax.engine.execute import chosen_backend, run_batch
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.step import Run
+from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
@@ -170,6 +171,7 @@ def run_blocks(
         lanes = jax.device_put(lanes_of(np.arange(blocks[k] * size, (blocks[k] + 1) * size)), places[place])
         with jax.default_device(chosen_device):  # which is a thread's own
             out = call(copies[place], lanes)
+        wait_until_ready(out)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
 
     first, each = results(0)  # alone: what is compiled is compiled once, and what a block takes is known after it

@@ -25,14 +25,13 @@ Limits of single joints are kept as one requirement on the largest part of a lim
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import Selection, holds_weights, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine.derivatives import Outer as Outer
@@ -338,7 +337,7 @@ def _limit(function: str, name: str, value: Any, example: str) -> jax.Array:
     return array
 
 
-def _choice(function: str, joints: Any, weights: Any, stacklevel: int = 4) -> tuple[Selection, Any]:
+def _choice(function: str, joints: Any, weights: Any) -> tuple[Selection, Any]:
     """The joints that count, and their weights.
 
     Floating-point numbers as `joints` were weights in earlier versions.  They are no indices, so they still mean that.
@@ -346,11 +345,10 @@ def _choice(function: str, joints: Any, weights: Any, stacklevel: int = 4) -> tu
     if holds_weights(joints):
         if weights is not None:
             raise checks.fail(f"{function}: joints", joints, "indices, names or a slice of joints", "The weights are in weights=.")
-        warnings.warn(
+        notices.warn(
             f"{function}(joints=...) selects joints by index, name or slice. Floating-point numbers are read as weights, as in earlier "
             f"versions: write {function}(weights=...).",
             DeprecationWarning,
-            stacklevel=stacklevel,
         )
         joints, weights = None, joints
     chosen = selection(f"{function}: joints", joints)
@@ -553,7 +551,7 @@ def metric(fold: Fold, name: str, *, joints: Any = None, weights: Any = None, sc
     """
     name = checks.word("name", name, "the name of one of the fold's results")
     if holds_weights(joints):
-        chosen, w = _choice("metric", joints, weights, stacklevel=3)
+        chosen, w = _choice("metric", joints, weights)
     else:
         chosen, w = selection("metric: joints", joints), 1.0 if weights is None else weights
     return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)

@@ -112,7 +112,9 @@ extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel
     return failure(frame, "iblf_jax kernel: wrong shapes");
   j.shared = (const real *)in[0]->data; j.leaves = (const real *)in[1]->data; j.floats_in = (const real *)in[2]->data;
   j.ints_in = (const int32_t *)in[3]->data; j.floats_out = (real *)out[0]->data; j.ints_out = (int32_t *)out[1]->data;
-  for (int i = 0; i < RECORDED; i++) j.records.at[i] = (real *)out[2 + i]->data;
+  /* Samples are numbered from step 0 on; the arrays begin at the one of the first step. */
+  const int64_t sizes[] = RECORDED_SIZES, skipped = j.every > 0 ? j.first / j.every : 0;
+  for (int i = 0; i < RECORDED; i++) j.records.at[i] = (real *)out[2 + i]->data - skipped * sizes[i] * runs;
   run_all(&j, settings[3]);
   return j.failed ? failure(frame, "iblf_jax kernel: out of memory") : NULL;
 }

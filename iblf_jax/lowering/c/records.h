@@ -1,17 +1,21 @@
 /* Where samples go.  The generated part gives RECORDED and RECORDED_SIZES: how many arrays are recorded, and how many numbers each has. */
+
+/* Before a loop: every round of it is written out.  Clang refuses two such words before one loop. */
+#if defined(__clang__) || defined(__CUDACC_RTC__)
+#define UNROLLED _Pragma("unroll")
+#else
+#define UNROLLED _Pragma("GCC unroll 1000")
+#endif
+
 typedef struct { real *at[RECORDED + 1]; } record_arrays;
 
 /* One sample of the `live` first of W runs, array after array, into a row of the arrays, each (rows, numbers, runs). */
 template <typename count> INLINE void write_some(const record_arrays *records, const F *sample, int64_t row, int64_t runs, int64_t run, count live) {
   const int sizes[] = RECORDED_SIZES;
   int n = 0;
-#pragma unroll
-#pragma GCC unroll 1000
-  for (int i = 0; i < RECORDED; i++) {
+  UNROLLED for (int i = 0; i < RECORDED; i++) {
     real *place = records->at[i] + row * sizes[i] * runs + run;
-#pragma unroll
-#pragma GCC unroll 1000
-    for (int k = 0; k < sizes[i]; k++) store_some(place + k * runs, sample[n++], live);
+    UNROLLED for (int k = 0; k < sizes[i]; k++) store_some(place + k * runs, sample[n++], live);
   }
 }
 

@@ -1,0 +1,77 @@
+"""The end of a process in which XLA is still at work.
+
+Ctrl-C while XLA compiles raises KeyboardInterrupt at once, and XLA goes on compiling in threads of its own.  When the interpreter
+then ends, it takes away what these threads work on, and the process crashes or hangs.  So the end waits for them; a process that ends
+by Ctrl-C does not wait, but ends by that signal without taking the interpreter down.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from iblf_jax._start import AT_END
+
+TASKS = Path("/proc/self/task")
+PATIENCE = 300.0
+"""Seconds that the end of a process waits for XLA at most: a compilation takes minutes at the worst."""
+LOOKS, PAUSE = 5, 0.002
+"""Times that threads are looked at before they count as idle, and seconds between: one that waits for memory is not running."""
+
+
+def native_threads_run() -> bool:
+    """Whether a thread that Python has not started is running; False where that is not known."""
+    known = {thread.native_id for thread in threading.enumerate()}
+    for _ in range(LOOKS):
+        if any(_is_running(task) for task in _tasks() if int(task.name) not in known):
+            return True
+        time.sleep(PAUSE)
+    return False
+
+
+def _tasks() -> list[Path]:
+    try:
+        return list(TASKS.iterdir())
+    except OSError:
+        return []
+
+
+def _is_running(task: Path) -> bool:
+    try:
+        state = (task / "stat").read_text().rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return False
+    return state in "RD"
+
+
+def finish() -> None:
+    """Waits for XLA, or ends the process here if Ctrl-C ends it."""
+    end = time.monotonic() + PATIENCE
+    while native_threads_run() and time.monotonic() < end:
+        if getattr(sys, "last_type", None) is KeyboardInterrupt:
+            _end_by_interrupt()
+        time.sleep(10 * PAUSE)
+
+
+def _end_by_interrupt() -> None:
+    """Ends the process as Python ends one by Ctrl-C, without taking the interpreter down."""
+    for last in AT_END:
+        last()
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # it may be closed, or nobody may be there to read it
+            stream.flush()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def finish_at_exit() -> None:
+    """Has every end of this process go through `finish`, before JAX takes XLA down."""
+    atexit.register(finish)

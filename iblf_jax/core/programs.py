@@ -1,0 +1,91 @@
+"""Bounds what compiled programs take of the process's memory maps.
+
+The code of a program that JAX has compiled for a CPU lies in some hundred memory maps, and Linux gives a process 65,530.  JAX keeps every
+program for as long as the process lives: after a few hundred of them (a few dozen arms, each with programs of its own) the compiler finds
+no memory, and the process ends.  So JAX forgets its programs when the maps come near to their limit; what is needed again is compiled
+again, or read from the disk (`core.cache`).
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+from pathlib import Path
+
+import jax
+
+MAPS, MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+COMPILED = "/jax/core/compile/backend_compile_duration"
+"""JAX's event of a program that is compiled, or read from the disk."""
+SHARE = 0.6
+"""Of the maps that a process may have, from which programs are released: libraries and other threads need some too."""
+PROGRAM = 300
+"""Maps of a program, about at most: one evaluation of the closed loop of an arm has 250."""
+
+
+def count_maps() -> int:
+    """Memory maps of this process; 0 where that is not known."""
+    try:
+        return MAPS.read_bytes().count(b"\n")
+    except OSError:
+        return 0
+
+
+def most_maps() -> int | None:
+    """Memory maps that a process may have; None where there is no such limit."""
+    try:
+        return int(MOST_MAPS.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+class ProgramBound:
+    """Has JAX release all programs once the process has more than `bound` memory maps of the `limit` that it may have."""
+
+    def __init__(self, limit: int, bound: int) -> None:
+        self.limit = limit
+        self.bound = bound
+        self.released = 0
+        """How many times programs were released."""
+        self._until_count = 0
+        """Programs to compile before maps are counted: to count ten thousands of them takes as long as a small program."""
+        self._lock = threading.Lock()
+
+    def __call__(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        """Listens to JAX's events."""
+        if event != COMPILED:
+            return
+        self._until_count -= 1
+        if self._until_count >= 0 or not self._lock.acquire(blocking=False):
+            return
+        try:
+            self.check()
+        finally:
+            self._lock.release()
+
+    def check(self) -> None:
+        """Counts the maps, and releases programs if there are too many."""
+        maps = count_maps()
+        if maps > self.bound:
+            release_programs()
+            self.released += 1
+            maps = count_maps()
+            # Where others hold most of the maps, programs are not released after every new one.
+            self.bound = max(self.bound, maps + (self.limit - maps) // 4)
+        self._until_count = max((self.bound - maps) // PROGRAM, 0)
+
+
+def release_programs() -> None:
+    """Has JAX forget what it has compiled; what runs is kept until its end."""
+    jax.clear_caches()
+    gc.collect()
+
+
+def bound_programs() -> ProgramBound | None:
+    """Bounds the programs of this process from now on; None where the system has no limit."""
+    limit = most_maps()
+    if limit is None:
+        return None
+    bound = ProgramBound(limit, int(SHARE * limit))
+    jax.monitoring.register_event_duration_secs_listener(bound)
+    return bound

@@ -1,0 +1,23 @@
+"""Waiting for XLA in a way that Ctrl-C ends at once."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax
+
+SHARE, LONGEST = 0.02, 0.02
+"""Of the time waited so far, what is waited until the next look; seconds of that at most."""
+
+
+def wait_until_ready(outputs: Any) -> None:
+    """Waits for arrays that XLA computes in threads of its own.
+
+    JAX's own waiting sees Ctrl-C only when the arrays are there.  Here KeyboardInterrupt is raised at once; XLA goes on
+    meanwhile, which does no harm (`core.process_end`).
+    """
+    begin = time.monotonic()
+    for array in jax.tree.leaves(outputs):
+        while isinstance(array, jax.Array) and not array.is_ready():  # type: ignore[attr-defined]
+            time.sleep(min(SHARE * (time.monotonic() - begin), LONGEST))
