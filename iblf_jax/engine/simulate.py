@@ -15,7 +15,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.execute import run_one
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
@@ -112,7 +112,7 @@ def simulate_unchecked(
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_one(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend, noise=noise)
+        outcome = run_one(scenario, folds, dt, run._replace(mechanism=known_of(scenario)), backend=backend, noise=noise)
     else:
         outcome = run_transformable(scenario, folds, dt, run, backend=backend, noise=noise)
     arrays, controller_state, observer_state, actuator_state, measured = outcome.records
