@@ -69,10 +69,15 @@ class Backstepping:
         return {"weight": weight_unit(self.barrier)}
 
     def advice(self) -> list[str]:
-        """Warnings about gains outside the conditions of Theorem 2."""
-        if not checks.is_concrete(self.K2) or bool(np.all(np.asarray(self.K2) > 0.5)):
+        """What is lost of Theorem 2 where the paper's law, whose weight is 1, has a gain outside its conditions."""
+        if not checks.is_concrete((self.K2, self.weight)):
             return []
-        return [f"controller.K2 = {self.K2}: Theorem 2 needs K2 > 1/2 on every joint (3.17); below it nothing is claimed. Raise K2."]
+        is_papers = np.asarray(self.weight) == 1.0
+        if not np.any(is_papers & (np.asarray(self.K2) <= 0.5)):
+            return []
+        need = "Theorem 2 needs K2 > 1/2 on every joint (3.17) for the paper's envelope of V2"
+        rest = "the corrected law with a momentum observer has the weighted claim of ij.certify for every K2 > 0"
+        return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost, stability is not: {rest}."]
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
         """No state."""
