@@ -15,6 +15,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.execute import run_one
+from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
@@ -176,7 +177,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         limit = tableau(result.method).stability / mode
         texts.append(
             f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to dt = {limit:.3g} s only; "
-            f"dt = {float(result.dt):g} s was asked for. Take dt={comfortable_dt(mode):g}, or lower controller.K2 or observer.kf."
+            f"dt = {float(result.dt):g} s was asked for. Take dt={comfortable_dt(mode):g}{_or_change(result)}."
         )
     elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
@@ -191,8 +192,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     if status & Status.SAMPLING_TOO_SLOW:
         texts.append(
             f"From one period to the next the loop grows, by {float(metrics[RADIUS]):.4g} at the worst of the instants that were looked "
-            "at. Sample faster (ij.recommended_period says how fast), shorten the delay, or lower controller.K2, observer.kf or the gains "
-            "of the velocity's filter."
+            f"at. Sample faster (ij.recommended_period says how fast){_or_change(result)}."
         )
     if status & Status.FILTER_INFEASIBLE:
         worst = f"{float(np.max(result.slack)):.3g} rad/s^2 (run.slack)"
@@ -214,6 +214,12 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             "further from the bounds, or give the barrier a smaller guard."
         )
     return texts
+
+
+def _or_change(result: Rollout) -> str:
+    """What else to change, the one term that limits the loop of a run, as the end of a sentence; empty where there is no such term."""
+    limit = limiting_term(result) if checks.is_concrete(result.scenario) else None
+    return "" if limit is None else f", or {limit.advice}: of all terms {limit.term.words} limits this loop"
 
 
 def _called(result: Rollout, joint: int) -> str:
