@@ -120,7 +120,7 @@ def test_the_certificate_holds(name, scenario):
     """The corrected law, all the way: every line that applies."""
     certificate = ij.certify(scenario, ij.simulate(scenario, **RUN))
     assert certificate.verdict == "holds"
-    assert certificate["inequality, case 2"].margin > 0
+    assert certificate["weighted inequality, case 2"].margin > 0
     assert certificate["joints inside"].margin > 0.5
 
 

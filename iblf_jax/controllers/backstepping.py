@@ -77,7 +77,7 @@ class Backstepping:
             return []
         need = "Theorem 2 needs K2 > 1/2 on every joint (3.17) for the paper's envelope of V2"
         rest = "the corrected law with a momentum observer has the weighted claim of ij.certify for every K2 > 0"
-        return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost, stability is not: {rest}."]
+        return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost: {rest}."]
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
         """No state."""

@@ -1,6 +1,7 @@
 """Default ranges of what is tuned: within the conditions of Theorem 2, and within what step, period and drive can bear.
 
-Below, k1 > 0, K2 > 1/2, kf > 1, for a leaf whose entries all start there, else its sign.  Above, a gain x may grow to f x0, f <= MOST, while the loop at the start and along its reference keeps
+Below, k1 > 0, K2 > 1/2, kf > 1, for a leaf whose entries all start there, else its sign.  Above, a gain x may grow to f x0, f <= MOST,
+while the loop at the start and along its reference keeps
 
     dt |lambda|_max <= SHARE * (the integrator's stability range)                  where the law runs all the time,
     rho(map from a period to the next) < 1                                         where it is sampled,
