@@ -497,16 +497,16 @@ def test_a_weight_of_one_costs_no_operation_and_another_one_a_joint():
     assert 0 < products[1] - products[0] <= 2 * 8
 
 
-def test_runs_of_other_weights_are_the_same_alone_and_in_a_batch():
+def test_a_run_of_other_weights_is_the_same_in_a_batch():
     paper = ij.presets.zhang_yan_2024()
     varied = {"controller.weight": ij.factor(ij.uniform(0.2, 3.0))}
     study = ij.monte_carlo(paper, varied, runs=3, seed=1, duration=0.1, dt=1e-3, progress=False)
     run = study.replay(1)
     assert np.all(np.abs(np.asarray(run.scenario.controller.weight) - 1.0) > 1e-3)
-    alone = ij.simulate(run.scenario, duration=0.1, dt=1e-3)
-    np.testing.assert_allclose(alone.q, run.q, rtol=1e-12)
+    single = ij.simulate(run.scenario, duration=0.1, dt=1e-3)
+    np.testing.assert_allclose(single.q, run.q, rtol=1e-12)
     np.testing.assert_allclose(study.metrics["margin"][1], run.metrics["margin"], rtol=1e-9)
-    assert np.max(np.abs(alone.q - ij.simulate(paper, duration=0.1, dt=1e-3).q)) > 1e-5
+    assert np.max(np.abs(single.q - ij.simulate(paper, duration=0.1, dt=1e-3).q)) > 1e-5
 
 
 def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():

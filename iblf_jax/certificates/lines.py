@@ -123,7 +123,7 @@ def weighted_case(whole: Whole) -> int | None:
 
 
 def replaces_the_papers(whole: Whole) -> bool:
-    """Whether the claim with weights stands for the paper's own: the barriers have other weights than 1."""
+    """Whether the claim with weights replaces the paper's own: the barriers have other weights than 1."""
     return weighted.has_other_weights(whole.run.scenario) and weighted_case(whole) is not None
 
 

@@ -19,7 +19,7 @@ lambda = lambda_min(M0), the loop with a momentum observer obeys
 
 what stands in brackets is for f' != 0 (case 2).
 
-A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 stands for s1 in (F.1), the cross term cancels as
+A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 replaces s1 in (F.1), the cross term cancels as
 before, and all claims hold with this V1.
 
 The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and K_l differ: there the torque jumps by

@@ -40,7 +40,7 @@ WORDS = {
     "filter": "the law's filter",
     "cutoff": "the filter of the velocity",
 }
-"""Name of a leaf -> the term that it stands for."""
+"""Name of a leaf -> the term of the loop that it sets."""
 SLOWER = ("cutoff", "bandwidth")
 """Leaves of sensors and actuators whose reciprocal is a time constant."""
 
