@@ -315,7 +315,7 @@ LIMITED = {
     "sensor.velocity.cutoff": (LAGGING, {"sensor.velocity.cutoff": 8.0}),
     "actuator.bandwidth": (LAGGING, {"actuator.bandwidth": 20.0}),
 }
-QUICK = ("controller.weight", "controller.K2")
+QUICK = ("controller.weight",)
 LAGS = ("sensor.velocity.cutoff", "actuator.bandwidth")
 
 
