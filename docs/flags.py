@@ -113,7 +113,8 @@ CASES: dict[str, Case] = {
     "SAMPLING_TOO_SLOW": Case(
         lambda: _run(_sampled(4e-3), dt=1e-3),
         "From one period to the next the loop grows: `run.metrics.sampling_radius` is above 1.",
-        "Sample faster; `ij.recommended_period(scenario, duration=...)` says how fast. Or shorten the delay, or lower `K2` and `kf`.",
+        "Sample faster; `ij.recommended_period(scenario, duration=...)` says how fast. Or change the term that limits the "
+        "loop: the warning names it, be it the slope of the barrier (`weight`), `K2`, `kf`, a filter, a lag or the delay.",
     ),
     "VELOCITY_VIOLATED": Case(
         lambda: _run(_paper(velocity_bounds=_speeds(-0.4))),

@@ -24,8 +24,13 @@ def loop(reading: str = "corrected", observer: str = "momentum", barrier=None, w
     return canonical(dataclasses.replace(paper, controller=law, observer=ij.observers.MEMBERS[observer](kf=20.0)))
 
 
-def random_loops(scenario: ij.Scenario, seed: int = 0, *, states: int = STATES, speed: float = 10.0, nearest: float = 0.99):
-    """Scenarios with other gains, masses and disturbances, and a time and state of each: (scenario, t, state), batched."""
+def random_loops(
+    scenario: ij.Scenario, seed: int = 0, *, states: int = STATES, speed: float = 10.0, nearest: float = 0.99, weighted: bool = False
+):
+    """Scenarios with other gains, masses and disturbances, and a time and state of each: (scenario, t, state), batched.
+
+    With `weighted` the barriers have weights, and the gains are anything positive: below the conditions of Theorem 2, too.
+    """
     dtype, rng, n = scenario.initial.q.dtype, np.random.default_rng(seed), scenario.n
 
     def uniform(low, high, *shape):
@@ -43,6 +48,9 @@ def random_loops(scenario: ij.Scenario, seed: int = 0, *, states: int = STATES, 
     )
     t, dq = uniform(0.0, 20.0), uniform(-speed, speed, n)
     q, momentum = _position(batch, t, uniform(-nearest, nearest, n), dq)
+    if weighted:
+        law = _rebuilt(batch.controller, weight=10 ** uniform(-3, 1.5, n), K2=10 ** uniform(-3, 1.7, n))
+        batch = _rebuilt(batch, controller=law, observer=_rebuilt(batch.observer, kf=10 ** uniform(-3, 1.7, n)))
     return batch, t, LoopState(q, dq, (), uniform(-5.0, 5.0, n) - batch.observer.kf * momentum)
 
 

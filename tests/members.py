@@ -99,9 +99,9 @@ LAWS = {
     "backstepping_corrected_log": controllers.Backstepping(k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"),
     "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
     "full_state_mixed": controllers.FullState(
-        k1=2.0, K2=20.0, c=1.0, barrier=barriers.Tan(), velocity_barrier=barriers.PrescribedPerformance()
+        k1=2.0, K2=20.0, c=1.0, barrier=barriers.Tan(), velocity_barrier=barriers.PrescribedPerformance(), weight=[0.5, 2.0]
     ),
-    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1),
+    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1, weight=[0.5, 2.0]),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
     "surface_barrier": controllers.SurfaceBarrier(a=2.0, K=[4.0, 3.0], surface=SURFACE),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=[10.0, 12.0]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from iblf_jax import bounds, controllers, references
 from iblf_jax.core.status import describe
 from iblf_jax.files.scenario import from_dict, scenario_to_dict
 from iblf_jax.presets import arms
+from iblf_jax.simulation.paths import get
 
 RUN = {"duration": 1.0, "dt": 1e-3, "record_every": 4}
 PRESETS = {"ur5": (ij.presets.ur5, 6, "tool0"), "iiwa14": (ij.presets.iiwa14, 7, "iiwa_link_ee")}
@@ -118,7 +120,9 @@ def test_the_certificate_holds(name, scenario):
     """The corrected law, all the way: every line that applies."""
     certificate = ij.certify(scenario, ij.simulate(scenario, **RUN))
     assert certificate.verdict == "holds"
-    assert certificate["inequality, case 2"].margin > 0
+    assert certificate["weighted inequality, case 2"].margin > 0
+    if name == "ur5":  # the last joint of the other one has a K2 below 1/2
+        assert certificate["inequality, case 2"].margin > 0
     assert certificate["joints inside"].margin > 0.5
 
 
@@ -184,6 +188,75 @@ def test_a_scenario_from_an_arm_alone():
     np.testing.assert_allclose(scenario.initial.q, reference.start)
     with pytest.raises(ValueError, match="reading"):
         arms.arm_scenario(arm, reference, reading="wrong")
+
+
+# ------------------------------------------------------------------------------------------------ joints of small inertia, sampled
+
+LAB = {"sampling": ij.Sampling(period=2e-3, delay=1e-3)}
+"""500 Hz, and half a period late."""
+MIDDLE, AMPLITUDE = [0.3, -0.6, 1.0, 0.2, 0.4, 0.1], [0.3, 0.2, 0.3, 0.4, 0.3, 0.5]
+FREQUENCY = [1.0, 0.8, 1.1, 1.3, 0.9, 1.2]
+
+
+def narrow(width):
+    """Bounds at this distance from the reference."""
+    return bounds.Bounds(
+        lower=bounds.Funnel(initial=-width, final=-width, rate=1.0), upper=bounds.Funnel(initial=width, final=width, rate=1.0)
+    )
+
+
+def light_wrist(joints=6, width=0.12):
+    """The last joints of an arm of six whose last one turns 0.002 kg m^2, between narrow bounds."""
+    pytest.importorskip("mujoco")
+    held = dict.fromkeys(("turn", "lift", "bend", "roll", "pitch", "twist")[: 6 - joints], 0.0)
+    arm = ij.robots.load(ROOT / "tests" / "data" / "arms" / "light_wrist.urdf", tip="hand", locked=held)
+    reference = references.Sinusoid(offset=MIDDLE[-joints:], amplitude=AMPLITUDE[-joints:], frequency=FREQUENCY[-joints:])
+    return arms.arm_scenario(arm, reference, bounds=narrow(width))
+
+
+@pytest.mark.parametrize("joints", [2, pytest.param(6, marks=pytest.mark.slow)])
+def test_a_light_wrist_keeps_narrow_bounds_at_500_hz_and_did_not_with_the_papers_weight(joints):
+    scenario = ij.with_parts(light_wrist(joints), **LAB)
+    inertia = jnp.diagonal(scenario.model.mass_matrix(scenario.initial.q))
+    K2, weight = get(scenario, "controller.K2"), get(scenario, "controller.weight")
+    assert float(inertia[-1]) < 0.0021
+    assert np.all(np.asarray(K2 / inertia) <= 100.0 * (1 + 1e-12))
+    assert np.all(np.asarray(K2 / inertia) >= 25.0 * (1 - 1e-12))
+    np.testing.assert_allclose(weight, np.minimum(1.0, inertia * 12.5**2 * 0.12**2 / 2))
+    brief = {"duration": 0.3, "dt": 1e-3, "record_every": 20}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # neither a failure nor advice on gains
+        run = ij.simulate(scenario, **brief)
+    assert int(run.status) == 0
+    assert float(run.metrics.sampling_radius) < 0.995
+    assert float(run.metrics.margin.min()) > 0.09
+    for factor in (0.3, 0.1, 0.03):
+        # All but 1, which would be compiled in: a program of its own.
+        papers = {"controller.K2": factor * jnp.maximum(25.0 * inertia, 0.6), "controller.weight": 1.0 - 1e-9}
+        with pytest.warns(UserWarning, match="sampled too slowly"):
+            run = ij.simulate(ij.with_parameters(scenario, papers), **brief)
+        assert float(run.metrics.sampling_radius) > 1.05
+
+
+@pytest.mark.slow
+def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are():
+    unknown = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25)), "initial.q": ij.offset(ij.uniform(-0.04, 0.04))}
+    study = ij.monte_carlo(ij.with_parts(light_wrist(), **LAB), unknown, runs=16, seed=0, duration=1.0, dt=1e-3, progress=False)
+    assert not len(study.failed)
+    assert np.all(np.asarray(study.status) == 0)
+    assert float(np.min(study.metrics["margin"])) > 0.03
+
+
+def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
+    """ds/de1 at e1 = 0 is that of the barrier: 2/k^2 of the integral one, 1 of the tangent."""
+    for law, stiffness in (("integral", 2 / 0.3**2), ("log", 1 / 0.3**2), ("mapping", 1.0), ("dynamic_surface", 2 / 0.3**2)):
+        scenario = arms.arm_scenario(
+            arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), law=law, bounds=narrow(0.3)
+        )
+        inertia = jnp.diagonal(scenario.model.mass_matrix(scenario.initial.q))
+        np.testing.assert_allclose(get(scenario, "controller.weight"), np.minimum(1.0, inertia * 12.5**2 / stiffness), rtol=1e-9)
+    with pytest.raises(ValueError, match="bounds: got 3"):
+        arms.arm_scenario(arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), bounds=3)
 
 
 # --------------------------------------------------------------------------------------------------------------- the whole chain

@@ -14,7 +14,7 @@ from certificate_states import loop, random_loops, terms_of
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax.certificates import Certificate, certify, claims, counterexample, trajectory
+from iblf_jax.certificates import Certificate, certify, claims, counterexample, trajectory, weighted
 from iblf_jax.certificates.eigenvalues import eigenvalues_over
 from iblf_jax.certificates.proof_terms import rounding, terms_at
 from iblf_jax.certificates.trajectory import look, starts_of
@@ -120,6 +120,56 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     assert float(rho) == pytest.approx(rate, rel=1e-12)
     left = float(seen.dV + rho * seen.V - 0.5 * seen.df @ seen.df)
     assert abs(left) <= rounding("float64") * float(seen.terms) < 1e-11
+
+
+@pytest.mark.parametrize("name", [x if x == "integral" else pytest.param(x, marks=pytest.mark.slow) for x in BARRIERS])
+def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(name):
+    """(W.1) with any a, b and w_f, at gains far below Theorem 2's conditions and at any weights of the barriers."""
+    rng, barrier = np.random.default_rng(5), getattr(BARRIERS[name], "values", [BARRIERS[name]])[0]
+    batch, t, state = random_loops(loop(barrier=barrier), 5, states=1024, speed=30.0, weighted=True)
+    proof = jax.tree.map(np.asarray, terms_of(batch, t, state))
+    K2, kf = np.asarray(batch.controller.K2), np.asarray(batch.observer.kf)
+    assert np.mean(np.any(K2 < 0.5, axis=1) & np.any(kf < 0.5, axis=1)) > 0.4
+    decay = batch.controller.barrier.decay_rate(np.asarray(batch.controller.k1))
+    a = rng.uniform(0.02, 0.98, t.size)
+    b = 2.0 * kf.min(axis=1) * rng.uniform(0.02, 0.9, t.size)
+    least = 0.25 / (a[:, None] * K2 * (kf - b[:, None] / 2.0))
+    w_f = least.max(axis=1) * 10 ** rng.uniform(0.0, 2.0, t.size)
+    numbers = zip(decay, K2, kf, proof.slowest, a, b, w_f, strict=True)
+    terms = np.array([weighted.rate_terms(claims.Claim(*each[:3]), *each[3:]) for each in numbers])
+    assert np.all(terms > -1e-9 * (1.0 + kf.max(axis=1))[:, None])
+    rho, half_square = terms.min(axis=1), 0.5 * np.sum(proof.f_tilde**2, axis=1)
+    V = proof.V + (w_f - 1.0) * half_square
+    rate = proof.dV + (w_f - 1.0) * np.sum(proof.f_tilde * proof.df_tilde, axis=1)
+    left = rate + rho * V - w_f / (2.0 * b) * np.sum(proof.df**2, axis=1)
+    allowed = rounding("float64") * np.maximum(1.0, w_f) * proof.terms
+    free = ~proof.held
+    assert np.mean(free) > 0.9
+    assert np.all(left[free] <= allowed[free])
+    # V_w holds all that it says: what is left of it without e2 and f_tilde is the barriers' with their weights.
+    M0 = np.asarray(jax.vmap(lambda scenario, q: scenario.model.mass_matrix(q))(batch, state.q))
+    V1 = V - w_f * half_square - 0.5 * np.einsum("ti,tij,tj->t", proof.e2, M0, proof.e2)
+    one = jax.vmap(lambda scenario, t, q: scenario.controller.barrier.value(scenario.setting.tube(t), q))(batch, t, state.q)
+    np.testing.assert_allclose(V1, np.sum(np.asarray(batch.controller.weight) * one, axis=1), rtol=1e-6, atol=1e-9 * np.abs(V).max())
+
+
+def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
+    """No other a, b and w_f that (W.2) admits is better by more than the grid is coarse."""
+    constants = claims.Claim(*(np.array(x) for x in ([4.0, 3.0], [0.2, 0.05], [0.7, 0.4])))
+    given = {"slowest": 0.9, "V_rest": 0.3, "half_square": 0.05, "F_d": 0.2, "duration": 10.0}
+
+    def mean(rho, w_f, rho2):
+        fading = (1.0 - np.exp(-rho * 10.0)) / (rho * 10.0)
+        return (given["V_rest"] + w_f * given["half_square"]) * fading + rho2 / rho
+
+    found = weighted.best(constants, *given.values(), 2)
+    assert np.min(weighted.rate_terms(constants, 0.9, found.a, found.b, found.w_f)) == pytest.approx(found.rho)
+    rng, others = np.random.default_rng(0), []
+    for a, b, w_f in zip(rng.uniform(0, 1, 20000), rng.uniform(0, 0.8, 20000), 10 ** rng.uniform(0, 4, 20000), strict=True):
+        rho = np.min(weighted.rate_terms(constants, 0.9, a, b, w_f))
+        others.append(mean(rho, w_f, w_f * given["F_d"] ** 2 / (2 * b)) if rho > 0 else np.inf)
+    assert mean(found.rho, found.w_f, found.rho2) < 1.01 * min(others)
+    assert weighted.best(constants, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
 
 
 # ---------------------------------------------------------------------------------------------------- runs
@@ -238,6 +288,67 @@ def test_gains_below_the_conditions_are_named(corrected_run):
     assert certificate.verdict == "fails"
     assert certificate["inequality, case 2"].verdict == "not applicable"
     assert "(3.25)" in certificate["inequality, case 2"].note
+
+
+LIGHT = {"controller.K2": [0.3, 0.1], "observer.kf": [0.4, 0.9], "controller.weight": [0.5, 0.05]}
+
+
+def test_a_law_with_weights_has_a_claim_below_the_conditions_of_theorem_2(corrected_run):
+    """Its own lines fail, and say what is lost; those with weights hold, and bound xi, e2 and f_tilde."""
+    scenario = ij.with_parameters(corrected_run.scenario, LIGHT)
+    certificate = certify(scenario, ij.simulate(scenario, **SHORT))
+    assert certificate.holds, certificate
+    for name in ("K2", "kf, case 2", "rho, case 2"):
+        assert (certificate[name].verdict, certificate[name].counts) == ("fails", False)
+        assert "stability is not" in certificate[name].note
+    for name in ("rho, case 2", "inequality, case 2", "envelope, case 2", "xi", "e2", "f_tilde"):
+        assert certificate[f"weighted {name}"].verdict == "holds", name
+        assert certificate[f"weighted {name}"].margin > 0, name
+    assert certificate["joints inside"].verdict == "holds"
+    assert certificate["weighted inequality, case 1"].verdict == "not applicable"
+    numbers = certificate.numbers
+    V_end = -np.expm1(-(numbers["V2_start"] / 0.05))
+    assert certificate["weighted xi"].margin < np.sqrt(V_end)
+    assert 0 < numbers["a_weighted_case_2"] < 1
+
+
+@pytest.mark.slow
+def test_with_the_papers_weights_its_own_conditions_decide(corrected_run):
+    papers = ij.with_parameters(corrected_run.scenario, LIGHT | {"controller.weight": 1.0})
+    certificate = certify(papers, ij.simulate(papers, **SHORT))
+    assert certificate.verdict == "fails"
+    assert certificate["K2"].counts
+    assert certificate["weighted inequality, case 2"].verdict == "holds"
+
+
+def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_observer(paper_certificate):
+    assert not [line.name for line in paper_certificate.lines if line.name.startswith("weighted")]
+
+
+def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
+    """With a rate that is too large the inequality fails where the right one holds."""
+    best = weighted.best
+    monkeypatch.setattr(weighted, "best", lambda *given: (found := best(*given)) and found._replace(rho=1e3 * found.rho))
+    scenario = ij.with_parameters(corrected_run.scenario, LIGHT)
+    certificate = certify(scenario, ij.simulate(scenario, **SHORT))
+    assert certificate["weighted inequality, case 2"].verdict == "fails"
+    assert certificate.verdict == "fails"
+
+
+@pytest.mark.parametrize("weight", [[0.3, 2.5], [40.0, 7.0]])
+def test_the_papers_claim_scales_with_the_weights(corrected_run, weight):
+    """V1 = sum w_i V1_i in every line: the inequality, the envelope, and xi by the barrier of its own joint."""
+    scenario = ij.with_parameters(corrected_run.scenario, {"controller.weight": weight})
+    run = ij.simulate(scenario, **SHORT)
+    certificate = certify(scenario, run)
+    assert certificate.holds, certificate
+    V1 = -np.log(1.0 - np.asarray(run.xi[0]) ** 2) * weight
+    M0, e2 = np.asarray(scenario.model.mass_matrix(run.q[0])), np.asarray(run.e2[0])
+    f_tilde = np.asarray(run.disturbance[0] - run.disturbance_estimate[0])
+    V = V1.sum() + 0.5 * (e2 @ M0 @ e2 + f_tilde @ f_tilde)
+    assert certificate.numbers["V2_start"] == pytest.approx(V, rel=1e-9)
+    bound = np.sqrt(-np.expm1(-certificate.traces.envelope[0] / np.asarray(weight)))
+    np.testing.assert_allclose(certificate.traces.xi_bound[0], bound, rtol=1e-9)
 
 
 def test_envelope_starts_anew_at_jumps_and_after_held_samples():

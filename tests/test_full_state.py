@@ -136,6 +136,23 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
     assert np.median(allowed / np.abs(proof.dV)) < 1e-10  # small beside what it judges
 
 
+@pytest.mark.parametrize(("first", "second"), [("integral", "integral"), ("tan", "mapping")])
+def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, second):
+    """(F.2) with V1 = sum w_i V1_i."""
+    law = controllers.FullState(
+        k1=[2.0, 1.5], K2=[20.0, 12.0], c=[1.0, 0.3], barrier=FAMILY[first], velocity_barrier=FAMILY[second], weight=[0.2, 6.0]
+    )
+    scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
+    t, states = random_states(scenario)
+    proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
+    assert not np.any(proof.held)
+    assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.terms))
+    V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.setting.tube(t), q))(t, states.q)
+    phi = jax.vmap(lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.setting)[1], dq))(t, states.q, states.dq)
+    expected = np.sum(V1 * np.array([0.2, 6.0]) + phi + 0.5 * proof.f_tilde**2, axis=1)
+    np.testing.assert_allclose(proof.V, expected, rtol=1e-9)
+
+
 def test_without_its_own_terms_the_inequality_breaks():
     """What the test above would see of a law without its cross term, or of a smaller rate."""
     law = controllers.FullState(k1=2.0, K2=20.0, c=1.0)

@@ -415,3 +415,112 @@ def test_their_gains_can_be_tuned(name, path):
     result = ij.tune(scenario, [path], objective, duration=0.2, dt=5e-4, iterations=4, progress=False)
     assert result.report.verdicts[0].verdict == "pass"
     assert result.history["objective"][-1, 0] <= result.history["objective"][0, 0]
+
+
+# ---------------------------------------------------------------------------------------------------- the weight of the barrier
+
+WEIGHTED = {
+    "backstepping": controllers.Backstepping(k1=2.0, K2=20.0),
+    "corrected_mapping": controllers.Backstepping(k1=2.0, K2=20.0, barrier=ij.barriers.Mapping(), reading="corrected"),
+    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
+    "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
+    "full_state": controllers.FullState(k1=2.0, K2=20.0, c=1.0),
+}
+WEIGHT = jnp.array([0.3, 2.5])
+
+
+def weighted(name, weight=None):
+    """The paper's scenario under one of these laws, its weight given to the constructor."""
+    law = dataclasses.replace(WEIGHTED[name], weight=weight)
+    velocities = ij.bounds.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
+    return dataclasses.replace(ij.presets.zhang_yan_2024(), controller=law, velocity_bounds=velocities)
+
+
+def commanded(scenario):
+    """What its law commands at one state."""
+    law, setting = scenario.controller, scenario.setting
+    return law.command(jnp.asarray(0.3), Q, DQ, jnp.array([0.5, -0.2]), setting, law.init(Q, DQ, setting))[0]
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_the_weight_multiplies_slope_and_value_of_the_barrier(name):
+    plain, other = (commanded(weighted(name, weight)) for weight in (None, WEIGHT))
+    scenario = weighted(name)
+    tube, barrier, model = scenario.setting.tube(jnp.asarray(0.3)), scenario.controller.barrier, scenario.model
+    added, first = (WEIGHT - 1.0) * barrier.slope(tube, Q), 0.0
+    if name == "full_state":
+        inner = scenario.controller.tubes(jnp.asarray(0.3), Q, DQ, scenario.setting)[1]
+        added = model.mass_matrix(Q) @ (added * scenario.controller.velocity_barrier.error_over_slope(inner, DQ))
+        first = scenario.controller.velocity_barrier.value(inner, DQ)
+    np.testing.assert_allclose(other.tau, plain.tau - added, rtol=1e-12)
+    np.testing.assert_allclose(other.V1 - first, WEIGHT * (plain.V1 - first), rtol=1e-9)
+    np.testing.assert_array_equal(plain.tau, commanded(weighted(name, 1.0)).tau)
+    np.testing.assert_array_equal(scenario.controller.weight, [1.0, 1.0])
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name):
+    units = {"corrected_mapping": "N m/rad", "full_state": "1"}
+    found = {p.path: p for p in ij.parameters(weighted(name))}["controller.weight"]
+    assert (found.shape, found.unit) == ((2,), units.get(name, "N m rad"))
+    assert ij.simulation.paths.unit_at(weighted(name), "controller.weight[1]") == found.unit
+    limited = controllers.Saturated(law=WEIGHTED[name], limit=30.0)
+    inside = ij.with_parameters(dataclasses.replace(weighted(name), controller=limited), {"controller.weight": WEIGHT})
+    np.testing.assert_array_equal(inside.controller.law.weight, WEIGHT)
+    with pytest.raises(ValueError, match=r"weight.*> 0"):
+        ij.with_parameters(weighted(name), {"controller.weight": [1.0, 0.0]})
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "unit"), [("Integral", "Tan", "rad^2/s^2"), ("Tan", "Integral", "1/rad^2"), ("State", "Tan", "1/s^2")]
+)
+def test_the_weight_of_a_full_state_law_has_the_unit_of_phi_over_that_of_V1(first, second, unit):
+    barriers = {"barrier": getattr(ij.barriers, first)(), "velocity_barrier": getattr(ij.barriers, second)()}
+    assert controllers.FullState(k1=2.0, K2=20.0, c=1.0, **barriers).leaf_units() == {"weight": unit}
+
+
+def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path):
+    ij.save_scenario(weighted("backstepping", WEIGHT), tmp_path / "scenario.toml")
+    text = (tmp_path / "scenario.toml").read_text()
+    np.testing.assert_array_equal(ij.load_scenario(tmp_path / "scenario.toml").controller.weight, WEIGHT)
+    old = "\n".join(line for line in text.splitlines() if not line.startswith("weight"))
+    assert old != text.rstrip("\n")
+    (tmp_path / "old.toml").write_text(old)
+    np.testing.assert_array_equal(ij.load_scenario(tmp_path / "old.toml").controller.weight, [1.0, 1.0])
+
+
+def test_a_weight_of_one_costs_no_operation_and_another_one_a_joint():
+    paper = ij.presets.zhang_yan_2024()
+    one, other = (ij.explain(ij.with_parameters(paper, {"controller.weight": w})) for w in (1.0, 0.5))
+    products = [sum(counter["mul"] for counter in found.counts.values()) for found in (one, other)]
+    # Four slopes of a step of Runge-Kutta, the value and its rate: one product a joint each.
+    assert 0 < products[1] - products[0] <= 2 * 8
+
+
+def test_a_run_of_other_weights_is_the_same_in_a_batch():
+    paper = ij.presets.zhang_yan_2024()
+    varied = {"controller.weight": ij.factor(ij.uniform(0.2, 3.0))}
+    study = ij.monte_carlo(paper, varied, runs=3, seed=1, duration=0.1, dt=1e-3, progress=False)
+    run = study.replay(1)
+    assert np.all(np.abs(np.asarray(run.scenario.controller.weight) - 1.0) > 1e-3)
+    single = ij.simulate(run.scenario, duration=0.1, dt=1e-3)
+    np.testing.assert_allclose(single.q, run.q, rtol=1e-12)
+    np.testing.assert_allclose(study.metrics["margin"][1], run.metrics["margin"], rtol=1e-9)
+    assert np.max(np.abs(single.q - ij.simulate(paper, duration=0.1, dt=1e-3).q)) > 1e-5
+
+
+def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
+    paper = ij.presets.zhang_yan_2024()
+
+    def margin(w):
+        return ij.simulate(ij.with_parameters(paper, {"controller.weight": w}), duration=0.05, dt=1e-3).q[-1, 0]
+
+    for w in (1.0, 0.7):
+        difference = (margin(w + 1e-4) - margin(w - 1e-4)) / 2e-4
+        np.testing.assert_allclose(jax.grad(margin)(w), difference, rtol=1e-5)
+
+
+def test_weights_are_tuned():
+    goal = ij.objectives.tracking() + 0.1 * ij.objectives.effort()
+    found = ij.tune(ij.presets.zhang_yan_2024(), ["controller.weight"], goal, duration=0.1, dt=1e-3, iterations=3, progress=False)
+    assert np.any(np.abs(np.asarray(found.scenario.controller.weight) - 1.0) > 1e-3)

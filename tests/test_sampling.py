@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import warnings
 
 import jax
@@ -295,6 +296,50 @@ def test_what_is_sampled_too_slowly_says_so():
         assert int(run.status) & int(Status.SAMPLING_TOO_SLOW) and int(run.status) & int(Status.BOUND_VIOLATED)
     assert ij.recommended_period(PAPER) == 5e-4
     assert ij.recommended_period(SLOW) > 1e-3
+
+
+LATE = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=1e-3))
+VERY_LATE = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=12e-3))
+LAGGING = ij.with_parts(
+    SLOW,
+    sampling=ij.Sampling(period=1e-3, delay=1e-3),
+    sensor=ij.sensors.Encoder(velocity=ij.sensors.FilteredDifference(cutoff=400.0)),
+    actuator=ij.actuators.Motor(bandwidth=400.0),
+    initial=ij.Initial(q=[0.55, 0.6]),
+)
+LIMITED = {
+    "controller.weight": (LATE, {"controller.weight": [60.0, 20.0]}),
+    "controller.K2": (LATE, {"controller.K2": 40.0}),
+    "observer.kf": (ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, observer="euler")), {"observer.kf": 1200.0}),
+    "sampling.delay": (VERY_LATE, {}),
+    "sensor.velocity.cutoff": (LAGGING, {"sensor.velocity.cutoff": 8.0}),
+    "actuator.bandwidth": (LAGGING, {"actuator.bandwidth": 20.0}),
+}
+QUICK = ("controller.weight",)
+LAGS = ("sensor.velocity.cutoff", "actuator.bandwidth")
+
+
+@pytest.mark.parametrize("limiting", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LIMITED])
+def test_the_warning_names_the_one_term_that_limits_the_loop(limiting):
+    """Scaled as the warning says that term makes the loop stable, and no other term does so by a smaller change."""
+    base, changes = LIMITED[limiting]
+    scenario = ij.with_parameters(base, changes)
+
+    def radius(path=limiting, scale=1.0):
+        moved = ij.with_parameters(scenario, {path: np.asarray(ij.simulation.paths.get(scenario, path)) * scale})
+        return radius_at(canonical(moved), float(scenario.sampling.period), np.array([0.0, 0.025, 0.05]))
+
+    with pytest.warns(ij.SimulationWarning, match="limits this loop") as caught:
+        ij.simulate(scenario, duration=0.05, dt=1e-3)
+    text = next(str(w.message) for w in caught if "limits this loop" in str(w.message))
+    assert [path for path in (*LIMITED, "controller.k1") if path in text] == [limiting]
+    direction, factor = re.search(r"(lower|raise) \S+ to (\S+) times its value", text).groups()
+    assert direction == ("raise" if limiting in LAGS else "lower")
+    assert radius() > 1
+    assert radius(scale=float(factor)) < 1
+    share = min(float(factor), 1.0 / float(factor))
+    for other in ("controller.K2", "observer.kf", "controller.weight", "controller.k1"):
+        assert other == limiting or radius(other, 1.5 * share) > 1, other
 
 
 def test_nothing_is_claimed_of_a_sampled_loop():

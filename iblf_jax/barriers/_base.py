@@ -29,8 +29,8 @@ from iblf_jax.core.pytree import Leaf
 GUARD = 1e-3
 """Default distance from the wall, in xi, at which the guard takes over."""
 
-CLAIMS = ("decay_rate", "xi_bound", "error_over_slope")
-"""Methods that a barrier may lack; then it claims nothing, or cannot stand on velocities."""
+CLAIMS = ("decay_rate", "xi_bound", "error_over_slope", "value_unit")
+"""Members that a barrier may lack: then it claims nothing, cannot stand on velocities, or has a V1 without a unit."""
 
 
 class Barrier(Protocol):
@@ -44,6 +44,11 @@ class Barrier(Protocol):
     @property
     def uses_o(self) -> bool:
         """A class attribute: whether `virtual_velocity` uses `o`."""
+        ...
+
+    @property
+    def value_unit(self) -> str:
+        """A class attribute: the unit of V1, "1" or "rad^2"; "1" for a barrier that does not declare it."""
         ...
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
@@ -74,6 +79,11 @@ class Barrier(Protocol):
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
         """The ratio e1/s, finite and smooth at e1 = 0, (n,); None for a barrier whose slope is of a higher order there."""
         ...
+
+
+def value_unit(barrier: Barrier) -> str:
+    """The unit of a barrier's V1 where its error is a position, "1" if the barrier declares none."""
+    return getattr(barrier, "value_unit", "1")
 
 
 def check_guard(owner: str, guard: float) -> None:

@@ -28,6 +28,7 @@ class Integral:
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = True
+    value_unit: ClassVar[str] = "1"
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""

@@ -29,6 +29,7 @@ class Log:
     p: int = static(default=1)
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = True
+    value_unit: ClassVar[str] = "1"
 
     def check(self) -> None:
         """Raises ValueError unless p is a whole number >= 1 and the guard in (0, 1)."""

@@ -31,6 +31,7 @@ class PrescribedPerformance:
 
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
+    value_unit: ClassVar[str] = "1"
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""

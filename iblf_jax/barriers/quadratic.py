@@ -22,6 +22,7 @@ class Quadratic:
 
     guard: ClassVar[float] = -math.inf
     uses_o: ClassVar[bool] = False
+    value_unit: ClassVar[str] = "rad^2"
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from iblf_jax import actuators, sensors
-from iblf_jax.certificates import claims, own_law
+from iblf_jax.certificates import claims, own_law, weighted_lines
 from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed, grid
@@ -136,11 +136,18 @@ def _one(run: Rollout) -> Certificate:
     whole, stretches = look(run)
     parts, traces = [], []
     for trajectory in stretches:
-        parts.append(of_stretch(trajectory))
+        lines_there, shares = of_stretch(trajectory)
+        parts.append(([*lines_there, *weighted_lines.of_stretch(trajectory)], shares))
         traces.append(_traces(trajectory))
-    lines = tuple(over_run(whole, parts))
+    lines = with_rates(over_run(whole, parts), weighted_lines.rates(whole))
     joined = Traces(*map(np.concatenate, zip(*traces, strict=True)))
     return Certificate(_heading(run.scenario), lines, _numbers(whole), joined, joints=joint_names(run.scenario.plant, run.n))
+
+
+def with_rates(lines: list[Line], rates: list[Line]) -> tuple[Line, ...]:
+    """The lines of a run, with the rates of the claim with weights before what follows from them."""
+    first = next((i for i, line in enumerate(lines) if line.name.startswith("weighted")), len(lines))
+    return (*lines[:first], *rates, *lines[first:])
 
 
 def _sampled(run: Rollout) -> Certificate:
@@ -196,6 +203,8 @@ def _numbers(whole: Whole) -> dict[str, Any]:
         "lambda_searched": whole.over_box.searched,
         "q_of_lambda_max_box": whole.over_box.q_max,
         "jump_times": whole.jumps,
+        "lambda_min_K2_over_M0_run": whole.slowest,
+        **{f"{name}_weighted_case_{case}": x for case, found in whole.weights.items() for name, x in found._asdict().items()},
         "samples": whole.samples,
         "samples_left_out": whole.left_out,
     }
@@ -248,7 +257,7 @@ def _many(runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], c
         disbelieved += [] if believed(run) else [index]
         for line in certificate.lines:
             lines.setdefault(line.name, []).append(dataclasses.replace(line, run=index))
-        badness = min(map(_badness, filter(lambda line: line.name.startswith("inequality"), certificate.lines)))
+        badness = min(map(_badness, filter(lambda line: "inequality" in line.name, certificate.lines)))
         badness = min(badness, (0.0 if certificate.verdict == FAILS else 1.0, badness[1]))
         if worst is None or badness < worst[0]:
             worst = (badness, index, certificate)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates import claims, own_law
+from iblf_jax.certificates import claims, own_law, weighted
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, SEEN_ONLY, Line
 from iblf_jax.certificates.trajectory import Trajectory, Whole
 from iblf_jax.controllers import FullState
@@ -104,6 +104,42 @@ def why_not(whole: Whole, case: int) -> str:
     return ""
 
 
+def why_not_weighted(whole: Whole, case: int) -> str:
+    """Why the claim with weights (`weighted`) of a case does not apply to this run; "" if it does."""
+    if not weighted.is_stated(whole.run.scenario):
+        return "the claim with weights is about the corrected law with a momentum observer"
+    if whole.no_run:
+        return whole.no_run
+    if case == 1 and whole.case == 2:
+        return f"case 1 is for f' = 0; here |f'| reaches {whole.F_d:.4g} N m/s, see case 2"
+    if case not in whole.weights:
+        return "the numbers of the run are not finite"
+    if whole.left_out == whole.samples:
+        return "the guard or a torque limit was at work all the time"
+    return ""
+
+
+def weighted_case(whole: Whole) -> int | None:
+    """The case whose claim with weights applies to the run: the stronger one that does, or None."""
+    return next((case for case in claims.CASES if not why_not_weighted(whole, case)), None)
+
+
+def replaces_the_papers(whole: Whole) -> bool:
+    """Whether the claim with weights replaces the paper's own: the barriers have other weights than 1."""
+    return weighted.has_other_weights(whole.run.scenario) and weighted_case(whole) is not None
+
+
+NOT_NEEDED = "the paper's own envelope of V2 is lost, stability is not: the claim with weights (W.1) does not need it"
+
+
+def _of_the_papers(whole: Whole, line: Line) -> Line:
+    """A line that only the paper's own envelope needs; where the claim with weights replaces it, it does not decide the verdict."""
+    if line.verdict != FAILS or weighted_case(whole) is None:
+        return line
+    note = "; ".join(x for x in (NOT_NEEDED, line.note) if x)
+    return dataclasses.replace(line, counts=line.counts and not replaces_the_papers(whole), note=note)
+
+
 def applicable_case(whole: Whole) -> int | None:
     """The case whose bounds apply to the run: the stronger one that does, or None."""
     return next((case for case in claims.CASES if not why_not(whole, case)), None)
@@ -138,7 +174,7 @@ def judged(trajectory: Trajectory, margins: np.ndarray, tolerances: np.ndarray |
     )
 
 
-def _excluded(whole: Whole) -> str:
+def excluded(whole: Whole) -> str:
     """What was left out of a line, and where claims start anew, in words."""
     notes = []
     if whole.left_out:
@@ -159,7 +195,7 @@ def assumptions(trajectory: Trajectory) -> list[Line]:
         ("f' bounded", "|f'| <= F_d between jumps", speed if whole.case == 2 else 0.0 * speed, "N m/s"),
     ):
         at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
-        jumps = "" if name == "f bounded" or not whole.jumps.size else f"Assumption 1 is broken by a jump of f: {_excluded(whole)}"
+        jumps = "" if name == "f bounded" or not whole.jumps.size else f"Assumption 1 is broken by a jump of f: {excluded(whole)}"
         verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
         lines.append(
             Line(name, "Assumption 1", statement, verdict, value=float(values[at]), unit=unit, time=float(trajectory.t[at]), note=jumps)
@@ -167,17 +203,17 @@ def assumptions(trajectory: Trajectory) -> list[Line]:
     room = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     row, joint = np.unravel_index(np.argmin(room), room.shape)
     feasible: Description = {"name": "reference inside", "equation": "Assumption 2", "statement": "k_lc < x_d < k_uc", "unit": "rad"}
-    line = _line(feasible, float(room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
+    line = positive(feasible, float(room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
     # The status of a filter's run says nothing of this: its bounds are kept wherever the reference goes.  The theorem needs it inside.
     lines.append(line if has(whole.run, "slack") else _as_status(whole, line, Status.INFEASIBLE_REFERENCE))
     if trajectory.t[0] == 0:
         start = np.minimum(sample.q[0] - sample.lower[0], sample.upper[0] - sample.q[0])
         inside: Description = {"name": "start inside", "equation": "Theorem 2", "statement": "k_lc(0) < q(0) < k_uc(0)", "unit": "rad"}
-        lines.append(_line(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
+        lines.append(positive(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
     return lines
 
 
-def _line(description: Description, margin: float, **more: Any) -> Line:
+def positive(description: Description, margin: float, **more: Any) -> Line:
     """A line whose margin must be positive."""
     return Line(verdict=HOLDS if margin > 0 else FAILS, margin=margin, **description, **more)
 
@@ -208,7 +244,8 @@ def gains(whole: Whole) -> list[Line]:
         margins = np.asarray(getattr(whole.claim, field)) - lowest
         spare = name == "kf, case 2" and whole.case == 1
         note = "f' = 0 on this run, so case 1 is what counts" if spare else ""
-        lines.append(_line(description, float(margins.min()), joint=int(margins.argmin()), counts=not spare, note=note))
+        line = positive(description, float(margins.min()), joint=int(margins.argmin()), counts=not spare, note=note)
+        lines.append(_of_the_papers(whole, line))
     return lines
 
 
@@ -227,7 +264,9 @@ def _full_gains(whole: Whole) -> list[Line]:
         needed = np.asarray(whole.claim.kf).min() - claims.LOWEST_FULL[case]
         note = f"lambda_min(M0) = {whole.lambda_min:.4g} kg m^2 along the run"
         note += f": c > {0.25 / (needed * whole.lambda_min**2):.4g} would do" if margin <= 0 < needed else ""
-        lines.append(_line(description, margin, counts=not spare, note="f' = 0 on this run, so case 1 is what counts" if spare else note))
+        lines.append(
+            positive(description, margin, counts=not spare, note="f' = 0 on this run, so case 1 is what counts" if spare else note)
+        )
     return lines
 
 
@@ -254,7 +293,8 @@ def rates(whole: Whole, case: int) -> list[Line]:
         eigenvalue = f"lambda_min(M0) = {smallest:.4g} kg m^2" if is_full(whole) else f"lambda_max(M0) = {largest:.4g} kg m^2"
         note = eigenvalue + (f" ({whole.over_box.searched})" if where == "box" else "") + f"; set by {least}"
         counts = not (case == 2 and whole.case == 1)
-        lines.append(_line(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts))
+        line = positive(description, whole.rho[case, where], value=whole.rho[case, where], note=note, counts=counts)
+        lines.append(_of_the_papers(whole, line))
     return lines
 
 
@@ -265,7 +305,7 @@ def inequality(trajectory: Trajectory, case: int) -> Line:
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
     tolerance = trajectory.whole.eps * (trajectory.proof.terms + trajectory.whole.rho[case, "run"] * trajectory.proof.V)
-    return judged(trajectory, -left_side(trajectory, case), tolerance, {**description, "note": _excluded(trajectory.whole)})
+    return judged(trajectory, -left_side(trajectory, case), tolerance, {**description, "note": excluded(trajectory.whole)})
 
 
 def full_assumptions(trajectory: Trajectory) -> list[Line]:
@@ -273,12 +313,12 @@ def full_assumptions(trajectory: Trajectory) -> list[Line]:
     sample, proof = trajectory.sample, trajectory.proof
     row, joint = np.unravel_index(np.argmin(proof.full.room), proof.full.room.shape)
     inside: Description = {"name": "alpha inside", "equation": "(F.1)", "statement": "v_l < alpha < v_u", "unit": "rad/s"}
-    line = _line(inside, float(proof.full.room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
+    line = positive(inside, float(proof.full.room[row, joint]), joint=int(joint), time=float(trajectory.t[row]))
     lines = [_as_status(trajectory.whole, line, Status.ALPHA_INFEASIBLE)]
     if trajectory.t[0] == 0:
         start = np.minimum(sample.dq[0] - sample.dq_lower[0], sample.dq_upper[0] - sample.dq[0])
         inside = {"name": "start speed inside", "equation": "(F.1)", "statement": "v_l(0) < q'(0) < v_u(0)", "unit": "rad/s"}
-        lines.append(_line(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
+        lines.append(positive(inside, float(start.min()), joint=int(start.argmin()), time=0.0))
     return lines
 
 
@@ -289,7 +329,7 @@ def step_inequality(trajectory: Trajectory) -> Line:
     whole, proof = trajectory.whole, trajectory.proof
     if whole.no_claim or whole.no_run:
         return Line(verdict=NOT_APPLICABLE, note=whole.no_claim or whole.no_run, **description)
-    return judged(trajectory, -proof.full.left, whole.eps * proof.terms, {**description, "note": _excluded(whole)})
+    return judged(trajectory, -proof.full.left, whole.eps * proof.terms, {**description, "note": excluded(whole)})
 
 
 def envelope(trajectory: Trajectory, case: int) -> Line:
@@ -299,14 +339,22 @@ def envelope(trajectory: Trajectory, case: int) -> Line:
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
     upper = trajectory.envelope[case]
-    return judged(trajectory, upper.bound - trajectory.proof.V, upper.tolerance, {**description, "note": _excluded(trajectory.whole)})
+    return judged(trajectory, upper.bound - trajectory.proof.V, upper.tolerance, {**description, "note": excluded(trajectory.whole)})
 
 
 @jax.jit
 def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
-    """The barrier's own bound on |xi| where V1 <= V, (T, n), or None if it states none."""
-    stated = getattr(claims.law_of(scenario).barrier, "xi_bound", None)
-    return None if stated is None else jax.vmap(lambda t, V: stated(V, scenario.setting.tube(t)))(t, V)
+    """The barrier's own bound on |xi_i| where w_i V1_i <= V, (T, n), or None if it states none."""
+    law: Any = claims.law_of(scenario)
+    stated = getattr(law.barrier, "xi_bound", None)
+    return None if stated is None else jax.vmap(lambda t, V: stated(V / law.weight, scenario.setting.tube(t)))(t, V)
+
+
+def xi_bound_along(trajectory: Trajectory, V: np.ndarray) -> np.ndarray:
+    """The barrier's bound on |xi_i| where w_i V1_i <= V, (T, n); NaN if it states none."""
+    places = np.minimum(np.arange(CERTIFY_STRETCH), V.size - 1)  # one program for stretches of every size
+    found = _xi_bound(trajectory.whole.run.scenario, trajectory.t[places], jnp.asarray(V[places], trajectory.t.dtype))
+    return np.full(trajectory.sample.q.shape, np.nan) if found is None else np.asarray(found)[: V.size]
 
 
 @jax.jit
@@ -319,8 +367,8 @@ def _e2_bound(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, V: 
 
 def bounds_along(trajectory: Trajectory, V: np.ndarray) -> dict[str, np.ndarray]:
     """The bounds on |xi| (by the barrier, by (3.23)), |e2| and |f_tilde| where V2 <= V; (T, n) for xi, else (T,)."""
-    places = np.minimum(np.arange(CERTIFY_STRETCH), V.size - 1)  # one program for stretches of every size
-    by_barrier = _xi_bound(trajectory.whole.run.scenario, trajectory.t[places], jnp.asarray(V[places], trajectory.t.dtype))
+    places = np.minimum(np.arange(CERTIFY_STRETCH), V.size - 1)
+    weight = np.asarray(claims.law_of(trajectory.whole.run.scenario).weight)
     e2: dict[str, np.ndarray] = {"e2": np.sqrt(2 * V / trajectory.whole.lambda_min)}
     if is_full(trajectory.whole):
         sample = trajectory.sample
@@ -334,8 +382,8 @@ def bounds_along(trajectory: Trajectory, V: np.ndarray) -> dict[str, np.ndarray]
         by_phi = np.full(sample.q.shape, np.nan) if stated is None else np.asarray(stated)[: V.size]
         e2 = {"e2": np.linalg.norm(by_phi * trajectory.proof.full.bound, axis=1), "xi2, by phi": by_phi}
     return e2 | {
-        "xi, by V1": np.full(trajectory.sample.q.shape, np.nan) if by_barrier is None else np.asarray(by_barrier)[: V.size],
-        "xi": np.broadcast_to(np.sqrt(2 * V)[:, None], trajectory.sample.q.shape),
+        "xi, by V1": xi_bound_along(trajectory, V),
+        "xi": np.sqrt(2 * V[:, None] / weight),
         "f_tilde": np.sqrt(2 * V),
     }
 
@@ -348,9 +396,9 @@ def bounds(trajectory: Trajectory) -> list[Line]:
         {
             "name": "xi, by V1",
             "equation": XI_BOUND[shown],
-            "statement": "V1 <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar)), or as the barrier says",
+            "statement": "V1 <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar/w_i)), or as the barrier says",
         },
-        {"name": "xi", "equation": BOUNDS[shown], "statement": "|xi_i| <= sqrt(2 Vbar)"},
+        {"name": "xi", "equation": BOUNDS[shown], "statement": "|xi_i| <= sqrt(2 Vbar/w_i)"},
         {"name": "e2", "equation": BOUNDS[shown], "statement": "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "unit": "rad/s"},
         {"name": "f_tilde", "equation": BOUNDS[shown], "statement": "|f_tilde| <= sqrt(2 Vbar)", "unit": "N m"},
     ]
@@ -375,7 +423,7 @@ def bounds(trajectory: Trajectory) -> list[Line]:
         if name == "xi2, by phi" and np.all(np.isnan(tight[name])):
             lines.append(Line(verdict=NOT_APPLICABLE, note="the velocity barrier states no bound on xi2 from phi", **description))
             continue
-        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", _excluded(trajectory.whole)) if x)
+        note = "; ".join(x for x in (f"Vbar is the envelope of case {case}", excluded(trajectory.whole)) if x)
         lines.append(judged(trajectory, tight[name] - sizes[name], wide[name] - tight[name], {**description, "note": note}))
     return lines
 
@@ -434,7 +482,7 @@ def conclusions(trajectory: Trajectory) -> list[Line]:
     room = np.minimum(sample.dq - sample.dq_lower, sample.dq_upper - sample.dq)
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
     description: Description = {"name": "velocities inside", "equation": "(F.3)", "statement": "v_l < q' < v_u", "unit": "rad/s"}
-    line = _line(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
+    line = positive(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
     line = _as_status(whole, line, Status.VELOCITY_VIOLATED)
     if applicable_case(whole) is None:
         line = dataclasses.replace(line, verdict=NOT_APPLICABLE, note=f"{SEEN_ONLY}{why_not(whole, whole.case)})")
@@ -447,8 +495,10 @@ def conclusion(trajectory: Trajectory) -> Line:
     room = 1.0 - np.abs(trajectory.sample.xi)
     at, joint = np.unravel_index(np.argmin(np.nan_to_num(room, nan=-np.inf)), room.shape)
     case = applicable_case(trajectory.whole)
-    line = _line(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
+    line = positive(description, float(room[at, joint]), joint=int(joint), time=float(trajectory.t[at]))
     line = _as_status(trajectory.whole, line, Status.BOUND_VIOLATED)
+    if case is None and replaces_the_papers(trajectory.whole):
+        case = weighted_case(trajectory.whole)
     unclaimed = case is not None and _xi_bound(trajectory.whole.run.scenario, trajectory.t[:1], trajectory.proof.V[:1]) is None
     if case is None or unclaimed:
         reason = NO_BOUND if unclaimed else why_not(trajectory.whole, trajectory.whole.case)

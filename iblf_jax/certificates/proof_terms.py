@@ -59,6 +59,8 @@ class ProofTerms(NamedTuple):
     """f', exact, (n,) [N m/s]."""
     f_tilde: jax.Array
     """f - f_hat, (n,) [N m]."""
+    df_tilde: jax.Array
+    """Its rate, exact, (n,) [N m/s]."""
     e2: jax.Array
     """q' - alpha, (n,) [rad/s]."""
     xi: jax.Array
@@ -79,6 +81,8 @@ class ProofTerms(NamedTuple):
     """Sizes of the terms of f', added up, (n,) [N m/s]."""
     V_terms: jax.Array
     """Error of sqrt(2 V2) for one unit of relative error, ()."""
+    slowest: jax.Array
+    """Smallest eigenvalue of M0^-1 K2, () [1/s]; NaN for a law whose K2 is no torque's gain."""
     full: Any = ()
     """Of a law that bounds velocities too, its `FullTerms`."""
     own: Any = ()
@@ -107,9 +111,9 @@ def _probe(scenario: Scenario, t: jax.Array, state: LoopState):
     """What is differentiated along the loop's vector field."""
     slope_of_state, sample = evaluate(scenario, t, state)
     law = law_of(scenario)
-    barrier_slope = (
-        law.barrier.slope(scenario.setting.tube(t), state.q) if isinstance(law, Backstepping | FullState) else jnp.zeros_like(state.q)
-    )
+    barrier_slope = jnp.zeros_like(state.q)
+    if isinstance(law, Backstepping | FullState):
+        barrier_slope = law.weight * law.barrier.slope(scenario.setting.tube(t), state.q)
     smooth = {name: getattr(sample, name) for name in ("V", "disturbance", "disturbance_estimate", "tau", "alpha", "xi", "e2", "dq_d")}
     plant = at_time(scenario.plant, t)
     # All that f holds where the plant is the model: what is pushed besides the law's torque.
@@ -136,7 +140,17 @@ def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
     """
     terms, M0, _ = _seen(scenario, t, state)
     eigenvalues = jnp.linalg.eigvalsh(M0)
-    return ProofTerms(**terms, lambda_min=eigenvalues[0], lambda_max=eigenvalues[-1])
+    slowest = 1.0 / jnp.linalg.eigvalsh(_over_K2(scenario, M0))[-1]
+    return ProofTerms(**terms, lambda_min=eigenvalues[0], lambda_max=eigenvalues[-1], slowest=slowest)
+
+
+def _over_K2(scenario: Scenario, M0: Any) -> Any:
+    """K2^(-1/2) M0 K2^(-1/2), (..., n, n) [s], whose eigenvalues are those of K2^-1 M0; NaN for other laws."""
+    law = law_of(scenario)
+    if not isinstance(law, Backstepping):
+        return M0 * np.nan
+    root = law.K2**0.5
+    return M0 / (root[:, None] * root[None, :])
 
 
 def _seen(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str, jax.Array], jax.Array, Sample]:
@@ -154,6 +168,7 @@ def _seen(scenario: Scenario, t: jax.Array, state: LoopState) -> tuple[dict[str,
         "f": now["disturbance"],
         "df": ahead["disturbance"],
         "f_tilde": f_tilde,
+        "df_tilde": ahead["disturbance"] - ahead["disturbance_estimate"],
         "e2": now["e2"],
         "xi": now["xi"],
         "dropped_e2": dropped_e2,
@@ -180,7 +195,7 @@ def _full(scenario: Scenario, t: jax.Array, state: LoopState, M0, ahead, f_tilde
     outer, inner = law.tubes(t, state.q, state.dq, scenario.setting)
     s2, V1, phi = (
         law.velocity_barrier.slope(inner, state.dq),
-        law.barrier.value(outer, state.q),
+        law.weight * law.barrier.value(outer, state.q),
         law.velocity_barrier.value(inner, state.dq),
     )
     barriers_rate = ahead["V"] - f_tilde @ (ahead["disturbance"] - ahead["disturbance_estimate"])
@@ -233,7 +248,8 @@ def _sizes(scenario: Scenario, t: jax.Array, state: LoopState, M0, now, ahead, f
         terms += _full_sizes(law, scenario, t, state, M0, torque, fast)
     tube = scenario.setting.tube(t)
     width = jnp.minimum(tube.k_l, tube.k_u)
-    reach = jnp.sum((jnp.abs(state.q) / (width * gap)) ** 2) + slow @ (jnp.abs(M0) @ slow) + torque @ torque
+    weight = getattr(law, "weight", jnp.ones_like(width))
+    reach = jnp.sum(weight * (jnp.abs(state.q) / (width * gap)) ** 2) + slow @ (jnp.abs(M0) @ slow) + torque @ torque
     return terms, torque_rate, jnp.sqrt(reach)
 
 
@@ -271,15 +287,16 @@ class Look:
 
 @dataclasses.dataclass(frozen=True)
 class Onward:
-    """A step of the engine that makes the run's own step, of any size, and records the state and V2 before it."""
+    """A step of the engine that makes the run's own step, of any size, and records the state, V2 and |f_tilde|^2/2 before it."""
 
     method: str
 
     def __call__(self, inputs, place: Place, index: jax.Array, form):
-        """The place after the step; the state and V2 before it."""
+        """The place after the step; the state, V2 and |f_tilde|^2/2 before it."""
         t = (place.steps + index.astype(place.steps.dtype)) * place.size
         made = step(self.method, partial(evaluate, inputs.scenario), t, place.state, place.size, rolled=form.rolled)
-        return place._replace(state=made.state), (place.state, made.first.V)
+        f_tilde = made.first.disturbance - made.first.disturbance_estimate
+        return place._replace(state=made.state), (place.state, (made.first.V, 0.5 * jnp.sum(f_tilde**2)))
 
 
 def along_run(scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.Array, *, method: str):
@@ -292,7 +309,7 @@ def along_run(scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.
       dt, method: of the run.
 
     Returns:
-      The proof, the sample, and the integrator's error in V2 over one step, on the host; (T, ...) each.
+      The proof, the sample, and the integrator's errors in V2 and in |f_tilde|^2/2 over one step, on the host; (T, ...) each.
     """
     count = index.astype(dt.dtype)
     whole, halves = (Place(jax.device_put(part * count), jax.device_put(np.full_like(count, float(dt) / part)), states) for part in (1, 2))
@@ -300,10 +317,24 @@ def along_run(scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.
     # One step against two half steps: the envelopes are held against a run in which V2 has fallen below what the integrator resolves.
     # Both go on for three, so that they are one call and compile once.
     both = jax.tree.map(lambda *xs: np.concatenate(xs), whole, halves)
-    V_whole, V_halves = np.split(np.asarray(run_from(scenario, dt, both, step=Onward(method), steps=3)[1][1]), 2)
+    levels = run_from(scenario, dt, both, step=Onward(method), steps=3)[1][1]
     proof, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     # NumPy raises at what is not finite, where the terms say NaN.
     finite = np.all(np.isfinite(M0), axis=(1, 2), keepdims=True)
     eigenvalues = np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, M0, 0.0)), np.nan)
-    defect = 2.0 * np.abs(V_whole[:, 1] - V_halves[:, 2])  # times two for safety
-    return ProofTerms(**proof | {"lambda_min": eigenvalues[:, 0], "lambda_max": eigenvalues[:, -1]}), sample, defect
+    found = {"lambda_min": eigenvalues[:, 0], "lambda_max": eigenvalues[:, -1], "slowest": _slowest(scenario, M0)}
+    return ProofTerms(**proof | found), sample, *map(_defect, levels)
+
+
+def _slowest(scenario: Scenario, M0: np.ndarray) -> np.ndarray:
+    """The smallest eigenvalue of M0^-1 K2 at each position, (T,) [1/s]; NaN where M0 is not finite."""
+    over_K2 = np.asarray(_over_K2(scenario, M0))
+    finite = np.all(np.isfinite(over_K2), axis=(1, 2))
+    unit = np.eye(M0.shape[-1])
+    return np.where(finite, 1.0 / np.linalg.eigvalsh(np.where(finite[:, None, None], over_K2, unit))[:, -1], np.nan)
+
+
+def _defect(level: jax.Array) -> np.ndarray:
+    """By how much one step of the run leads elsewhere than two half steps, (T,), of a level along both, (2 T, 3); twice, for safety."""
+    whole, halves = np.split(np.asarray(level), 2)
+    return 2.0 * np.abs(whole[:, 1] - halves[:, 2])

@@ -38,6 +38,8 @@ class Stretch(NamedTuple):
     """The integrator's error in V2 over one step from each."""
     recorded: np.ndarray
     """Whether the run recorded the step, bool."""
+    defect_f: np.ndarray
+    """As `defect`, in |f_tilde|^2/2."""
 
 
 def states_of(run: Any) -> LoopState:
@@ -131,8 +133,8 @@ def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> St
     t = index.astype(run.t.dtype) * run.dt
     padded = jax.tree.map(lambda x: np.asarray(x)[places], states)
     found = along_run(run.scenario, index[places], padded, run.dt, method=run.method)
-    proof, sample, defect = jax.tree.map(lambda x: x[:size], found)
-    return Stretch(t, sample, proof, defect, index % every == 0)
+    proof, sample, defect, defect_f = jax.tree.map(lambda x: x[:size], found)
+    return Stretch(t, sample, proof, defect, index % every == 0, defect_f)
 
 
 def _check_arrival(run: Any, recorded: LoopState, made: LoopState, rows: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.certificates import claims
+from iblf_jax.certificates import claims, weighted
 from iblf_jax.certificates.eigenvalues import Extremes, eigenvalues_over
 from iblf_jax.certificates.proof_terms import rounding
 from iblf_jax.certificates.retrace import Stretch, believed, check_status, grid, stretches
@@ -83,6 +83,10 @@ class Whole(NamedTuple):
     """Those of them at which the guard or a torque limit was at work."""
     V_ends: tuple[float, float]
     """V2 at the first and at the last."""
+    slowest: float
+    """Smallest eigenvalue of M0^-1 K2 along the run [1/s]."""
+    weights: dict[int, weighted.Weights]
+    """The numbers of the claim with weights, by case, for a loop that has one."""
 
 
 class Trajectory(NamedTuple):
@@ -94,6 +98,8 @@ class Trajectory(NamedTuple):
     proof: Any
     recorded: np.ndarray
     envelope: dict[int, Envelope]
+    weighted: dict[int, Envelope]
+    """The envelopes of the claim with weights."""
 
 
 def look(run: Any) -> tuple[Whole, Iterator[Trajectory]]:
@@ -113,6 +119,7 @@ class _Tally:
         self.F_m = self.F_d = self.lambda_max = -np.inf
         self.steady, self.samples, self.left_out = True, 0, 0
         self.V_ends = (np.nan, np.nan)
+        self.slowest, self.half_square = np.inf, np.nan
 
     def add(self, stretch: Stretch) -> None:
         """Takes a stretch into account; what is no number stays none."""
@@ -124,6 +131,9 @@ class _Tally:
         self.lambda_min = np.minimum(self.lambda_min, proof.lambda_min.min())
         self.lambda_max = np.maximum(self.lambda_max, proof.lambda_max.max())
         self.steady = self.steady and bool(proof.steady.all())
+        self.slowest = np.minimum(self.slowest, proof.slowest.min())
+        if self.samples == 0:
+            self.half_square = 0.5 * np.sum(proof.f_tilde[0] ** 2)
         self.V_ends = (proof.V[0] if self.samples == 0 else self.V_ends[0], proof.V[-1])
         self.samples, self.left_out = self.samples + stretch.t.size, self.left_out + int(proof.held.sum())
 
@@ -147,8 +157,11 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
         for each in claims.CASES:
             for where, seen_there in (("run", tally), ("box", over_box)):
                 rates[each, where] = float(claims.rho(constants, seen_there.lambda_max, each, seen_there.lambda_min))
+    F_d = 0.0 if case == 1 else float(tally.F_d)
     return Whole(
         run=run,
+        slowest=float(tally.slowest),
+        weights=_weights(run, constants, tally, F_d),
         eps=rounding(run.q.dtype),
         no_claim=no_claim,
         no_run=no_run,
@@ -156,7 +169,7 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
         case=case,
         rho=rates,
         F_m=float(tally.F_m),
-        F_d=0.0 if case == 1 else float(tally.F_d),
+        F_d=F_d,
         lambda_min=float(tally.lambda_min),
         lambda_max=float(tally.lambda_max),
         over_box=over_box,
@@ -167,18 +180,43 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
     )
 
 
+def _weights(run: Any, constants: Any, tally: _Tally, F_d: float) -> dict[int, weighted.Weights]:
+    """The numbers of the claim with weights, by case; none for a loop that has no such claim."""
+    if not isinstance(constants, claims.Claim) or not weighted.is_stated(run.scenario):
+        return {}
+    duration, half_square = grid(run)[1] * float(run.dt), float(tally.half_square)
+    V_rest = float(tally.V_ends[0]) - half_square
+    found = {}
+    for case in claims.CASES:
+        best = weighted.best(constants, float(tally.slowest), V_rest, half_square, F_d, duration, case)
+        if best is not None:
+            found[case] = best
+    return found
+
+
 def _with_envelopes(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Trajectory]:
     """The second look: the stretches, with the envelopes that run through them."""
-    anchors: dict[int, Anchor] = {}
+    anchors: dict[tuple[str, int], Anchor] = {}
     t, held = np.zeros(0), np.zeros(0, bool)
     for stretch in seen:
         starts = starts_of(np.append(t, stretch.t), np.append(held, stretch.proof.held), whole.jumps)[t.size :]
         t, held = stretch.t[-1:], stretch.proof.held[-1:]
-        envelopes = {}
-        if whole.claim is not None:
-            for case in claims.CASES:
-                envelopes[case], anchors[case] = _envelope(whole, case, stretch, starts, anchors.get(case))
-        yield Trajectory(whole, stretch.t, stretch.sample, stretch.proof, stretch.recorded, envelopes)
+        envelopes: dict[str, dict[int, Envelope]] = {"paper": {}, "weighted": {}}
+        for (kind, case), (rate, rho2, w_f) in _claimed(whole).items():
+            level = level_of(stretch, w_f)
+            found = _envelope(whole, rate, rho2, stretch, level, starts, anchors.get((kind, case)))
+            envelopes[kind][case], anchors[kind, case] = found
+        yield Trajectory(whole, stretch.t, stretch.sample, stretch.proof, stretch.recorded, envelopes["paper"], envelopes["weighted"])
+
+
+def _claimed(whole: Whole) -> dict[tuple[str, int], tuple[float, float, float]]:
+    """Kind and case of every envelope -> its rate, its rho2 and the weight of f_tilde."""
+    found = {}
+    for case in claims.CASES if whole.claim is not None else ():
+        found["paper", case] = (whole.rho[case, "run"], 0.0 if case == 1 else whole.F_d**2 / 2, 1.0)
+    for case, weights in whole.weights.items():
+        found["weighted", case] = (weights.rho, weights.rho2, weights.w_f)
+    return found
 
 
 def same_structure(one: Any, other: Any) -> bool:
@@ -205,17 +243,39 @@ def starts_of(t: np.ndarray, held: np.ndarray, jumps: np.ndarray) -> np.ndarray:
     return np.concatenate([[True], fresh | held[:-1]])
 
 
-def _envelope(whole: Whole, case: int, stretch: Stretch, starts: np.ndarray, before: Anchor | None) -> tuple[Envelope, Anchor]:
-    """The envelope of V2 and its tolerance along a stretch; NaN at held steps, and everywhere if the rate is not positive."""
-    rate, rho2 = whole.rho[case, "run"], 0.0 if case == 1 else whole.F_d**2 / 2
-    t, V, noise = stretch.t, stretch.proof.V, NOISE * float(np.finfo(stretch.proof.V.dtype).eps) * stretch.proof.V_terms
+class Level(NamedTuple):
+    """V2, or V_w, along a stretch, (T,) each."""
+
+    V: np.ndarray
+    noise: np.ndarray
+    """By how much sqrt(2 V) may be off by rounding."""
+    defect: np.ndarray
+    """The integrator's error in V over one step."""
+
+
+def level_of(stretch: Any, w_f: float) -> Level:
+    """V_w with the weight w_f of f_tilde, V2 for w_f = 1, along a `Stretch` or a `Trajectory` (whose integrator's errors are not known)."""
+    proof = stretch.proof
+    V = proof.V if w_f == 1.0 else proof.V + (w_f - 1.0) * 0.5 * np.sum(proof.f_tilde**2, axis=1)
+    noise = NOISE * float(np.finfo(proof.V.dtype).eps) * proof.V_terms * max(1.0, w_f) ** 0.5
+    defect = getattr(stretch, "defect", np.zeros_like(V))
+    if w_f != 1.0 and isinstance(stretch, Stretch):
+        defect = defect + abs(w_f - 1.0) * stretch.defect_f
+    return Level(V, noise, defect)
+
+
+def _envelope(
+    whole: Whole, rate: float, rho2: float, stretch: Stretch, level: Level, starts: np.ndarray, before: Anchor | None
+) -> tuple[Envelope, Anchor]:
+    """The envelope of a level and its tolerance along a stretch; NaN at held steps, and everywhere if the rate is not positive."""
+    t, V, noise = stretch.t, level.V, level.noise
     if before is None:
         before = Anchor(t[0], V[0], noise[0], 0.0)
     # Index of the step at which the envelope started, 0 for one before this stretch.
     first = np.maximum.accumulate(np.where(starts, np.arange(1, t.size + 1), 0))
     start_t, start_V, start_noise = (np.append(a, b)[first] for a, b in zip(before[:3], (t, V, noise), strict=True))
     decay, sums, total = np.exp(-max(rate, 0.0) * float(whole.run.dt)), [], before.carried
-    for fresh, error in zip(starts.tolist(), stretch.defect.tolist(), strict=True):
+    for fresh, error in zip(starts.tolist(), level.defect.tolist(), strict=True):
         sums.append(0.0 if fresh else total)
         total = decay * sums[-1] + error
     after = Anchor(start_t[-1], start_V[-1], start_noise[-1], total)

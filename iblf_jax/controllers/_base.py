@@ -76,8 +76,10 @@ class Controller(Protocol):
     which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `needs_velocity_bounds = True` if it cannot do
     without `Setting.velocity_bounds`; `includes_e2 = True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2;
     `filters = True` if its commands have a `slack`; `wraps`, the name of the field that holds another law whose paths are then its own
-    ("controller.K2" reaches through).  And methods: `advice()`, a list of warnings, and `check_start(setting)`, which raises
-    ValueError for what does not fit together where the number of joints is known.
+    ("controller.K2" reaches through); `unit_factors`, the names of leaves that only multiply, of which it may be compiled in which numbers
+    are 1 (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(setting)`, which raises
+    ValueError for what does not fit together where the number of joints is known, and `leaf_units()`, the units of leaves that depend on
+    other fields, by name.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:

@@ -25,14 +25,14 @@ import numpy as np
 from iblf_jax.barriers import Barrier, Log
 from iblf_jax.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.controllers.backstepping import alpha_and_rate, fit_o
+from iblf_jax.controllers.backstepping import alpha_and_rate, fit_o, fit_weight, weight_unit
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
 @component
 class AdaptiveRBF:
-    """tau = -s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
+    """tau = -w s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
 
     s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes, n) [N m].
 
@@ -49,6 +49,8 @@ class AdaptiveRBF:
       width: width of the Gaussians in half boxes, () [1], > 0; 2 if not given.
       barrier: any `Barrier`; `Log()` if not given.
       nodes: number of Gaussians, a whole number; 64 if not given.
+      weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
+        rad^2), > 0; 1, the paper's, if not given.
 
     Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068; numbers as said at the head of this module.
     """
@@ -65,14 +67,21 @@ class AdaptiveRBF:
     width: Leaf = leaf("1", sign="positive", shape="scalar", default=2.0)
     barrier: Barrier = Log()
     nodes: int = static(default=64)
+    weight: Leaf = leaf("N m rad", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
+    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
 
     def check(self) -> None:
-        """Raises ValueError for a bad barrier or number of nodes; fits `o` to the barrier."""
+        """Raises ValueError for a bad barrier or number of nodes; completes `o` and `weight`."""
         checks.positive_integer("AdaptiveRBF.nodes", self.nodes)
         checks.conforms("AdaptiveRBF.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Log().", CLAIMS)
         fit_o(self)
+        fit_weight(self)
+
+    def leaf_units(self) -> dict[str, str]:
+        """The unit of the weight, which depends on the barrier."""
+        return {"weight": weight_unit(self.barrier)}
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> jax.Array:
         """W_hat(0) = 0, (nodes, n) [N m]."""
@@ -91,9 +100,11 @@ class AdaptiveRBF:
         alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
         tube, e2 = setting.tube(t), dq - alpha
         S = self.basis(q, dq, alpha, dalpha)
-        tau = jnp.sum(S[:, None] * state, axis=0) - self.K2 * e2 - self.barrier.slope(tube, q)
+        learned = jnp.sum(S[:, None] * state, axis=0)
+        tau = learned - self.K2 * e2 - self.weight * self.barrier.slope(tube, q)
         guard_active = guard_is_active(tube, q, self.barrier.guard)
-        command = Command(tau, alpha, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active))
+        value = self.weight * self.barrier.value(tube, q)
+        command = Command(tau, alpha, value, guard_active, jnp.zeros_like(guard_active))
         return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)
 
 

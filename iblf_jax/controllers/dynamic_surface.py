@@ -3,7 +3,7 @@
 alpha goes through a filter of the first order, and the law follows what comes out of it,
 
     mu beta' + beta = alpha,   beta(0) = alpha(0),   e2 = q' - beta,
-    tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - s,   beta' = (alpha - beta)/mu,
+    tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   beta' = (alpha - beta)/mu,
 
 so that alpha' is never formed: neither the reference's acceleration nor the rates of the bounds' rates are needed.  The price is
 the filter's lag, beta - alpha = -mu beta', which drives e1 as an error of the velocity would: about mu |alpha'|/k1 is left of it.  For
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from iblf_jax.barriers import Barrier, Integral
 from iblf_jax.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.controllers.backstepping import fit_o
+from iblf_jax.controllers.backstepping import fit_o, fit_weight, weight_unit
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
@@ -28,7 +28,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 
 @component
 class DynamicSurface:
-    """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - s,   mu beta' + beta = alpha,   e2 = q' - beta.
+    """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha,   e2 = q' - beta.
 
     The state is beta, (n,) [rad/s], which stands for alpha in all that is recorded.
 
@@ -38,6 +38,8 @@ class DynamicSurface:
       filter: time constant mu of the filter, () or (n,) [s], > 0; a sampled law needs one longer than half its period.
       o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not given.
       barrier: any `Barrier`; `Integral()` if not given.
+      weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
+        rad^2), > 0; 1, the paper's, if not given.
 
     Source: D. Swaroop, J. K. Hedrick, P. P. Yip, J. C. Gerdes, IEEE Trans. Automatic Control 45 (2000) 1893-1899; with barriers as at the
     head of this module.
@@ -48,12 +50,19 @@ class DynamicSurface:
     filter: Leaf = leaf("s", sign="positive")
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
     barrier: Barrier = Integral()
+    weight: Leaf = leaf("N m rad", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
+    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
 
     def check(self) -> None:
-        """Raises ValueError for something that is no barrier; fits `o` to it."""
+        """Raises ValueError for something that is no barrier; completes `o` and `weight`."""
         checks.conforms("DynamicSurface.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().", CLAIMS)
         fit_o(self)
+        fit_weight(self)
+
+    def leaf_units(self) -> dict[str, str]:
+        """The unit of the weight, which depends on the barrier."""
+        return {"weight": weight_unit(self.barrier)}
 
     def _alpha(self, t: jax.Array, q: jax.Array, setting: Setting) -> jax.Array:
         """Alpha, (n,) [rad/s]."""
@@ -70,6 +79,7 @@ class DynamicSurface:
         tube, model, beta = setting.tube(t), setting.model, state
         dbeta = (self._alpha(t, q, setting) - beta) / self.filter
         feedforward = model.coriolis(q, dq, beta) + model.gravity(q) + matvec(model.mass_matrix(q), dbeta)
-        tau = feedforward - f_hat - self.K2 * (dq - beta) - self.barrier.slope(tube, q)
+        tau = feedforward - f_hat - self.K2 * (dq - beta) - self.weight * self.barrier.slope(tube, q)
         guard_active = guard_is_active(tube, q, self.barrier.guard)
-        return Command(tau, beta, self.barrier.value(tube, q), guard_active, jnp.zeros_like(guard_active)), dbeta
+        value = self.weight * self.barrier.value(tube, q)
+        return Command(tau, beta, value, guard_active, jnp.zeros_like(guard_active)), dbeta

@@ -19,6 +19,9 @@ lambda = lambda_min(M0), the loop with a momentum observer obeys
 
 what stands in brackets is for f' != 0 (case 2).
 
+A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 replaces s1 in (F.1), the cross term cancels as
+before, and all claims hold with this V1.
+
 The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and K_l differ: there the torque jumps by
 M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation asks for.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
 """
@@ -31,18 +34,26 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.barriers import Barrier, Integral
-from iblf_jax.barriers._base import CLAIMS, guard_is_active
+from iblf_jax.barriers._base import CLAIMS, guard_is_active, value_unit
 from iblf_jax.bounds import Tube
 from iblf_jax.controllers._base import Command, Setting
-from iblf_jax.controllers.backstepping import alpha_and_rate
+from iblf_jax.controllers.backstepping import alpha_and_rate, fit_weight
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
 
+WEIGHT_UNITS = {
+    ("1", "1"): "1",
+    ("rad^2", "1"): "1/rad^2",
+    ("1", "rad^2"): "rad^2/s^2",
+    ("rad^2", "rad^2"): "1/s^2",
+}
+"""Units of V1 and of phi's barrier on positions -> unit of the weight, with which w V1 has the unit of phi."""
+
 
 @component
 class FullState:
-    """tau = C0 q' + G0 + M0 (a2 - s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for the integral barrier.
+    """tau = C0 q' + G0 + M0 (a2 - w s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for the integral barrier.
 
     It keeps the scenario's `velocity_bounds` too, as long as alpha is inside them (`alpha_margin` > 0); symbols at the head of this
     module.  Its V1 is that of e1 and that of e2.  Symmetric constant bounds with p = 1 logarithms on both are the barriers of the source.
@@ -56,6 +67,8 @@ class FullState:
         not given.
       barrier: on e1, any `Barrier`; `Integral()` if not given.
       velocity_barrier: on e2, any `Barrier` whose slope falls with e2 itself (not `Log` with p > 1); `Integral()` if not given.
+      weight: w of the V1 of e1, () or (n,) [1], > 0; 1 if not given.  Where V1 is in rad^2 its unit has 1/rad^2 besides, where phi is in
+        rad^2/s^2 it has rad^2/s^2.
 
     Source: W. He, Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (symmetric, constant, logarithms); asymmetric, time-varying
     and for any barrier as derived at the head of this module.
@@ -67,12 +80,14 @@ class FullState:
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
     barrier: Barrier = Integral()
     velocity_barrier: Barrier = Integral()
+    weight: Leaf = leaf("1", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
+    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     needs_velocity_bounds: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raises ValueError for something that is no barrier, or one that cannot stand on velocities; fits `o` to the two."""
+        """Raises ValueError for something that is no barrier, or one that cannot bound velocities; completes `o` and `weight`."""
         for name in ("barrier", "velocity_barrier"):
             checks.conforms(f"FullState.{name}", getattr(self, name), Barrier, "Such as iblf_jax.barriers.Integral().", CLAIMS)
         if _ratio_of(self.velocity_barrier) is None:
@@ -83,6 +98,11 @@ class FullState:
             object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
         if not any(uses_o) and self.o is not None:
             raise checks.fail("FullState.o", self.o, "None with these barriers", "Neither has a kappa; leave `o` out.")
+        fit_weight(self)
+
+    def leaf_units(self) -> dict[str, str]:
+        """The unit of the weight, by those of V1 and phi."""
+        return {"weight": WEIGHT_UNITS[value_unit(self.barrier), value_unit(self.velocity_barrier)]}
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
         """No state."""
@@ -102,11 +122,11 @@ class FullState:
         first, second = self.barrier, self.velocity_barrier
         a2 = second.virtual_velocity(inner, dq, self.K2, self.o)
         ratio: Any = second.error_over_slope(inner, dq)
-        crossed = first.slope(outer, q) * ratio
+        crossed = self.weight * first.slope(outer, q) * ratio
         wanted = a2 - crossed - self.c * second.slope(inner, dq)
         tau = model.coriolis(q, dq, dq) + model.gravity(q) + matvec(model.mass_matrix(q), wanted) - f_hat
         guard_active = guard_is_active(outer, q, first.guard) | guard_is_active(inner, dq, second.guard)
-        value = first.value(outer, q) + second.value(inner, dq)
+        value = self.weight * first.value(outer, q) + second.value(inner, dq)
         return Command(tau, inner.q_d, value, guard_active, jnp.zeros_like(guard_active)), ()
 
 

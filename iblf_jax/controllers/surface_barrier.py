@@ -33,7 +33,8 @@ class SurfaceBarrier:
 
     Args:
       a: rate of the surface, () or (n,) [1/s], > 0.
-      K: gain, () or (n,) [N m rad/s], > 0 (N m s/rad for a barrier whose V1 is in rad^2/s^2).
+      K: gain, () or (n,) [N m rad/s], > 0 (N m s/rad for a barrier whose V1 is in rad^2/s^2).  It is the weight of the barrier too, so
+        there is no other.
       surface: bounds of sigma [rad/s]; its reference is 0, so a `Funnel` on either side shrinks onto 0.  Where a run starts
         outside, the barrier's guard is at work, `Status.GUARD_ACTIVE`.
       barrier: on sigma, any `Barrier`; `PrescribedPerformance()` if not given.

@@ -57,7 +57,9 @@ governor around the yardstick "pd", a safety filter around the unconstrained "ba
 _WITHOUT_OBSERVER = ("adaptive_rbf", "pd", "reference_governor")
 
 
-def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, reading: str = "printed", p: int = 1) -> Controller:
+def law_by_name(
+    name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, reading: str = "printed", p: int = 1, weight: Any = 1.0
+) -> Controller:
     """The law of a system.
 
     Args:
@@ -67,6 +69,7 @@ def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, readi
       o: margin under the root of kappa (3.7), () or (n,) [1/s^2], for the barriers that use it.
       reading: "printed" or "corrected", for the backstepping laws.
       p: exponent of the logarithmic barrier.
+      weight: of the barrier, () or (n,), of the laws that have one; in the unit that the law states.
 
     Raises:
       ValueError: an unknown name or reading.
@@ -75,17 +78,18 @@ def law_by_name(name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, readi
     if name in YARDSTICKS:
         return YARDSTICKS[name]()
     if name == "adaptive_rbf":
-        return AdaptiveRBF(k1=k1, K2=K2, o=o, barrier=barriers.Log(p=p))
+        return AdaptiveRBF(k1=k1, K2=K2, o=o, barrier=barriers.Log(p=p), weight=weight)
     if name == "dynamic_surface":
-        return DynamicSurface(k1=k1, K2=K2, o=o, filter=FILTER)
+        return DynamicSurface(k1=k1, K2=K2, o=o, filter=FILTER, weight=weight)
     if name == "full_state":
-        return FullState(k1=k1, K2=K2, c=DAMPING, o=o)
+        return FullState(k1=k1, K2=K2, c=DAMPING, o=o, weight=weight)
     if name == "reference_governor":
         return ReferenceGovernor(law=YARDSTICKS["pd"](), eta=SPEED)
     if name == "safety_filter":
-        return SafetyFilter(law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading), nearest="acceleration")
+        return SafetyFilter(law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight), nearest="acceleration")
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
-    return Backstepping(k1=k1, K2=K2, o=o if getattr(barrier, "uses_o", True) else None, barrier=barrier, reading=reading)
+    o = o if getattr(barrier, "uses_o", True) else None
+    return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, reading=reading, weight=weight)
 
 
 def observer_of(name: str, usual: Observer) -> Observer:

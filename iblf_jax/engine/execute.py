@@ -27,7 +27,7 @@ from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
-from iblf_jax.engine.mechanism import Mechanism, mechanism_of
+from iblf_jax.engine.mechanism import Mechanism, known_of
 from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, Run, TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.lowering.packed import Shapes
@@ -398,7 +398,7 @@ def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps:
     Returns:
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
-    return _run_from(scenario, dt, carry, step=step, run=Run(steps, mechanism=mechanism_of(scenario) if automatic()[0] != "xla" else None))
+    return _run_from(scenario, dt, carry, step=step, run=Run(steps, mechanism=known_of(scenario) if automatic()[0] != "xla" else None))
 
 
 @partial(jax.jit, static_argnames=("step", "run"))

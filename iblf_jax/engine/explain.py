@@ -14,7 +14,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import automatic, inputs_of
 from iblf_jax.engine.executors import program_of
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.step import Run, TimeStep
 from iblf_jax.lowering.operations import OPERATIONS
 from iblf_jax.lowering.passes import written_out
@@ -85,7 +85,7 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
     noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
-    one = Batch.of(inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), Run(1), None), leaves | noise, mechanism=mechanism_of(scenario))
+    one = Batch.of(inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), Run(1), None), leaves | noise, mechanism=known_of(scenario))
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)

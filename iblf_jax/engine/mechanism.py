@@ -1,8 +1,9 @@
-"""What of a robot's mechanism is compiled in: which numbers of its geometry are 0, 1 or -1, and which are equal to others.
+"""What is compiled in: which numbers of a robot's geometry are 0, 1 or -1, which are equal to others, and which factors of a law are 1.
 
 Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree.  A scalar program that knows it needs fewer
 operations.  Numbers themselves are never compiled in, nor anything of masses, gains and loads, so new ones compile nothing: a robot says
-which these are (`geometry_fields`).  What differs between runs is not shared, and nothing is known of it.
+which these are (`geometry_fields`).  A law has factors that are mostly 1, such as the weight of a barrier (`unit_factors`): one that is 1
+costs nothing.  What differs between runs is not shared, and nothing is known of it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import layers
 from iblf_jax.lowering.program import Known
 from iblf_jax.simulation.scenario import Scenario
 
@@ -42,15 +44,15 @@ class Mechanism(NamedTuple):
         return tuple(found)
 
 
-def _geometry(robot: Any) -> tuple[str, ...]:
-    """The fields that a class of robots says may be compiled in."""
-    names = getattr(type(robot), "geometry_fields", ())
+def _declared(part: Any, attribute: str) -> tuple[str, ...]:
+    """The fields of which a class declares that they may be compiled in; none where users have a field of that name."""
+    names = getattr(type(part), attribute, ())
     return names if isinstance(names, tuple) and all(isinstance(name, str) for name in names) else ()
 
 
 def mechanism_of(scenario: Scenario) -> Mechanism | None:
-    """What is known of a scenario's numbers; None where they are tracers, or no robot has a geometry."""
-    robots = {name: _geometry(getattr(scenario, name)) for name in ("plant", "model")}
+    """What is known of the numbers of a scenario's robots; None where they are tracers, or no robot has a geometry."""
+    robots = {name: _declared(getattr(scenario, name), "geometry_fields") for name in ("plant", "model")}
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
     numbers: list[Known | None] = []
@@ -73,6 +75,39 @@ def mechanism_of(scenario: Scenario) -> Mechanism | None:
         else:
             numbers += [None] * int(np.size(leaf))
     return Mechanism(tuple(numbers))
+
+
+def known_of(scenario: Scenario) -> Mechanism | None:
+    """What is known of a scenario's numbers, robots' and law's; None where nothing is.
+
+    Of the law: which entries of its `unit_factors` are 1.
+    """
+    mechanism = mechanism_of(scenario)
+    factors = _factors(scenario)
+    if not any(np.any(np.asarray(factor) == 1.0) for factor in factors.values()):
+        return mechanism
+    numbers: list[Known | None] = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
+        factor = factors.get(tuple(getattr(key, "name", "") for key in path))
+        if factor is None:
+            numbers += [None] * int(np.size(leaf))
+            continue
+        numbers += [Known(1.0) if x == 1.0 else None for x in np.ravel(factor)]
+    if mechanism is None:
+        return Mechanism(tuple(numbers))
+    both = zip(mechanism.numbers, numbers, strict=True)
+    return Mechanism(tuple(known if known is not None else of_law for known, of_law in both))
+
+
+def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
+    """The factors of a scenario's law that may be compiled in where they are 1, by where they are, but for tracers."""
+    path: tuple[str, ...] = ("controller",)
+    found: dict[tuple[str, ...], Any] = {}
+    for law in layers(scenario.controller):
+        for name in _declared(law, "unit_factors"):
+            found[*path, name] = getattr(law, name)
+        path = (*path, getattr(type(law), "wraps", ""))
+    return {names: factor for names, factor in found.items() if checks.is_concrete(factor)}
 
 
 def _known(x: float, before: np.ndarray, start: int) -> Known | None:

@@ -14,7 +14,8 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.execute import run_one
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.limiting_term import limiting_term
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
@@ -112,7 +113,7 @@ def simulate_unchecked(
     """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has drawn."""
     run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_one(scenario, folds, dt, run._replace(mechanism=mechanism_of(scenario)), backend=backend, noise=noise)
+        outcome = run_one(scenario, folds, dt, run._replace(mechanism=known_of(scenario)), backend=backend, noise=noise)
     else:
         outcome = run_transformable(scenario, folds, dt, run, backend=backend, noise=noise)
     arrays, controller_state, observer_state, actuator_state, measured = outcome.records
@@ -176,7 +177,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         limit = tableau(result.method).stability / mode
         texts.append(
             f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to dt = {limit:.3g} s only; "
-            f"dt = {float(result.dt):g} s was asked for. Take dt={comfortable_dt(mode):g}, or lower controller.K2 or observer.kf."
+            f"dt = {float(result.dt):g} s was asked for. Take dt={comfortable_dt(mode):g}{_or_change(result)}."
         )
     elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
@@ -190,8 +191,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     if status & Status.SAMPLING_TOO_SLOW:
         texts.append(
             f"From one period to the next the loop grows, by {float(metrics[RADIUS]):.4g} at the worst of the instants that were looked "
-            "at. Sample faster (ij.recommended_period says how fast), shorten the delay, or lower controller.K2, observer.kf or the gains "
-            "of the velocity's filter."
+            f"at. Sample faster (ij.recommended_period says how fast){_or_change(result)}."
         )
     if status & Status.FILTER_INFEASIBLE:
         worst = f"{float(np.max(result.slack)):.3g} rad/s^2 (run.slack)"
@@ -224,6 +224,12 @@ def _smaller_step(result: Rollout, steps: int) -> str:
         return f"dt={find_dt(result.scenario, duration=duration, method=result.method):g}"
     except ValueError:  # the run is too long for a step to be tried
         return "a smaller one"
+
+
+def _or_change(result: Rollout) -> str:
+    """What else to change, the one term that limits the loop of a run, as the end of a sentence; empty where there is no such term."""
+    limit = limiting_term(result) if checks.is_concrete(result.scenario) else None
+    return "" if limit is None else f", or {limit.advice}: of all terms {limit.term.words} limits this loop"
 
 
 def _called(result: Rollout, joint: int) -> str:

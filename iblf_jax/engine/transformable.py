@@ -26,7 +26,7 @@ from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.executors import scan
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.step import Outcome, Run, recorded
 from iblf_jax.lowering.program import UnsupportedError
 from iblf_jax.lowering.toolchain import ToolchainError
@@ -59,7 +59,7 @@ def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *
     """
     leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run, noise))
     name, reason = execute.automatic()
-    runs = Runs(treedef, run._replace(mechanism=mechanism_of(scenario)), name, (False,) * len(leaves))
+    runs = Runs(treedef, run._replace(mechanism=known_of(scenario)), name, (False,) * len(leaves))
     return _differentiable(runs)(*leaves) if backend != "xla" and reason is None else _plain(runs, *leaves)
 
 
@@ -113,7 +113,7 @@ def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
-        run = runs.run._replace(mechanism=mechanism_of(inputs.scenario))
+        run = runs.run._replace(mechanism=known_of(inputs.scenario))
         return execute.run_one(inputs.scenario, inputs.folds, inputs.dt, run, noise=inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 

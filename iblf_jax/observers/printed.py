@@ -71,7 +71,8 @@ def kf_advice(kf: jax.Array) -> list[str]:
     if not checks.is_concrete(kf) or bool(np.all(np.asarray(kf) > 0.5)):
         return []
     need = "Theorem 2 needs kf > 1/2 on every joint (3.17), and kf > 1 where f changes (3.25)"
-    return [f"observer.kf = {kf}: {need}; below it nothing is claimed. Raise kf."]
+    rest = "the corrected law with a momentum observer has the weighted claim of ij.certify for every kf > 0"
+    return [f"observer.kf = {kf}: {need}, for the paper's envelope of V2. Below it that envelope is lost: {rest}."]
 
 
 def held_eta(observer, t, q, dq, tau, model: Robot, state: jax.Array, period: jax.Array) -> jax.Array:

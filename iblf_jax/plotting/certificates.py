@@ -143,7 +143,9 @@ def _mark_held(panels: Any, traces: Traces) -> None:
 def _verdicts(axes: Axes, shown: Certificate) -> None:
     """The lines that were checked along the run, with their verdicts."""
     axes.set_axis_off()
-    named = ("K2", "kf", "own", "inequality", "envelope", "xi", "e2", "f_tilde", "joints")
+    named: tuple[str, ...] = ("K2", "kf", "own", "inequality", "envelope", "xi", "e2", "f_tilde", "joints")
+    if not any(line.name.startswith("inequality") and line.verdict != "not applicable" for line in shown.lines):
+        named = (*named, "weighted")  # the paper's own claim does not apply
     growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]
     lines = [line for line in shown.lines if line.name.startswith(named) and line.verdict != "not applicable" and line.counts]
     for row, line in enumerate(lines):

@@ -7,9 +7,14 @@ neither the network nor a parser of robot descriptions.
 proportion to its inertia.  The inertia of a wrist is a thousandth of a shoulder's, so one number for all joints will not do: the loop's
 modes are about K2 / M, and
 
-    K2_i = max(rate M_ii(q), least),   least > 1/2 for Theorem 2,
+    K2_i = rate min(sum_j |M_ij(q)|, 4 M_ii(q))
 
-makes them about `rate` on every joint.
+makes them `rate` on a joint that moves by itself and up to four times that where heavier joints push it, which is what a light wrist at the
+end of an arm needs.  The slope of the barrier is a spring besides, of stiffness w ds/de1, whatever K2 is.  With
+
+    w_i = min(1, M_ii (rate/2)^2 / max_t ds_i/de1(e1 = 0))
+
+that spring with a damper rate M_ii is at most critically damped at the reference, and light joints can be sampled; 1 is the paper's weight.
 """
 
 from __future__ import annotations
@@ -26,6 +31,8 @@ import numpy as np
 
 from iblf_jax import bounds as bounds_
 from iblf_jax import disturbances, references
+from iblf_jax.barriers import Barrier
+from iblf_jax.barriers._base import CLAIMS
 from iblf_jax.bounds import Bounds
 from iblf_jax.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
 from iblf_jax.controllers.systems import observer_of
@@ -36,13 +43,19 @@ from iblf_jax.observers import Momentum, Printed
 from iblf_jax.references import Reference
 from iblf_jax.robots import Arm, Robot
 from iblf_jax.robots._base import mass_matrix_at
-from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 
 ARMS = ("ur5", "iiwa14")
 """The arms that come with the package."""
 
+RATE = 25.0
+"""1/s.  The modes of the velocity errors on every joint of `arm_scenario`."""
+COUPLED = 4.0
+"""How much above rate M_ii the gain of a joint may be for the inertia that couples it to others [1]."""
 LEAST_K2 = 0.6
-"""N m s/rad; above the 1/2 of Theorem 2 (3.17)."""
+"""N m s/rad; above the 1/2 of Theorem 2 (3.17), for claims with the paper's own weights."""
+TIMES = np.linspace(0.0, 20.0, 81)
+"""Times at which tubes are looked at for where they are narrowest [s]."""
 
 
 def arm(name: str) -> Arm:
@@ -67,14 +80,14 @@ def _start_of(reference: Reference) -> jax.Array:
     return reference.position(jnp.zeros(()))
 
 
-def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST_K2) -> jax.Array:
+def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = LEAST_K2) -> jax.Array:
     """K2_i = max(rate M_ii(q), least), (n,) [N m s/rad]: about `rate` for the loop's modes on every joint.
 
     Args:
       robot: of n joints.
       q: a position that is typical of the motion, (n,) [rad].
       rate: [1/s].
-      least: smallest entry [N m s/rad].
+      least: smallest entry, one number or one a joint [N m s/rad].
     """
     checks.conforms("robot", robot, Robot)
     given = {name: checks.as_floats(name, x) for name, x in (("q", q), ("rate", rate), ("least", least))}
@@ -84,6 +97,59 @@ def inertial_gain(robot: Robot, q: Any, rate: float = 25.0, least: float = LEAST
             raise checks.fail(name, given[name], f"one number, or {robot.n} (one a joint)")
     inertia = jnp.diagonal(mass_matrix_at(robot, given["q"].astype(jnp.result_type(float))))
     return jnp.maximum(given["rate"] * inertia, given["least"])
+
+
+def _coupled_gain(robot: Robot, q: jax.Array) -> jax.Array:
+    """The gain rate min(sum_j |M_ij(q)|, 4 M_ii(q)), (n,) [N m s/rad]."""
+    M = mass_matrix_at(robot, q.astype(jnp.result_type(float)))
+    return RATE * jnp.minimum(jnp.sum(jnp.abs(M), axis=1), COUPLED * jnp.diagonal(M))
+
+
+def inertial_weight(robot: Robot, reference: Reference, bounds: Bounds, barrier: Barrier, rate: float = RATE) -> jax.Array:
+    """The weight of the barrier with which its slope suits the inertia of each joint, and at most the paper's 1.
+
+        w_i = min(1, M_ii(q) (rate/2)^2 / max_t ds_i/de1),   at e1 = 0 and q = q_d(0)
+
+    The slope acts as a spring of stiffness w ds/de1.  With K2 = rate M_ii it is then at most critically damped at the reference, on
+    joints of any inertia and in tubes of any width.
+
+    Args:
+      robot: whose inertia counts, of n joints.
+      reference: what it follows.
+      bounds: of its joints.
+      barrier: any `Barrier`.
+      rate: of `inertial_gain` [1/s].
+
+    Returns:
+      (n,), in the unit of the law's `weight`.
+
+    Raises:
+      ValueError: something that is no robot, reference, bounds or barrier; a rate that is not positive.
+
+    Source: this package.
+    """
+    checks.conforms("robot", robot, Robot)
+    checks.conforms("reference", reference, Reference)
+    checks.conforms("barrier", barrier, Barrier, optional=CLAIMS)
+    if not isinstance(bounds, Bounds):
+        raise checks.fail("bounds", bounds, "a Bounds", "Such as Bounds(lower=Constant(0.1), upper=Constant(0.9)).")
+    rate = checks.positive_number("rate", rate, "1/s")
+    reference, bounds = (fit_joints(part, robot.n, name) for part, name in ((reference, "reference"), (bounds, "bounds")))
+    inertia = jnp.diagonal(mass_matrix_at(robot, _start_of(reference)))
+    needed = inertia * (0.5 * rate) ** 2 / _stiffness(barrier, reference, bounds, jnp.asarray(TIMES, inertia.dtype))
+    return jnp.minimum(needed, 1.0)
+
+
+@jax.jit
+def _stiffness(barrier: Barrier, reference: Reference, bounds: Bounds, times: jax.Array) -> jax.Array:
+    """The largest ds/de1 of each joint at e1 = 0 and these times, (n,); where a tube is closed it does not count."""
+
+    def at(t):
+        tube = bounds_.tube_at(reference, bounds, t, acceleration=False)
+        stiffness = jax.jvp(lambda q: barrier.slope(tube, q), (tube.q_d,), (jnp.ones_like(tube.q_d),))[1]
+        return jnp.where((tube.k_l > 0) & (tube.k_u > 0), stiffness, 0.0)
+
+    return jnp.max(jax.vmap(at)(times), axis=0)
 
 
 def arm_scenario(
@@ -99,7 +165,8 @@ def arm_scenario(
 ) -> Scenario:
     """A scenario on an arm, with what follows from the arm's own numbers: bounds, saturation, gains.
 
-    k1 = 2, K2 as `inertial_gain`, kf = 20; the law within the arm's `effort`; bounds at its joint limits; a start on the reference at rest.
+    k1 = 2, K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, the barrier's weight as `inertial_weight`, kf = 20; the law within the
+    arm's `effort`; bounds at its joint limits; a start on the reference at rest.
 
     Args:
       robot: with `limits` and `effort`, such as `iblf_jax.robots.load` gives; it is the plant.
@@ -124,16 +191,22 @@ def arm_scenario(
     checks.conforms("reference", reference, Reference)
     keep_programs()
     start = _start_of(reference)
-    K2 = inertial_gain(robot if model is None else model, jnp.broadcast_to(start, (robot.n,)) if jnp.ndim(start) == 0 else start)
+    known = robot if model is None else model
+    bounds = bounds if bounds is not None else bounds_.from_limits(robot)
+    q = jnp.broadcast_to(start, (robot.n,)) if jnp.ndim(start) == 0 else start
+    K2 = inertial_gain(known, q, least=_coupled_gain(known, q))
     if law == "pd":  # its gains by name are for one size of joint
         controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)
     else:
         controller = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
+    if "weight" in getattr(type(controller), "unit_factors", ()):
+        weight = inertial_weight(known, reference, bounds, controller.barrier)  # type: ignore[attr-defined]
+        controller = dataclasses.replace(controller, weight=weight)  # type: ignore[type-var]
     return Scenario(
         plant=robot,
         model=model,  # type: ignore[arg-type]
         reference=reference,
-        bounds=bounds if bounds is not None else bounds_.from_limits(robot),
+        bounds=bounds,
         disturbance=disturbance if disturbance is not None else Nothing(),
         controller=within_effort(controller, robot),
         observer=observer_of(law, (Printed if reading == "printed" else Momentum)(kf=20.0)),

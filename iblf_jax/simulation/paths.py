@@ -87,6 +87,7 @@ def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = N
             yield from _walk(x, f"{path}[{i}]", named, units)
     elif dataclasses.is_dataclass(part) and not isinstance(part, type):
         own = {field.name for field in dataclasses.fields(part)}
+        of_leaves = {**_own_units(part), **units}
         for field in dataclasses.fields(part):
             if field.metadata.get("static"):
                 continue
@@ -98,7 +99,7 @@ def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = N
                     yield inner if parse(rest)[0] not in own else inner._replace(path=f"{name}.{rest}")
                 continue
             if isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-                yield Parameter(name, jnp.shape(value), _unit(field, units), value)
+                yield Parameter(name, jnp.shape(value), _unit(field, of_leaves), value)
             else:
                 yield from _walk(value, name, named, {**units, **field.metadata.get("units", {})})
         if named:
@@ -108,6 +109,11 @@ def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = N
 def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
     """The unit of a leaf: its own, unless what holds it says otherwise (`units` among the metadata of its field)."""
     return str(units.get(field.name, field.metadata.get("unit", "")))
+
+
+def _own_units(part: Any) -> Mapping[str, str]:
+    """Units of a component's leaves that depend on its other fields, by name."""
+    return part.leaf_units() if hasattr(part, "leaf_units") else {}
 
 
 def _rows(part: Any, path: str) -> Iterator[Parameter]:
@@ -210,7 +216,7 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
             part = part[token] if isinstance(part, tuple | list) else part
         else:
             field = next(f for f in dataclasses.fields(part) if f.name == token)
-            metadata = {**field.metadata, "unit": _unit(field, units)}
+            metadata = {**field.metadata, "unit": _unit(field, {**_own_units(part), **units})}
             units |= field.metadata.get("units", {})
             part = getattr(part, token)
     return metadata

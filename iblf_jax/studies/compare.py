@@ -26,7 +26,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import Run
 from iblf_jax.observers import NoObserver
@@ -211,7 +211,7 @@ def _trials_of(scenario: Scenario, names: Sequence[str], options: Mapping[str, A
     dtype, size = scenario.initial.q.dtype, len(grid())
     folds = as_folds((AboveGravity(),), dtype, scenario)
     steps = checks.whole_steps(options["duration"], options["dt"])
-    run = Run(steps, options["method"], mechanism=mechanism_of(scenario))
+    run = Run(steps, options["method"], mechanism=known_of(scenario))
     noise = noise_of(scenario, jax.random.PRNGKey(0), 0)
 
     def trials(factors: np.ndarray) -> Trials:

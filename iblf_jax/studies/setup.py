@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
@@ -96,7 +96,7 @@ def prepare(
         shapes = sample_size(targets, by_path)
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
-    study_run = StudyRun(targets, steps, method, backend, mechanism_of(scenario))
+    study_run = StudyRun(targets, steps, method, backend, known_of(scenario))
     shared = StudyInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), folds, step)
     setup = StudySetup(study_run, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
     return dataclasses.replace(setup, study_run=with_chosen_backend(study_run, shared, setup.lanes(np.arange(block_size()))))

@@ -31,7 +31,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import Run
@@ -157,7 +157,7 @@ def falsify(
     one: Any = 1.0
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
-    run, unit = Run(steps, method, mechanism=mechanism_of(scenario)), DEFICITS[peak.signal]
+    run, unit = Run(steps, method, mechanism=known_of(scenario)), DEFICITS[peak.signal]
     push = partial(_push, cube, astype(peak, dtype), jnp.asarray(dt, dtype), run=run, backend=backend)
     searcher = Newton(Box(np.full(cube.size, 0.5), np.zeros(cube.size), np.ones(cube.size)), TOLERANCE, FIRST_RADIUS)
     state, best, history = searcher.init(cube.admissible_points(starts, [seed, 3])), None, []

@@ -15,7 +15,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import BACKENDS, differentiates_forward, values_together
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -299,7 +299,7 @@ def build(scenario, parameters, objective, perturbations, runs: int, seed: int, 
     ones = complete(goal, np.ones(len(goal.terms)))
     shares = tuple(float(r.allowed) for r in goal.requirements)
     ones, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), (ones, by_path, timing["dt"]))
-    backend, mechanism = timing.get("backend", "auto"), mechanism_of(scenario)
+    backend, mechanism = timing.get("backend", "auto"), known_of(scenario)
     pieces = piece_counts(ones, scenario, float(timing["duration"]))
     formulation = Formulation(blocks, targets, steps, timing["method"], risk, shares, levels, backend, mechanism=mechanism, pieces=pieces)
     inputs = ProblemInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), ones, step)

@@ -133,7 +133,7 @@ def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple
     highs = default_highs(scenario, open_ended, dt, method)
     blocks, parts, reasons, start = [], [], [], 0
     for item, (value, log, sign) in zip(wanted, starts, strict=True):
-        low, below = default_low(item.path, sign) if item.low is None else (item.low, GIVEN)
+        low, below = default_low(item.path, sign, value) if item.low is None else (item.low, GIVEN)
         high, above = highs.get(item.path, (item.high, GIVEN))
         block, part = _one(item, value, _limit(item, "low", low, value), _limit(item, "high", high, value), start, log)
         blocks.append(block)

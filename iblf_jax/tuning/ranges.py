@@ -1,6 +1,7 @@
 """Default ranges of what is tuned: within the conditions of Theorem 2, and within what step, period and drive can bear.
 
-Below, k1 > 0, K2 > 1/2, kf > 1.  Above, a gain x may grow to f x0, f <= MOST, while the loop at the start and along its reference keeps
+Below, k1 > 0, K2 > 1/2, kf > 1, for a leaf whose entries all start there, else its sign.  Above, a gain x may grow to f x0, f <= MOST,
+while the loop at the start and along its reference keeps
 
     dt |lambda|_max <= SHARE * (the integrator's stability range)                  where the law runs all the time,
     rho(map from a period to the next) < 1                                         where it is sampled,
@@ -51,10 +52,10 @@ NOISE = "beyond it the sensor's noise asks for more torque, or a higher rate of 
 TOGETHER = ", with all gains at their upper ends"
 
 
-def default_low(path: str, sign: str | None) -> tuple[float, str]:
-    """The lower end of a leaf's range, and what set it."""
+def default_low(path: str, sign: str | None, start: np.ndarray) -> tuple[float, str]:
+    """The lower end of the range of a leaf that starts at `start`, and what set it."""
     leaf = re.sub(r"(\[\d+\])+$", "", path)
-    if leaf in CONDITIONS:
+    if leaf in CONDITIONS and np.all(start >= CONDITIONS[leaf]):
         return CONDITIONS[leaf], THEOREM
     return (0.0, SIGN) if sign in ("positive", "nonnegative") else (-np.inf, NONE)
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from iblf_jax.core import checks, devices
 from iblf_jax.core.status import Status
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import fresh_together
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation import paths
@@ -253,7 +253,7 @@ def _run(
     dtype, (targets, by_path) = first.initial.q.dtype, targets_of(first, perturbations or {})
     by_path, objective, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, objective, timing["dt"]))
     cases = Cases(first, by_path, jax.random.PRNGKey(seed))
-    run = Run(checks.whole_steps(timing["duration"], timing["dt"]), timing["method"], mechanism=mechanism_of(first))
+    run = Run(checks.whole_steps(timing["duration"], timing["dt"]), timing["method"], mechanism=known_of(first))
     points = {path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios]) for path in tuned}
     index, of = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios)), np.repeat(np.arange(len(scenarios)), runs or 1)
     parts = []

@@ -14,7 +14,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import values_together
 from iblf_jax.engine.simulate import simulate_unchecked
 from iblf_jax.engine.step import Run
@@ -274,7 +274,7 @@ class TuneResult:
         setup, scenario = self.setup, canonical(self.scenario)
         dtype = scenario.initial.q.dtype
         folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario)
-        run = Run(checks.whole_steps(setup.duration, setup.dt), setup.method, mechanism=mechanism_of(scenario))
+        run = Run(checks.whole_steps(setup.duration, setup.dt), setup.method, mechanism=known_of(scenario))
         outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), run=run, backend=setup.backend)
         values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
         valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
