@@ -22,6 +22,7 @@ class Quadratic:
 
     guard: ClassVar[float] = -math.inf
     uses_o: ClassVar[bool] = False
+    ratio_jumps: ClassVar[bool] = False
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

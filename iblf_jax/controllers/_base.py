@@ -76,6 +76,11 @@ class Controller(Protocol):
     `filters = True` if its commands have a `slack`; `wraps`, the name of the field that holds another law whose paths are then its own
     ("controller.K2" reaches through).  And methods: `advice()`, a list of warnings, and `check_start(setting)`, which raises
     ValueError for what does not fit together where the number of joints is known.
+
+    A law whose command jumps declares where: `switching(t, q, dq, setting, state)` returns (m,) functions of q or q', and the command
+    jumps where one of them crosses 0 (as sliding-mode laws do, or `FullState` with some barriers).  The derivatives of a run then contain
+    what such a jump does to a perturbation (`engine.switching`); without the method they leave it out.  A law that wraps another
+    passes the call on with `switching_functions`.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
@@ -93,3 +98,9 @@ class Controller(Protocol):
           state: the law's own state.
         """
         ...
+
+
+def switching_functions(law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+    """The functions at whose zeros a law's command jumps, (m,), or None if it declares none; arguments as `Controller.command`."""
+    declared = getattr(law, "switching", None)
+    return None if declared is None else declared(t, q, dq, setting, state)

@@ -29,6 +29,7 @@ from iblf_jax.simulation import accuracy, integrators, sampling, stability
 from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
+from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 
 
 class Run(NamedTuple):
@@ -233,6 +234,8 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         folds, dt, sample = inputs.folds, inputs.dt, stepped.first
         begun = _begun_at(index, folds, sample, carry.accumulators)
         accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
+        if scenario.sampling is None:
+            stepped, accumulators = _across_jumps(inputs, carry.state, method, stepped, begun, accumulators)
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
         here = Nearest(near, sample.t, jax.lax.stop_gradient(surroundings(carry.state)))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
@@ -246,6 +249,51 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         return Advanced(Carry(after, accumulators, status, nearest, estimate), sample, begun, carry.state)
 
     return form.piece(folded_in)(inputs, carry._replace(state=state), index, goes_on, stepped, pieces)
+
+
+def _across_jumps(
+    inputs: Inputs, before: LoopState, method: str, stepped: integrators.Stepped, begun: tuple, accumulators: tuple
+) -> tuple[integrators.Stepped, tuple]:
+    """A step and the accumulators after it, with their derivatives across jumps of the command; values stay as they are.
+
+    Args:
+      inputs: of the run.
+      before: state at the start of the step.
+      method: the integrator.
+      stepped: the step.
+      begun, accumulators: of the folds, before and after its sample.
+    """
+    scenario, dt, t = inputs.scenario, inputs.dt, stepped.first.t
+
+    def rate(t, state):
+        return evaluate(scenario, t, state, dt)
+
+    def gains_of(sample):
+        def sums(weight):
+            weighed = dataclasses.replace(sample, dt=weight)
+            folded = zip(inputs.folds, begun, strict=True)
+            return _split_floats(tuple(fold.update(acc, weighed) for fold, acc in folded))[0]
+
+        return jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+
+    floats, replaced = _split_floats(accumulators)
+    loop = Loop(scenario, rate, gains_of)
+    after, floats = with_hybrid_derivative(loop, method, t, before, dt, stepped, floats)
+    return stepped._replace(state=after), replaced(floats)
+
+
+def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
+    """The floating-point numbers of a tree, and the function that puts others in their place."""
+    leaves, treedef = jax.tree.flatten(tree)
+    places = [i for i, x in enumerate(leaves) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+
+    def replaced(floats):
+        new = list(leaves)
+        for i, x in zip(places, floats, strict=True):
+            new[i] = x
+        return jax.tree.unflatten(treedef, new)
+
+    return [leaves[i] for i in places], replaced
 
 
 def recorded(folds: Any, begun: tuple, sample: Sample, state: LoopState):
