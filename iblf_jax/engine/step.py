@@ -330,7 +330,7 @@ class Probed(NamedTuple):
     growth: stability.Growth
     """Of the power iteration."""
     jacobian: jax.Array
-    """By the numbers that `accuracy` watches, (m', m') [1/s]."""
+    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s]; `stability.resolved` makes one of them."""
     unseen: accuracy.Unseen
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass matrix."""
 
@@ -347,20 +347,31 @@ class Probe:
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
         watched, whole, x = accuracy.places(start), ravel_pytree(surroundings(start))[1], carry.state
-        iteration = index - watched.size
+        iteration = index - 3 * watched.size
+        count = jnp.asarray(watched.size, index.dtype)
+        level, number = jax.lax.div(index, count), jax.lax.rem(index, count)
         rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
-        unit = (jnp.asarray(rank) == index).astype(x.dtype)
+        unit = (jnp.asarray(rank) == number).astype(x.dtype)
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
             return ravel_pytree(change(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece))[0]
 
-        w, growth = stability.along(rate_at, x, direction), carry.growth
+        around = whole(x)
+        plant = around if inputs.scenario.sampling is None else around.plant
+        rooms = stability.room_around(inputs.scenario, carry.time, plant, x.size)
+        steep = jnp.any(stability.is_steep(carry.jacobian))
+        room = jnp.where(iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype))
+        sizes = stability.difference_sizes(x, direction, room)
+        widest = (level == 2) | ((iteration >= 0) & steep)
+        size = jnp.where(widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0]))
+        w, growth = stability.along(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
             growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
-        column = jnp.arange(watched.size, dtype=index.dtype) == index
-        jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
+        columns = jnp.arange(watched.size, dtype=index.dtype) == number
+        chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
+        jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
         unseen = keep_if(index == 0, accuracy.kicked(inputs.scenario, carry.unseen), carry.unseen)
         return Probed(carry.time, x, growth, jacobian, unseen), ()
 
@@ -369,22 +380,33 @@ def probe_steps(scenario: Scenario) -> int:
     """Steps of a `Probe`."""
     state = initial_state(scenario)
     watched = accuracy.places(state).size
-    return watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
+    return 3 * watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
 
 
 def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
     """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
+    if len(probed.jacobian[0]) < probed.state.size and scenario.sampling is None:
+        return stability.growth_rate(probed.growth)
+    return _mode_of(scenario, stability.resolved(probed.jacobian))
+
+
+def steepest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
+    """The mode by differences of the smallest size, () [1/s]: above `fastest_mode` where a derivative is infinite."""
+    return _mode_of(scenario, probed.jacobian[0])
+
+
+def _mode_of(scenario: Scenario, jacobian: jax.Array) -> jax.Array:
+    """The mode of what a step integrates, () [1/s]."""
+    size = len(jacobian)
     if scenario.sampling is not None:
         size = ravel_pytree(moving(initial_state(scenario)))[0].size
-        return stability.growth_rate_by(probed.jacobian[:size, :size])
-    complete = len(probed.jacobian) == probed.state.size
-    return stability.growth_rate_by(probed.jacobian) if complete else stability.growth_rate(probed.growth)
+    return stability.growth_rate_by(jacobian[:size, :size])
 
 
 def probed(time: jax.Array, around: Any, watched: int, unseen: accuracy.Unseen) -> Probed:
     """The carry of a `Probe` of what `surroundings` gave, of which `accuracy` watches so many numbers."""
     x = ravel_pytree(around)[0]
-    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype), unseen))
+    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((3, watched, watched), x.dtype), unseen))
 
 
 def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
@@ -415,11 +437,15 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
     estimate = accuracy.between_stages(carry.accuracy, unseen)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
-    status = carry.status | flag(inputs.dt * mode > integrators.tableau(method).stability, Status.STEP_TOO_LARGE)
+    limit = integrators.tableau(method).stability
+    status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
+    steepest = jax.vmap(partial(steepest_mode, inputs.scenario))(instants)
+    steep = jnp.any(stability.is_steep(instants.jacobian), axis=-1) & (inputs.dt * steepest > limit)
+    status |= flag(jnp.any(steep), Status.INFINITE_SLOPE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
     metrics = accuracy.results(estimate)
     if inputs.scenario.sampling is not None:
-        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(instants.jacobian)
+        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(stability.resolved(instants.jacobian))
         radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)

@@ -115,7 +115,7 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
             law, setting, t = scenario.controller, scenario.setting, jnp.asarray(TIME)
             tube = setting.tube(t)
             q, dq = tube.q_d, tube.dq_d
-            limits = () if scenario.velocity_bounds is None else setting.speed_limits(t)
+            limits: Any = () if scenario.velocity_bounds is None else setting.speed_limits(t)
             if axis == "xi":
                 q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
             else:
