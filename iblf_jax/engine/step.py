@@ -349,7 +349,8 @@ class Probe:
         watched, whole, x = accuracy.places(start), ravel_pytree(surroundings(start))[1], carry.state
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
-        level, number = jax.lax.div(index, count), jax.lax.rem(index, count)
+        level = jax.lax.div(index, count)
+        number = index - level * count
         rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
         unit = (jnp.asarray(rank) == number).astype(x.dtype)
