@@ -73,9 +73,11 @@ class PowerOfE2:
     c: Any = ij.leaf("N m", sign="positive")
 
     def init(self, q, dq, setting):
+        """No state."""
         return ()
 
     def command(self, t, q, dq, f_hat, setting, state):
+        """The torque."""
         tube, model = setting.tube(t), setting.model
         alpha = tube.dq_d - 2.0 * (q - tube.q_d)
         e2 = dq - alpha
@@ -141,8 +143,8 @@ CASES: dict[str, Case] = {
     ),
     "INFINITE_SLOPE": Case(
         lambda: _run(_at_rest(), dt=1e-3),
-        "At an isolated instant a derivative of the loop is infinite: here that of |e2|^0.6 sign(e2) with respect to e2, at e2 = 0. It is no "
-        "fast mode, and the time step is judged without it.",
+        "At an isolated instant a derivative of the loop is infinite: here that of |e2|^0.6 sign(e2) with respect to e2, at e2 = 0. It is "
+        "no fast mode, and the time step is judged without it.",
         "Nothing, if no derivatives are needed. Else write such a power as e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta.",
     ),
     "SAMPLING_TOO_SLOW": Case(

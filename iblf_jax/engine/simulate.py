@@ -35,13 +35,7 @@ MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""
 
 
-LOOKED_AT = (
-    Status.INACCURATE
-    | Status.GUARD_STAYED
-    | Status.SAMPLING_TOO_SLOW
-    | Status.FILTER_INFEASIBLE
-    | Status.INFINITE_SLOPE
-)
+LOOKED_AT = Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW | Status.FILTER_INFEASIBLE | Status.INFINITE_SLOPE
 """The flags of a run that did not fail and that a user should see."""
 
 
@@ -200,10 +194,10 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         )
     if status & Status.INFINITE_SLOPE:
         texts.append(
-            "At an isolated instant the derivative of the closed loop with respect to a state is infinite, as that of |e2|^a sign(e2) with "
-            "a < 1 is with respect to e2 = q' - alpha where e2 = 0. That is no fast mode, so the time step is judged by differences of "
-            f"{WIDEST:g} rad/s there. Derivatives of the run are not reliable; replace such a power by e2 (e2^2 + delta^2)^((a - 1)/2) with a "
-            "small delta."
+            "At an isolated instant the derivative of the closed loop with respect to a state is infinite, as that of "
+            "|e2|^a sign(e2) with a < 1 is with respect to e2 = q' - alpha where e2 = 0. That is no fast mode, so the time step "
+            f"is judged by differences of {WIDEST:g} rad/s there. Derivatives of the run are not reliable; replace such a power by "
+            "e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta."
         )
     if status & Status.SAMPLING_TOO_SLOW:
         texts.append(

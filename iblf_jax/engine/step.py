@@ -25,11 +25,11 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.mechanism import Mechanism
+from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 from iblf_jax.simulation import accuracy, integrators, sampling, stability
 from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
-from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 
 
 class Run(NamedTuple):
@@ -384,16 +384,16 @@ def probe_steps(scenario: Scenario) -> int:
     return 3 * watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
 
 
-def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
-    """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
-    if len(probed.jacobian[0]) < probed.state.size and scenario.sampling is None:
-        return stability.growth_rate(probed.growth)
-    return _mode_of(scenario, stability.resolved(probed.jacobian))
+def fastest_modes(scenario: Scenario, probed: Probed) -> tuple[jax.Array, jax.Array]:
+    """The mode that a `Probe` has found, of what a step integrates, and that by differences of the smallest size, () each [1/s].
 
-
-def steepest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
-    """The mode by differences of the smallest size, () [1/s]: above `fastest_mode` where a derivative is infinite."""
-    return _mode_of(scenario, probed.jacobian[0])
+    The second is the larger one where a derivative is infinite.
+    """
+    both = jnp.stack([stability.resolved(probed.jacobian), probed.jacobian[0]])
+    mode, steepest = jax.vmap(partial(_mode_of, scenario))(both)
+    if len(both[0]) < probed.state.size and scenario.sampling is None:
+        mode = stability.growth_rate(probed.growth)
+    return mode, steepest
 
 
 def _mode_of(scenario: Scenario, jacobian: jax.Array) -> jax.Array:
@@ -436,11 +436,10 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
       instants: what it has found at some of them.
     """
     estimate = accuracy.between_stages(carry.accuracy, unseen)
-    modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
+    modes, steepest = jax.vmap(partial(fastest_modes, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
-    steepest = jax.vmap(partial(steepest_mode, inputs.scenario))(instants)
     steep = jnp.any(stability.is_steep(instants.jacobian), axis=-1) & (inputs.dt * steepest > limit)
     status |= flag(jnp.any(steep), Status.INFINITE_SLOPE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)

@@ -7,8 +7,8 @@ without any physics behind them.  So every run measures its fastest mode, at its
 
 Derivatives of the loop are central differences of its rate: the rate is compiled as it is, its derivative would take thrice as long.
 
-A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0, and one instant there says nothing about the time step: the
-oscillation that a step excites ends where the difference quotient over its amplitude is small enough.  A smooth loop has the same
+A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0, and one instant there says nothing about the time step:
+the oscillation that a step excites ends where the difference quotient over its amplitude is small enough.  A smooth loop has the same
 derivative by differences of any small size.  So every derivative is measured by differences of three sizes, h0, 10 h0 and WIDEST (less near
 a bound, where the barrier is stiff indeed); where that of 10 h0 is much smaller than that of h0, the one of WIDEST counts (`resolved`).
 
@@ -111,7 +111,7 @@ def along(rate_at: Callable, x: jax.Array, direction: jax.Array, size: jax.Array
 
 def room_around(scenario: Scenario, t: jax.Array, plant: LoopState, size: int) -> jax.Array:
     """The largest sizes of differences of what `closed_loop.surroundings` gives, (size,): small near bounds, WIDEST elsewhere."""
-    tube = scenario.setting.tube(t)
+    tube = scenario.setting.tube(t, acceleration=False)
     side = jnp.minimum(plant.q - tube.lower, tube.upper - plant.q)
     near = [jnp.clip(ROOM * side, 0.0, WIDEST_MOVE)]
     if scenario.velocity_bounds is not None:
