@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gallery
+import jax.numpy as jnp
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -64,6 +65,36 @@ def _filtered() -> ij.Scenario:
     return _paper(controller=law)
 
 
+@ij.component
+class PowerOfE2:
+    """A finite-time law, tau = ... - K2 e2 - c |e2|^0.6 sign(e2), whose derivative is infinite at e2 = 0."""
+
+    K2: Any = ij.leaf("N m s/rad", sign="positive")
+    c: Any = ij.leaf("N m", sign="positive")
+
+    def init(self, q, dq, setting):
+        """No state."""
+        return ()
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        """The torque."""
+        tube, model = setting.tube(t), setting.model
+        alpha = tube.dq_d - 2.0 * (q - tube.q_d)
+        e2 = dq - alpha
+        wanted = tube.ddq_d - 2.0 * (dq - tube.dq_d)
+        tau = model.coriolis(q, dq, dq) + model.gravity(q) + model.mass_matrix(q) @ wanted
+        tau = tau - f_hat - self.K2 * e2 - self.c * jnp.sign(e2) * jnp.abs(e2) ** 0.6
+        none = jnp.zeros(q.shape, bool)
+        return ij.controllers.Command(tau, alpha, (q - tube.q_d) ** 2, none, none), ()
+
+
+def _at_rest() -> ij.Scenario:
+    """It starts at e2 = 0."""
+    scenario = _paper(controller=PowerOfE2(K2=5.0, c=2.0))
+    tube = scenario.setting.tube(jnp.zeros(()))
+    return ij.with_parts(scenario, initial=ij.Initial(tube.q_d, tube.dq_d))
+
+
 CASES: dict[str, Case] = {
     "BOUND_VIOLATED": Case(
         lambda: _run(_weak([4.0, 1.0])),
@@ -109,6 +140,12 @@ CASES: dict[str, Case] = {
         lambda: _run(_paper(), dt=5e-3),
         "The estimated error of the positions is more than 0.5 % of the tube. Its numbers are not to be used.",
         "Take the step that the warning names.",
+    ),
+    "INFINITE_SLOPE": Case(
+        lambda: _run(_at_rest(), dt=1e-3),
+        "At an isolated instant a derivative of the loop is infinite: here that of |e2|^0.6 sign(e2) with respect to e2, at e2 = 0. It is "
+        "no fast mode, and the time step is judged without it.",
+        "Nothing, if no derivatives are needed. Else write such a power as e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta.",
     ),
     "SAMPLING_TOO_SLOW": Case(
         lambda: _run(_sampled(4e-3), dt=1e-3),

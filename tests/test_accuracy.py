@@ -211,3 +211,37 @@ def test_a_sampled_run_says_how_accurate_it_is(method, actuator):
         told = float(run.metrics.relative_numerical_error)
         assert told > error
         assert told < 200 * error or told < 1e-6
+
+
+@ij.component
+class PowerOfE2:
+    """tau = ... - K2 e2 - c |e2|^0.6 sign(e2): its derivative is infinite at e2 = 0."""
+
+    K2: jax.Array = ij.leaf("N m s/rad", sign="positive")
+    c: jax.Array = ij.leaf("N m", sign="positive")
+
+    def init(self, q, dq, setting):
+        return ()
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        tube, model = setting.tube(t), setting.model
+        alpha = tube.dq_d - 2.0 * (q - tube.q_d)
+        e2, wanted = dq - alpha, tube.ddq_d - 2.0 * (dq - tube.dq_d)
+        tau = model.coriolis(q, dq, dq) + model.gravity(q) + model.mass_matrix(q) @ wanted
+        tau = tau - self.K2 * e2 - self.c * jnp.sign(e2) * jnp.abs(e2) ** 0.6
+        none = jnp.zeros(q.shape, bool)
+        return ij.controllers.Command(tau, alpha, (q - tube.q_d) ** 2, none, none), ()
+
+
+def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
+    scenario = ij.with_parts(paper, controller=PowerOfE2(K2=5.0, c=2.0), observer=ij.observers.NoObserver())
+    tube = scenario.setting.tube(jnp.zeros(()))
+    scenario = ij.with_parts(scenario, initial=ij.Initial(tube.q_d, tube.dq_d))  # e2 = 0
+    with pytest.warns(ij.SimulationWarning, match=r"respect to e2.*delta\^2"):
+        run = ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=100)
+    assert int(run.status) == int(ij.Status.INFINITE_SLOPE)
+    assert float(run.fastest_mode) < 2000.0
+    assert ij.recommended_dt(scenario, duration=0.5) >= 5e-4
+    with pytest.warns(ij.SimulationWarning, match="time step is too large"):
+        run = ij.simulate(scenario, duration=0.5, dt=1e-2, record_every=50)
+    assert int(run.status) & ij.Status.STEP_TOO_LARGE

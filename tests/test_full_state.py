@@ -11,7 +11,9 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
+from iblf_jax.barriers._base import ratio_jumps
 from iblf_jax.certificates.proof_terms import rounding, terms_at
+from iblf_jax.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import initial_state
 
 H = np.pi / 2
@@ -24,9 +26,14 @@ class FullLoop(Loop):
     c: np.ndarray = dataclasses.field(default_factory=lambda: np.full(2, 1.0))
     slowest: tuple = ((-1.6, -1.4), (-0.1, 0.0), 1.0, 0.0)
     fastest: tuple = ((0.6, 0.5), (0.1, 0.0), 1.0, H)
+    factor: float = 2.0
+    """2 for integral barriers, 1 for logarithmic ones: the slope is factor e/(k^2 - e^2)."""
 
-    def full(self, t, x):
-        """The rate of (q, q', eta), the torque, and V1 + phi of each joint."""
+    def full(self, t, x, above=None):
+        """The rate of (q, q', eta), the torque, V1 + phi of each joint (for integral barriers), and e2.
+
+        `above`: on which side of e2 = 0 the torque is evaluated, joint by joint; the state's own if not given.
+        """
         q, v, eta = x[:2], x[2:4], x[4:]
         M, C, G, dM = self.arm(q)
         (xd, dxd, ddxd), (lo, dlo, ddlo), (up, dup, ddup) = (sine(*s)(t) for s in (self.reference, self.lower, self.upper))
@@ -37,18 +44,18 @@ class FullLoop(Loop):
         alpha = dxd - (self.k1 + kappa) * e1
         dalpha = ddxd - dkappa * e1 - (self.k1 + kappa) * (v - dxd)
         k = np.where(e1 > 0, ku, kl)
-        s1, e2 = 2 * e1 / (k**2 - e1**2), v - alpha
+        s1, e2 = self.factor * e1 / (k**2 - e1**2), v - alpha
         (vl, dvl, _), (vu, dvu, _) = sine(*self.slowest)(t), sine(*self.fastest)(t)
         Ku, Kl = vu - alpha, alpha - vl
-        K = np.where(e2 > 0, Ku, Kl)
-        s2, kappa2 = 2 * e2 / (K**2 - e2**2), np.sqrt(((dvu - dalpha) / Ku) ** 2 + ((dalpha - dvl) / Kl) ** 2 + self.o)
-        w = -(self.K2 + kappa2) * e2 - s1 * (K**2 - e2**2) / 2 - self.c * s2
+        K = np.where(e2 > 0 if above is None else above, Ku, Kl)
+        s2, kappa2 = self.factor * e2 / (K**2 - e2**2), np.sqrt(((dvu - dalpha) / Ku) ** 2 + ((dalpha - dvl) / Kl) ** 2 + self.o)
+        w = -(self.K2 + kappa2) * e2 - s1 * (K**2 - e2**2) / self.factor - self.c * s2
         f_hat = eta + self.kf * (M @ v)
         tau = C(v) @ v + G + M @ (dalpha + w) - f_hat
         f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
         ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
         deta = -self.kf * (f_hat + tau - C(v) @ v - G + dM * v[1] @ v)
-        return np.concatenate([v, ddq, deta]), tau, -np.log(1 - (e1 / k) ** 2) - np.log(1 - (e2 / K) ** 2)
+        return np.concatenate([v, ddq, deta]), tau, -np.log(1 - (e1 / k) ** 2) - np.log(1 - (e2 / K) ** 2), e2
 
     @classmethod
     def random(cls, rng, **given):
@@ -62,7 +69,8 @@ class FullLoop(Loop):
     @property
     def scenario(self):
         """The same in the package."""
-        law = controllers.FullState(k1=self.k1, K2=self.K2, c=self.c, o=self.o)
+        barrier = barriers.Integral() if self.factor == 2.0 else barriers.Log()
+        law = controllers.FullState(k1=self.k1, K2=self.K2, c=self.c, o=self.o, barrier=barrier, velocity_barrier=barrier)
         return dataclasses.replace(
             ij.presets.zhang_yan_2024(reading="corrected"),
             controller=law,
@@ -271,12 +279,173 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
 
 
 def test_a_gradient_is_the_difference():
+    smooth = controllers.FullState(k1=2.0, K2=20.0, c=8.0, o=0.1, velocity_barrier=barriers.Mapping())
+
     def loss(K2):
-        scenario = ij.with_parameters(ij.presets.zhang_yan_2024_full_state(), {"controller.K2": K2, "initial.dq": [-1.0, -0.6]})
+        scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=smooth)
+        scenario = ij.with_parameters(scenario, {"controller.K2": K2, "initial.dq": [-1.0, -0.6]})
         return jnp.sum(ij.simulate(scenario, duration=0.1, dt=5e-4, record_every=200).metrics.ise)
 
     found, h = jax.grad(loss)(20.0), 1e-4
     assert float(found) == pytest.approx((float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5)
+
+
+class Pieces:
+    """The independent loop from event to event of e2_i = 0: each joint above 0, below it, or (None) sliding along it."""
+
+    def __init__(self, loop, duration):
+        self.loop, self.passed = loop, []
+        start = np.concatenate([loop.q0, loop.dq0, np.zeros(4)])
+        self.mode = [bool(x) for x in loop.full(0.0, start[:6])[3] > 0]
+        t, x = 0.0, start
+        while t < duration:
+            t, x = self.until_an_event(t, x, duration)
+        self.q, self.dq, (self.ise, self.effort) = x[:2], x[2:4], x[6:]
+
+    def at(self, t, x, above):
+        """Rate of the state and of the integrals of |e1|^2 and |tau|^2."""
+        rate, tau, _, _ = self.loop.full(t, x[:6], above)
+        e1 = x[:2] - sine(*self.loop.reference)(t)[0]
+        return np.concatenate([rate, [e1 @ e1, tau @ tau]])
+
+    def e2(self, t, x):
+        return self.loop.full(t, x[:6], np.zeros(2, bool))[3]
+
+    def approach(self, t, x, rate, h=1e-6):
+        """Rate of e2 along a rate of the state."""
+        return (self.e2(t + h, x + h * rate) - self.e2(t - h, x - h * rate)) / (2 * h)
+
+    def rate(self, t, x, mode):
+        """The rate in a mode, and of a sliding joint how much of the rate is that from above (Filippov)."""
+        above = np.array([side is True for side in mode])
+        below = self.at(t, x, above)
+        if None not in mode:
+            return below, None
+        joint = mode.index(None)
+        above[joint] = True
+        beyond = self.at(t, x, above)
+        toward = [self.approach(t, x, rate)[joint] for rate in (below, beyond)]
+        share = toward[0] / (toward[0] - toward[1])
+        return below + share * (beyond - below), share
+
+    def until_an_event(self, t, x, duration):
+        mode, events = self.mode, []
+
+        def event(function, direction, joint, new):
+            function.terminal, function.direction = True, direction
+            events.append((function, joint, new))
+
+        for joint, side in enumerate(mode):
+            if side is None:
+                event(lambda t, x: self.rate(t, x, mode)[1], -1, joint, False)
+                event(lambda t, x: self.rate(t, x, mode)[1] - 1.0, 1, joint, True)
+            else:
+                event(lambda t, x, i=joint: self.e2(t, x)[i], -1 if side else 1, joint, not side)
+        how = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
+        found = solve_ivp(lambda t, x: self.rate(t, x, mode)[0], (t, duration), x, events=[e[0] for e in events], max_step=0.02, **how)
+        t, x = found.t[-1], found.y[:, -1]
+        if t == duration:
+            return t, x
+        for (_, joint, new), times in zip(events, found.t_events, strict=True):
+            if len(times):
+                after = [*mode[:joint], new, *mode[joint + 1 :]]
+                onwards = self.approach(t, x, self.rate(t, x, after)[0])[joint]
+                self.mode = after if mode[joint] is None or (onwards > 0) == new else [*mode[:joint], None, *mode[joint + 1 :]]
+                self.passed.append((joint, self.mode[joint]))
+        beyond = min(t + 1e-7, duration)  # off the surface, where the event would be found again
+        return beyond, x + (beyond - t) * self.rate(t, x, self.mode)[0]
+
+
+GAINS = {"k1": 2.0, "K2": 12.0, "c": 1.0, "kf": 100.0}
+PATHS = {"k1": "controller.k1", "K2": "controller.K2", "c": "controller.c", "kf": "observer.kf"}
+
+
+def pieces(duration, factor=2.0, **gains):
+    """The run in pieces at these gains, the same on both joints."""
+    gains = {name: np.full(2, x) for name, x in (GAINS | gains).items()}
+    return Pieces(FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), factor=factor, **gains), duration)
+
+
+def slopes_in_pieces(duration, factor=2.0, **gains):
+    """Central differences of runs in pieces by k1, K2, c and kf; of |e1|^2's integral, |tau|^2's, and q at the end."""
+    found = []
+    for name, x in (GAINS | gains).items():
+        ends = [pieces(duration, factor, **gains | {name: x + h}) for h in (1e-3 * x, -1e-3 * x)]
+        assert ends[0].passed == ends[1].passed
+        up, down = (np.array([end.ise, end.effort, *end.q]) for end in ends)
+        found.append((up - down) / (2e-3 * x))
+    return np.array(found).T
+
+
+def outcome_by(duration, dt, factor=2.0, backend="auto"):
+    """The same numbers of the package's run as a function of the gains."""
+    scenario = FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), factor=factor).scenario
+
+    def outcome(gains):
+        values = {path: jnp.full(2, x) for path, x in zip(PATHS.values(), gains, strict=True)}
+        run = ij.simulate(ij.with_parameters(scenario, values), duration=duration, dt=dt, backend=backend)
+        return jnp.array([jnp.trapezoid(jnp.sum(run.e1**2, axis=1), dx=dt), run.metrics["effort"], *run.q[-1]])
+
+    return outcome
+
+
+@pytest.mark.parametrize("factor", [2.0, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces(factor):
+    assert pieces(0.2, factor).passed == [(0, True), (1, True), (0, False)][: 3 if factor == 2.0 else 2]
+    true, gains = slopes_in_pieces(0.2, factor), jnp.array([*GAINS.values()])
+    outcome = outcome_by(0.2, 1e-3, factor)
+    found = np.asarray(jax.jacfwd(outcome)(gains))
+    np.testing.assert_allclose(jax.grad(lambda x: outcome(x)[0])(gains), found[0], rtol=1e-12)
+    np.testing.assert_allclose(found[0], true[0], rtol=0.01)
+    np.testing.assert_allclose(found[2:], true[2:], rtol=0.01, atol=2e-3 * np.max(np.abs(true[2:])))
+
+
+@pytest.mark.slow
+def test_every_mode_and_executor_has_the_same_derivative_across_the_jumps():
+    gains = jnp.array([*GAINS.values()])
+    native = jax.jacfwd(outcome_by(0.12, 2e-3))(gains)[0]
+    forward = jax.jvp(lambda x: outcome_by(0.12, 2e-3, backend="xla")(gains * x)[0], (1.0,), (1.0,))[1]
+    reverse = jax.grad(lambda x: outcome_by(0.12, 2e-3, backend="xla")(x)[0])(gains)
+    assert float(forward) == pytest.approx(float(native @ gains), rel=1e-9)
+    np.testing.assert_allclose(reverse, native, rtol=1e-9)
+
+
+def test_a_derivative_of_the_torque_s_square_contains_its_jump():
+    true = slopes_in_pieces(0.12)[1]
+    found = jax.jacfwd(outcome_by(0.12, 1e-4))(jnp.array([*GAINS.values()]))[1]
+    np.testing.assert_allclose(found, true, rtol=0.05)
+
+
+def test_where_e2_slides_along_0_derivatives_are_those_of_the_sliding_motion():
+    assert pieces(0.25, kf=20.0).passed == [(0, True), (1, None), (1, True)]
+    true = slopes_in_pieces(0.25, kf=20.0)
+    found = jax.jacfwd(outcome_by(0.25, 1e-3))(jnp.array([*(GAINS | {"kf": 20.0}).values()]))
+    np.testing.assert_allclose(found[0], true[0], rtol=0.02)
+
+
+@pytest.mark.slow
+def test_a_sampled_loop_needs_no_term():
+    base = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), sampling=ij.Sampling(period=2e-3))
+
+    def loss(K2):
+        scenario = ij.with_parameters(base, {"controller.K2": K2, "initial.dq": [-1.0, -0.6]})
+        return jnp.sum(ij.simulate(scenario, duration=0.1, dt=1e-3, record_every=100).metrics.ise)
+
+    found, h = jax.grad(loss)(20.0), 1e-4
+    assert float(found) == pytest.approx((float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name in FAMILY if name != "quadratic"])
+def test_a_barrier_states_whether_its_ratio_jumps(name):
+    tube = bounds.Tube(jnp.zeros(1), jnp.zeros(1), -jnp.ones(1), 2.0 * jnp.ones(1), jnp.zeros(1), jnp.zeros(1))
+    left, right = (FAMILY[name].error_over_slope(tube, jnp.array([e])) for e in (-1e-9, 1e-9))
+    assert bool(abs(left - right)[0] > 1e-6) == ratio_jumps(FAMILY[name])
+    law = controllers.FullState(k1=2.0, K2=20.0, c=1.0, velocity_barrier=FAMILY[name])
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
+    wrapped = controllers.Saturated(law=law, limit=50.0)
+    for each in (law, wrapped):
+        found = switching_functions(each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.setting, ())
+        assert (found is not None) == ratio_jumps(FAMILY[name])
 
 
 @pytest.mark.parametrize(

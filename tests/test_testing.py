@@ -160,12 +160,59 @@ def test_broken_law():
     integer = changed(PlainLaw, command=lambda self, *a: (PlainLaw.command(self, *a)[0]._replace(saturated=jnp.zeros(2, int)), ()))
     rejects(ij.testing.check_law, integer(3.0), "Command.saturated", "bool")
 
-    def unguarded(self, t, q, dq, f_hat, setting, state):
+    rejects(ij.testing.check_law, unguarded(0.7), "not finite at xi = -0.9995, 0.9995, inside the bounds", "guarded_error")
+
+
+def unguarded(reach):
+    """A law with a root that has no real value for |xi| > reach."""
+
+    def command(self, t, q, dq, f_hat, setting, state):
         command, state = PlainLaw.command(self, t, q, dq, f_hat, setting, state)
-        xi = setting.tube(t).xi(q)
+        xi = setting.tube(t).xi(q) / reach
         return command._replace(tau=command.tau - xi / jnp.sqrt(1 - xi**2)), state
 
-    rejects(ij.testing.check_law, changed(PlainLaw, command=unguarded)(3.0), "not finite at xi", "guarded_error")
+    return changed(PlainLaw, command=command)(3.0)
+
+
+def published(power=1.0, delta=0.0):
+    """A law with s = ln[(A/a) (a + x)/(A - x)] on e1 and on e2, and a power of e2."""
+
+    def slope(tube, x):
+        return jnp.log(tube.k_u / tube.k_l * (tube.k_l + x) / (tube.k_u - x))
+
+    def command(self, t, q, dq, f_hat, setting, state):
+        tube, model = setting.tube(t), setting.model
+        alpha = tube.dq_d - 2.0 * (q - tube.q_d)
+        slow, fast = setting.speed_limits(t)
+        e2 = dq - alpha
+        inner = tube._replace(q_d=alpha, lower=slow, upper=fast)
+        powered = jnp.sign(e2) * jnp.abs(e2) ** power if delta == 0.0 else e2 * (e2**2 + delta**2) ** ((power - 1.0) / 2)
+        tau = model.gravity(q) - slope(tube, q - tube.q_d) - slope(inner, e2) - 5.0 * powered
+        no = jnp.zeros(q.shape, bool)
+        return Command(tau, alpha, (q - tube.q_d) ** 2, no, no), ()
+
+    return changed(PlainLaw, command=command, needs_velocity_bounds=True)(3.0)
+
+
+def test_a_law_that_is_undefined_beyond_its_bounds_fits_with_a_remark():
+    (remark,) = ij.testing.check_law(unguarded(1.0))
+    assert "undefined beyond the bound" in remark
+    assert "-40, -1, 1, 40" in remark
+
+
+def test_so_does_one_that_is_undefined_beyond_velocity_bounds():
+    position, velocity = ij.testing.check_law(published())
+    assert "undefined beyond the bound" in position
+    assert "undefined beyond the velocity bound" in velocity
+
+
+def test_an_infinite_derivative_in_e2_is_named():
+    with pytest.raises(ContractError) as caught:
+        ij.testing.check_law(published(power=0.6))
+    assert "with respect to e2" in str(caught.value)
+    assert "delta^2" in str(caught.value)
+    assert "wall" not in str(caught.value)
+    assert len(ij.testing.check_law(published(power=0.6, delta=0.05))) == 2
 
 
 class Stating(PlainLaw):

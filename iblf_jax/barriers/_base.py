@@ -77,13 +77,22 @@ class Barrier(Protocol):
         ...
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
-        """The ratio e1/s, finite and smooth at e1 = 0, (n,); None for a barrier whose slope is of a higher order there."""
+        """The ratio e1/s, finite at e1 = 0, (n,); None for a barrier whose slope is of a higher order there.
+
+        A class attribute `ratio_jumps = False` states that the ratio is continuous at e1 = 0 in an asymmetric tube, too; without it a law
+        assumes that it may jump there.
+        """
         ...
 
 
 def value_unit(barrier: Barrier) -> str:
     """The unit of a barrier's V1 where its error is a position, "1" if the barrier declares none."""
     return getattr(barrier, "value_unit", "1")
+
+
+def ratio_jumps(barrier: Barrier) -> bool:
+    """Whether `error_over_slope` of a barrier may jump at e1 = 0."""
+    return bool(getattr(barrier, "ratio_jumps", True))
 
 
 def check_guard(owner: str, guard: float) -> None:

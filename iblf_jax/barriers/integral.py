@@ -20,6 +20,8 @@ class Integral:
 
     It is twice the logarithmic barrier with p = 1, identically.  Theorem 1: xi^2/2 <= V1 <= xi^2/(1 - xi^2).
 
+    The slope has a kink at e1 = 0 where k_u and k_l differ: second derivatives of a run leave out what the kink adds.
+
     Args:
       guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
 

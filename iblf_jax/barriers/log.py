@@ -19,6 +19,8 @@ class Log:
 
         s = e1^(2p-1) / (k^(2p) - e1^(2p)),   alpha = q_d' - (k1 + kappa) e1
 
+    The slope has a kink at e1 = 0 where k_u and k_l differ: second derivatives of a run leave out what the kink adds.
+
     Args:
       p: exponent, a whole number >= 1; 1 if not given.
       guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.

@@ -32,6 +32,7 @@ class PrescribedPerformance:
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "1"
+    ratio_jumps: ClassVar[bool] = False
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""

@@ -23,6 +23,7 @@ class Quadratic:
     guard: ClassVar[float] = -math.inf
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "rad^2"
+    ratio_jumps: ClassVar[bool] = False
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

@@ -32,6 +32,7 @@ class Tan:
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "rad^2"
+    ratio_jumps: ClassVar[bool] = False
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""

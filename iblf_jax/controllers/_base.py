@@ -80,6 +80,11 @@ class Controller(Protocol):
     are 1 (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(setting)`, which raises
     ValueError for what does not fit together where the number of joints is known, and `leaf_units()`, the units of leaves that depend on
     other fields, by name.
+
+    A law whose command jumps declares where: `switching(t, q, dq, setting, state)` returns (m,) functions of q or q', and the command
+    jumps where one of them crosses 0 (as sliding-mode laws do, or `FullState` with some barriers).  The derivatives of a run then contain
+    what such a jump does to a perturbation (`engine.switching`); without the method they leave it out.  A law that wraps another
+    passes the call on with `switching_functions`.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
@@ -97,6 +102,12 @@ class Controller(Protocol):
           state: the law's own state.
         """
         ...
+
+
+def switching_functions(law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+    """The functions at whose zeros a law's command jumps, (m,), or None if it declares none; arguments as `Controller.command`."""
+    declared = getattr(law, "switching", None)
+    return None if declared is None else declared(t, q, dq, setting, state)
 
 
 class LyapunovLaw(Protocol):

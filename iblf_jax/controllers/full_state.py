@@ -24,6 +24,19 @@ before, and all claims hold with this V1.
 
 The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and K_l differ: there the torque jumps by
 M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation asks for.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
+
+**Derivatives across the jump.**  In a continuous loop the derivative of a step that reaches e2_i = 0 is that of the hybrid flow, with the
+jump of a perturbation at the crossing (`engine.switching`, J.1), in every executor and in forward and reverse mode; that of a metric of
+the torque contains the jump of its integrand.  Limits:
+
+- Where the torques of both sides drive e2_i towards 0, it slides along 0.  Derivatives of the state are then those of the sliding motion,
+  of first order in dt; those of a metric of the torque leave out how the torque alternates.  Where e2_i touches 0 without crossing it, no
+  derivative exists.
+- A sampled loop holds its torque, so that its derivative needs no such term.  But its metrics, as functions of a gain, jump whenever a
+  crossing moves from one sample to the next, and no derivative contains that.
+- Second derivatives leave out the kink of the barrier's slope at e1 = 0, as those of every law with asymmetric bounds do.
+- A fixed step across the jump is of first order; `numerical_error` contains that error.
+- Other solvers that take `VectorField` step across the jump in their own way: derivatives through them leave the term out.
 """
 
 from __future__ import annotations
@@ -34,7 +47,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.barriers import Barrier, Integral
-from iblf_jax.barriers._base import CLAIMS, guard_is_active, value_unit
+from iblf_jax.barriers._base import CLAIMS, guard_is_active, ratio_jumps, value_unit
 from iblf_jax.bounds import Tube
 from iblf_jax.controllers._base import Command, Setting
 from iblf_jax.controllers.backstepping import alpha_and_rate, fit_weight
@@ -57,6 +70,10 @@ class FullState:
 
     It keeps the scenario's `velocity_bounds` too, as long as alpha is inside them (`alpha_margin` > 0); symbols at the head of this
     module.  Its V1 is that of e1 and that of e2.  Symmetric constant bounds with p = 1 logarithms on both are the barriers of the source.
+
+    With `Integral` or `Log` as `velocity_barrier` the torque jumps at e2 = 0 where K_u and K_l differ.  First derivatives of a run contain
+    that jump (head of this module, with the limits).  Hessians leave out the kink of the barrier's slope at e1 = 0.  `Mapping`, `Tan`,
+    `State` and `PrescribedPerformance` have no jump.
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
@@ -113,6 +130,13 @@ class FullState:
         alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
         (lower, upper), (dlower, dupper) = jax.jvp(setting.speed_limits, (t,), (jnp.ones_like(t),))
         return setting.tube(t), Tube(alpha, dalpha, lower, upper, dlower, dupper)
+
+    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: tuple[()]) -> jax.Array | None:
+        """e2 = q' - alpha, (n,) [rad/s], where the torque jumps at e2 = 0; None for a velocity barrier without a jump."""
+        if not ratio_jumps(self.velocity_barrier):
+            return None
+        alpha = self.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, self.k1, self.o)
+        return dq - alpha
 
     def command(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]

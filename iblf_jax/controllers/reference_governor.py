@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.controllers._base import Command, Controller, Setting
+from iblf_jax.controllers._base import Command, Controller, Setting, switching_functions
 from iblf_jax.controllers.computed_torque import ComputedTorque
 from iblf_jax.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
@@ -104,6 +104,11 @@ class ReferenceGovernor:
         law: Any = self.law
         low, high = self._walls(t, setting)
         return 0.5 * jnp.min(law.Kp * jnp.maximum(jnp.minimum(g - low, high - g), 0.0) ** 2)
+
+    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: GovernorState) -> jax.Array | None:
+        """Where the wrapped law's command jumps."""
+        governed = setting._replace(reference=_AtRest(state.g))
+        return switching_functions(self.law, t, q, dq, governed, state.law)
 
     def command(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: GovernorState

@@ -29,7 +29,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.controllers._base import Command, Controller, Setting, State
+from iblf_jax.controllers._base import Command, Controller, Setting, State, switching_functions
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -113,6 +113,10 @@ class SafetyFilter:
         A, dA = (h, 1.0) if self.shape1 == "linear" else (jnp.arctan(h), 1.0 / (1.0 + h * h))
         z = dh + self.a1 * A
         return self.a1 * dA * dh + self.a2 * (z if self.shape2 == "linear" else z**3)
+
+    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+        """Where the wrapped law's command jumps."""
+        return switching_functions(self.law, t, q, dq, setting, state)
 
     def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
         """The wrapped law's command with its torque filtered, and the slack."""

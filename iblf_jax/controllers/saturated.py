@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.controllers._base import Command, Controller, Setting, State
+from iblf_jax.controllers._base import Command, Controller, Setting, State, switching_functions
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.robots import Robot
@@ -53,6 +53,10 @@ class Saturated:
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
         """The wrapped law's state."""
         return self.law.init(q, dq, setting)
+
+    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+        """Where the wrapped law's command jumps."""
+        return switching_functions(self.law, t, q, dq, setting, state)
 
     def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
         """The wrapped law's command with its torque limited; `saturated` says where it asked for more than the limit."""

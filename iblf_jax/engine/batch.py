@@ -29,6 +29,7 @@ from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state, surroundings
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME
+from iblf_jax.simulation.stability import resolved
 
 
 class Leaves(NamedTuple):
@@ -155,7 +156,7 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]
         return probed(jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen)
 
     found = _probed(executor, batch, batch.each(around))
-    return batch.each(lambda inputs, found: start(inputs, method, found.jacobian), found), found
+    return batch.each(lambda inputs, found: start(inputs, method, resolved(found.jacobian)), found), found
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:

@@ -29,10 +29,14 @@ from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import has
-from iblf_jax.simulation.stability import RADIUS
+from iblf_jax.simulation.stability import RADIUS, WIDEST
 
 MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""
+
+
+LOOKED_AT = Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW | Status.FILTER_INFEASIBLE | Status.INFINITE_SLOPE
+"""The flags of a run that did not fail and that a user should see."""
 
 
 class SimulationError(RuntimeError):
@@ -139,7 +143,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
     failed = status & FAILED
-    told = failed | status & (Status.INACCURATE | Status.GUARD_STAYED | Status.SAMPLING_TOO_SLOW | Status.FILTER_INFEASIBLE)
+    told = failed | status & LOOKED_AT
     if getattr(unwrapped(result.scenario.controller), "needs_velocity_bounds", False):
         told |= status & Status.ALPHA_INFEASIBLE
     if not told:
@@ -187,6 +191,13 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         texts.append(
             f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where {100 * TOLERANCE:g} % are tolerated: "
             f"dt = {float(result.dt):g} s is too large for what drives this loop. Take {dt}."
+        )
+    if status & Status.INFINITE_SLOPE:
+        texts.append(
+            "At an isolated instant the derivative of the closed loop with respect to a state is infinite, as that of "
+            "|e2|^a sign(e2) with a < 1 is with respect to e2 = q' - alpha where e2 = 0. That is no fast mode, so the time step "
+            f"is judged by differences of {WIDEST:g} rad/s there. Derivatives of the run are not reliable; replace such a power by "
+            "e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta."
         )
     if status & Status.SAMPLING_TOO_SLOW:
         texts.append(

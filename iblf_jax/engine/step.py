@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.mechanism import Mechanism
+from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 from iblf_jax.simulation import accuracy, integrators, sampling, stability
 from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
@@ -233,6 +234,8 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         folds, dt, sample = inputs.folds, inputs.dt, stepped.first
         begun = _begun_at(index, folds, sample, carry.accumulators)
         accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
+        if scenario.sampling is None:
+            stepped, accumulators = _across_jumps(inputs, carry.state, method, stepped, begun, accumulators)
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
         here = Nearest(near, sample.t, jax.lax.stop_gradient(surroundings(carry.state)))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
@@ -246,6 +249,51 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         return Advanced(Carry(after, accumulators, status, nearest, estimate), sample, begun, carry.state)
 
     return form.piece(folded_in)(inputs, carry._replace(state=state), index, goes_on, stepped, pieces)
+
+
+def _across_jumps(
+    inputs: Inputs, before: LoopState, method: str, stepped: integrators.Stepped, begun: tuple, accumulators: tuple
+) -> tuple[integrators.Stepped, tuple]:
+    """A step and the accumulators after it, with their derivatives across jumps of the command; values stay as they are.
+
+    Args:
+      inputs: of the run.
+      before: state at the start of the step.
+      method: the integrator.
+      stepped: the step.
+      begun, accumulators: of the folds, before and after its sample.
+    """
+    scenario, dt, t = inputs.scenario, inputs.dt, stepped.first.t
+
+    def rate(t, state):
+        return evaluate(scenario, t, state, dt)
+
+    def gains_of(sample):
+        def sums(weight):
+            weighed = dataclasses.replace(sample, dt=weight)
+            folded = zip(inputs.folds, begun, strict=True)
+            return _split_floats(tuple(fold.update(acc, weighed) for fold, acc in folded))[0]
+
+        return jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+
+    floats, replaced = _split_floats(accumulators)
+    loop = Loop(scenario, rate, gains_of)
+    after, floats = with_hybrid_derivative(loop, method, t, before, dt, stepped, floats)
+    return stepped._replace(state=after), replaced(floats)
+
+
+def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
+    """The floating-point numbers of a tree, and the function that puts others in their place."""
+    leaves, treedef = jax.tree.flatten(tree)
+    places = [i for i, x in enumerate(leaves) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+
+    def replaced(floats):
+        new = list(leaves)
+        for i, x in zip(places, floats, strict=True):
+            new[i] = x
+        return jax.tree.unflatten(treedef, new)
+
+    return [leaves[i] for i in places], replaced
 
 
 def recorded(folds: Any, begun: tuple, sample: Sample, state: LoopState):
@@ -282,7 +330,7 @@ class Probed(NamedTuple):
     growth: stability.Growth
     """Of the power iteration."""
     jacobian: jax.Array
-    """By the numbers that `accuracy` watches, (m', m') [1/s]."""
+    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s]; `stability.resolved` makes one of them."""
     unseen: accuracy.Unseen
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass matrix."""
 
@@ -299,20 +347,32 @@ class Probe:
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
         watched, whole, x = accuracy.places(start), ravel_pytree(surroundings(start))[1], carry.state
-        iteration = index - watched.size
+        iteration = index - 3 * watched.size
+        count = jnp.asarray(watched.size, index.dtype)
+        level = jax.lax.div(index, count)
+        number = index - level * count
         rank = np.full(x.size, -1, index.dtype)
         rank[watched] = np.arange(watched.size)
-        unit = (jnp.asarray(rank) == index).astype(x.dtype)
+        unit = (jnp.asarray(rank) == number).astype(x.dtype)
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
             return ravel_pytree(change(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece))[0]
 
-        w, growth = stability.along(rate_at, x, direction), carry.growth
+        around = whole(x)
+        plant = around if inputs.scenario.sampling is None else around.plant
+        rooms = stability.room_around(inputs.scenario, carry.time, plant, x.size)
+        steep = jnp.any(stability.is_steep(carry.jacobian))
+        room = jnp.where(iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype))
+        sizes = stability.difference_sizes(x, direction, room)
+        widest = (level == 2) | ((iteration >= 0) & steep)
+        size = jnp.where(widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0]))
+        w, growth = stability.along(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
             growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
-        column = jnp.arange(watched.size, dtype=index.dtype) == index
-        jacobian = jnp.where(column, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
+        columns = jnp.arange(watched.size, dtype=index.dtype) == number
+        chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
+        jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
         unseen = keep_if(index == 0, accuracy.kicked(inputs.scenario, carry.unseen), carry.unseen)
         return Probed(carry.time, x, growth, jacobian, unseen), ()
 
@@ -321,22 +381,33 @@ def probe_steps(scenario: Scenario) -> int:
     """Steps of a `Probe`."""
     state = initial_state(scenario)
     watched = accuracy.places(state).size
-    return watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
+    return 3 * watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
 
 
-def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
-    """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
+def fastest_modes(scenario: Scenario, probed: Probed) -> tuple[jax.Array, jax.Array]:
+    """The mode that a `Probe` has found, of what a step integrates, and that by differences of the smallest size, () each [1/s].
+
+    The second is the larger one where a derivative is infinite.
+    """
+    both = jnp.stack([stability.resolved(probed.jacobian), probed.jacobian[0]])
+    mode, steepest = jax.vmap(partial(_mode_of, scenario))(both)
+    if len(both[0]) < probed.state.size and scenario.sampling is None:
+        mode = stability.growth_rate(probed.growth)
+    return mode, steepest
+
+
+def _mode_of(scenario: Scenario, jacobian: jax.Array) -> jax.Array:
+    """The mode of what a step integrates, () [1/s]."""
+    size = len(jacobian)
     if scenario.sampling is not None:
         size = ravel_pytree(moving(initial_state(scenario)))[0].size
-        return stability.growth_rate_by(probed.jacobian[:size, :size])
-    complete = len(probed.jacobian) == probed.state.size
-    return stability.growth_rate_by(probed.jacobian) if complete else stability.growth_rate(probed.growth)
+    return stability.growth_rate_by(jacobian[:size, :size])
 
 
 def probed(time: jax.Array, around: Any, watched: int, unseen: accuracy.Unseen) -> Probed:
     """The carry of a `Probe` of what `surroundings` gave, of which `accuracy` watches so many numbers."""
     x = ravel_pytree(around)[0]
-    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((watched, watched), x.dtype), unseen))
+    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((3, watched, watched), x.dtype), unseen))
 
 
 def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
@@ -365,13 +436,16 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
       instants: what it has found at some of them.
     """
     estimate = accuracy.between_stages(carry.accuracy, unseen)
-    modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
+    modes, steepest = jax.vmap(partial(fastest_modes, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
-    status = carry.status | flag(inputs.dt * mode > integrators.tableau(method).stability, Status.STEP_TOO_LARGE)
+    limit = integrators.tableau(method).stability
+    status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
+    steep = jnp.any(stability.is_steep(instants.jacobian), axis=-1) & (inputs.dt * steepest > limit)
+    status |= flag(jnp.any(steep), Status.INFINITE_SLOPE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
     metrics = accuracy.results(estimate)
     if inputs.scenario.sampling is not None:
-        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(instants.jacobian)
+        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(stability.resolved(instants.jacobian))
         radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)

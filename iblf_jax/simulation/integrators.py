@@ -84,6 +84,11 @@ def _unrolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
     return Stepped(_combine(state, dt, table.b, slopes), slopes, first)
 
 
+def stage_states(method: str, state, dt: jax.Array, slopes: list) -> list:
+    """The states at which a step evaluates its later stages, given the slopes of all of them."""
+    return [_combine(state, dt, row, slopes[: len(row)]) for row in tableau(method).a[1:]]
+
+
 def _combine(state, dt, weights, slopes):
     def one(x, *ks):
         # Weights times dt are shared by all numbers and runs; x is added last, so that it is rounded once.

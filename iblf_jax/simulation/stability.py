@@ -7,6 +7,11 @@ without any physics behind them.  So every run measures its fastest mode, at its
 
 Derivatives of the loop are central differences of its rate: the rate is compiled as it is, its derivative would take thrice as long.
 
+A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0, and one instant there says nothing about the time step:
+the oscillation that a step excites ends where the difference quotient over its amplitude is small enough.  A smooth loop has the same
+derivative by differences of any small size.  So every derivative is measured by differences of three sizes, h0, 10 h0 and WIDEST (less near
+a bound, where the barrier is stiff indeed); where that of 10 h0 is much smaller than that of h0, the one of WIDEST counts (`resolved`).
+
 Where the law is sampled, what counts is the map from one period to the next.  Its derivative follows from those of plant and law: the
 plant's state goes with exp(A t), A its rate's derivative, while the torque is held.  The loop is stable only while the spectral radius of
 that map, of all that is remembered, is below 1.
@@ -34,6 +39,15 @@ SQUARINGS = 20
 """Of a map, for its spectral radius."""
 RADIUS = "sampling_radius"
 """Name of what a sampled run says of this, beside its metrics."""
+WIDER, WIDEST = 10.0, 1e-2
+"""The second size of a difference, relative to the first, and the third [rad/s or the state's unit]: an oscillation of 0.01 rad/s with the
+period of a few steps moves the positions by some 1e-5 rad."""
+WIDEST_MOVE = 1e-3
+"""rad.  The third size of a difference in a position."""
+ROOM = 0.25
+"""Largest size of a difference, relative to the distance from a bound."""
+STEEP = 0.8
+"""Ratio of the derivatives by differences of the second and the first size below which the derivative is taken to be infinite."""
 SLOWEST = 1.0
 """1/s.  A loop slower than this still follows a reference."""
 
@@ -82,22 +96,61 @@ def growth_rate_by(jacobian: jax.Array) -> jax.Array:
     return jnp.exp((logarithm / 2.0 + lengths[1] - lengths[0]) / AVERAGED)
 
 
-def along(rate_at: Callable, x: jax.Array, direction: jax.Array) -> jax.Array:
-    """The derivative of `rate_at`, (m,) -> (m,), at x along a direction, one evaluation at a time."""
-    size = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
+def difference_sizes(x: jax.Array, direction: jax.Array, room: jax.Array) -> jax.Array:
+    """The three sizes of central differences at x along a direction, (3,); `room` is the largest that makes sense, ()."""
+    first = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
+    third = jnp.maximum(first, room)
+    return jnp.stack([first, jnp.minimum(WIDER * first, third), third])
+
+
+def along(rate_at: Callable, x: jax.Array, direction: jax.Array, size: jax.Array) -> jax.Array:
+    """The derivative of `rate_at`, (m,) -> (m,), at x along a direction by a central difference, one evaluation at a time."""
     rates = jax.lax.map(rate_at, jnp.stack([x + size * direction, x - size * direction]))
     return (rates[0] - rates[1]) / (2.0 * size)
+
+
+def room_around(scenario: Scenario, t: jax.Array, plant: LoopState, size: int) -> jax.Array:
+    """The largest sizes of differences of what `closed_loop.surroundings` gives, (size,): small near bounds, WIDEST elsewhere."""
+    tube = scenario.setting.tube(t, acceleration=False)
+    side = jnp.minimum(plant.q - tube.lower, tube.upper - plant.q)
+    near = [jnp.clip(ROOM * side, 0.0, WIDEST_MOVE)]
+    if scenario.velocity_bounds is not None:
+        slow, fast = scenario.setting.speed_limits(t)
+        side = jnp.minimum(plant.dq - slow, fast - plant.dq)
+        near.append(jnp.clip(ROOM * side, 0.0, WIDEST))
+    rest = jnp.full((size - sum(x.size for x in near),), WIDEST, plant.q.dtype)
+    return jnp.concatenate([*near, rest])
+
+
+def is_steep(jacobians: jax.Array) -> jax.Array:
+    """Which columns of a Jacobian are infinite derivatives, (..., m) bool, from those by differences of three sizes, (..., 3, m, m)."""
+    lengths = jnp.sum(jnp.abs(jacobians), axis=-2)
+    return lengths[..., 1, :] < STEEP * lengths[..., 0, :]
+
+
+def resolved(jacobians: jax.Array) -> jax.Array:
+    """The Jacobian that counts, (..., m, m), from those by differences of three sizes, (..., 3, m, m)."""
+    steep = is_steep(jacobians)[..., None, :]
+    return jnp.where(steep, jacobians[..., 2, :, :], jacobians[..., 0, :, :])
 
 
 @jax.jit
 def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     """The derivative of `closed_loop.change` at (t, state), (m, m): the closed loop's Jacobian [1/s] where the law is not sampled."""
     x, whole = ravel_pytree(surroundings(state))
+    room = room_around(scenario, t, state, x.size)
 
     def rate_at(y):
         return ravel_pytree(change(scenario, t, whole(y)))[0]
 
-    return jax.lax.map(lambda unit: along(rate_at, x, unit), jnp.eye(x.size, dtype=x.dtype)).T
+    def column(each):
+        unit, size = each
+        return along(rate_at, x, unit, size)
+
+    units = jnp.eye(x.size, dtype=x.dtype)
+    sizes = jax.vmap(lambda unit, room: difference_sizes(x, unit, room))(units, room)
+    found = jax.lax.map(column, (jnp.repeat(units, 3, axis=0), sizes.ravel()))
+    return resolved(jnp.transpose(found.reshape(x.size, 3, x.size), (1, 2, 0)))
 
 
 def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:

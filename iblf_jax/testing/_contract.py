@@ -32,12 +32,20 @@ class Findings:
         self.name = type(member).__name__
         self.family = family
         self.problems: list[str] = []
+        self.remarks: list[str] = []
+        """What a user should know and what fails nothing."""
 
     def add(self, problem: str, remedy: str = "") -> None:
         """Writes one problem down, once."""
         text = f"{problem}." + (f" {remedy}" if remedy else "")
         if text not in self.problems:
             self.problems.append(text)
+
+    def remark(self, remark: str, remedy: str = "") -> None:
+        """Writes one remark down, once."""
+        text = f"{remark}." + (f" {remedy}." if remedy else "")
+        if text not in self.remarks:
+            self.remarks.append(text)
 
     def require(self, condition: Any, problem: str, remedy: str = "") -> bool:
         """Writes the problem down unless the condition holds; returns whether it holds."""

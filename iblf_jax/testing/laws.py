@@ -13,15 +13,13 @@ from iblf_jax.bounds import Bounds, Constant
 from iblf_jax.controllers import Command, Controller
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.status import Status
+from iblf_jax.core.status import VIOLATED, Status
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing.bounds import check_at_the_bounds
 from iblf_jax.testing.joints import check_scenario, scenario_for
 from iblf_jax.testing.own_claims import check_claims
-
-XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
-"""Where the law is asked for a torque, in xi: a run may get anywhere, and must stay finite there."""
 
 SHORT_RUN = 0.1
 """s."""
@@ -29,13 +27,16 @@ SPEED = 2.0
 """rad/s.  Bounds of the velocities for a law that needs some."""
 
 
-def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = None) -> None:
-    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite at the wall, a short closed loop.
+def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = None) -> tuple[str, ...]:
+    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite inside its bounds, a short closed loop.
 
     Args:
       law: an instance.
       scenario: to try it in; if not given the paper's simulation, or one like it for as many joints as the law is for.
       n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these are scalars.
+
+    Returns:
+      Remarks, such as that the law is undefined beyond its bounds, where many published laws are; an empty tuple if there are none.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
@@ -67,9 +68,10 @@ def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = Non
 
         probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.setting))
         check_claims(findings, base)
-        _at_the_wall(findings, base)
+        is_defined_beyond = check_at_the_bounds(findings, base)
         findings.stop_if_any()
-        _closed_loop(findings, in_dtype(base, "float32"))
+        _closed_loop(findings, in_dtype(base, "float32"), is_defined_beyond)
+    return tuple(findings.remarks)
 
 
 def _structure(findings: Findings, scenario: Scenario) -> None:
@@ -97,43 +99,19 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
     same_structure(findings, "the rate that command returns" + kind, rate, state)
 
 
-def _at_the_wall(findings: Findings, scenario: Scenario) -> None:
-    """Torque, V1 and their derivatives in both modes are finite wherever a run may get."""
-
-    @jax.jit
-    def numbers(scenario, xis):
-        def at(xi):
-            law, setting, t = scenario.controller, scenario.setting, jnp.asarray(0.7)
-            tube = setting.tube(t)
-
-            def functions(law, q, dq):
-                state = law.init(scenario.initial.q, scenario.initial.dq, setting)
-                command = law.command(t, q, dq, jnp.zeros_like(q), setting, state)[0]
-                return command.tau, command.alpha, command.V1
-
-            point = (law, tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l), tube.dq_d)
-            values, forward = jax.jvp(functions, point, jax.tree.map(jnp.ones_like, point))
-            reverse = jax.vjp(functions, *point)[1](jax.tree.map(jnp.ones_like, values))
-            return values, forward, reverse
-
-        return jax.vmap(at)(xis)
-
-    values, forward, reverse = numbers(scenario, jnp.asarray(XI))
-    remedy = "Near and past the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay finite"
-    for label, tree in (("the command", values), ("its forward derivative", forward), ("its reverse derivative", reverse)):
-        finite = np.all([np.all(np.isfinite(np.asarray(x).reshape(len(XI), -1)), axis=1) for x in jax.tree.leaves(tree)], axis=0)
-        where = ", ".join(f"{xi:g}" for xi, ok in zip(XI, finite, strict=True) if not ok)
-        findings.require(np.all(finite), f"{label} is not finite at xi = {where}", remedy)
-    findings.require(np.all(np.asarray(values[2]) >= 0), "V1 is negative somewhere", "It is a Lyapunov function; zeros if the law has none")
-
-
-def _closed_loop(findings: Findings, scenario: Scenario) -> None:
+def _closed_loop(findings: Findings, scenario: Scenario, is_defined_beyond: bool) -> None:
     """A short run in float32, where a state that changes its type is an error."""
     try:
         with notices.muted():
             run = simulate(scenario, duration=SHORT_RUN, dt=1e-3, record_every=10, metrics=())
     except (TypeError, ValueError) as error:
         findings.add(f"it does not run in a closed loop ({type(error).__name__}: {str(error).splitlines()[0]})")
+        return
+    left = int(run.status) & int(VIOLATED | Status.ALPHA_INFEASIBLE)
+    if left and not is_defined_beyond:
+        findings.remark(
+            "the closed loop of the check left the bounds, beyond which the law is undefined", "Try it in a scenario of its own"
+        )
         return
     lost = int(run.status) & int(Status.NOT_FINITE) and not int(run.status) & int(Status.STEP_TOO_LARGE)
     findings.require(not lost, f"the arm ran away within {SHORT_RUN} s of the closed loop", "Look at the signs of the feedback")

@@ -1,0 +1,148 @@
+"""What a law does at its bounds and beyond them: inside it must be finite, beyond it may be undefined, and that is a remark."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.testing._contract import Findings
+
+XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
+"""Where a law is evaluated, in xi: a run may get anywhere."""
+NEAR, NEARER = 1e-4, 1e-10
+"""rad/s.  e2 at which the slope of the command is measured."""
+GROWTH = 3.0
+"""How much the slope may grow from the one to the other."""
+TIME = 0.7
+"""s."""
+LABELS = ("the command", "its forward derivative", "its reverse derivative")
+
+
+class Points(NamedTuple):
+    """What a law answers at some points, one number a point."""
+
+    finite: dict[str, np.ndarray]
+    """By label, whether all numbers are finite, bool."""
+    inside: np.ndarray
+    """Whether positions, velocities and alpha are inside their bounds, bool."""
+    at_rest: np.ndarray
+    """Whether e2 = 0 on some joint, bool."""
+    V1: np.ndarray
+
+
+def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
+    """Torque, V1 and their derivatives in both modes are finite inside the bounds; whether they are beyond them, too."""
+    infinite = _infinite_in_e2(findings, scenario)
+    everywhere = _swept(findings, scenario, "xi", infinite)
+    if scenario.velocity_bounds is None:
+        return everywhere
+    return _swept(findings, scenario, "xi of the velocity", infinite) and everywhere
+
+
+def _command(scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Torque, alpha and V1 without a disturbance."""
+    setting = scenario.setting
+    state = law.init(scenario.initial.q, scenario.initial.dq, setting)
+    command = law.command(jnp.asarray(TIME), q, dq, jnp.zeros_like(q), setting, state)[0]
+    return command.tau, command.alpha, command.V1
+
+
+def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
+    """Whether the slope of the torque grows without limit towards e2 = 0; a finding if it does."""
+
+    @jax.jit
+    def slope(scenario, e2):
+        law, tube = scenario.controller, scenario.setting.tube(jnp.asarray(TIME))
+        q = tube.q_d + 0.3 * tube.k_u
+        alpha = _command(scenario, law, q, tube.dq_d)[1]
+        one = jnp.ones_like(alpha)
+        return jax.jvp(lambda dq: _command(scenario, law, q, dq)[0], (alpha + e2,), (one,))[1]
+
+    near, nearer = (float(np.max(np.abs(slope(scenario, jnp.asarray(e2))))) for e2 in (NEAR, NEARER))
+    if not np.isfinite(near) or nearer <= GROWTH * near + 1.0:
+        return False
+    findings.add(
+        "the derivative of the torque with respect to e2 = q' - alpha is infinite at e2 = 0 "
+        f"(it is {near:.3g} N m s/rad at e2 = {NEAR:g} rad/s and {nearer:.3g} at {NEARER:g})",
+        "Replace a power |e2|^a sign(e2) with a < 1 by e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta",
+    )
+    return True
+
+
+def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bool) -> bool:
+    """Looks along the positions ("xi") or the velocities across their bounds; whether everything is finite beyond them."""
+    found, xi = _at_points(scenario, axis), np.asarray(XI)
+    beyond = np.zeros(xi.size, bool)
+    remedy = "Near the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay finite"
+    for label, finite in found.finite.items():
+        beyond |= ~finite & ~found.inside
+        bad = ~finite & found.inside
+        if label != LABELS[0] and infinite_in_e2:
+            bad &= ~found.at_rest
+        if np.array_equal(xi[bad], [0.0]) and label != LABELS[0]:
+            smooth = "Smooth a root, a norm or a power below 1 of an error there, as (e^2 + delta^2)^(1/2) for |e|"
+            findings.add(f"{label} is not finite where the error is 0", smooth)
+            continue
+        findings.require(not np.any(bad), f"{label} is not finite at {axis} = {_listed(xi[bad])}, inside the bounds", remedy)
+    findings.require(
+        np.all(found.V1[found.inside & found.finite[LABELS[0]]] >= 0),
+        "V1 is negative somewhere",
+        "It is a Lyapunov function; zeros if the law has none",
+    )
+    if np.any(beyond):
+        what = "bound" if axis == "xi" else "velocity bound"
+        findings.remark(
+            f"the law is undefined beyond the {what}: it or its derivative is not finite at {axis} = {_listed(xi[beyond])}",
+            "A run that leaves the bounds is frozen there and flagged NOT_FINITE; with iblf_jax.barriers.guarded_error it would go on",
+        )
+    return not np.any(beyond)
+
+
+def _listed(xi: np.ndarray) -> str:
+    return ", ".join(f"{x:g}" for x in xi)
+
+
+def _at_points(scenario: Scenario, axis: str) -> Points:
+    """The law at all XI along an axis."""
+
+    @jax.jit
+    def answers(scenario, xis):
+        def at(xi):
+            law, setting, t = scenario.controller, scenario.setting, jnp.asarray(TIME)
+            tube = setting.tube(t)
+            q, dq = tube.q_d, tube.dq_d
+            limits: Any = () if scenario.velocity_bounds is None else setting.speed_limits(t)
+            if axis == "xi":
+                q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+            else:
+                alpha = _command(scenario, law, q, dq)[1]
+                dq = alpha + xi * jnp.where(xi > 0, limits[1] - alpha, alpha - limits[0])
+
+            def functions(law, q, dq):
+                return _command(scenario, law, q, dq)
+
+            point = (law, q, dq)
+            values, forward = jax.jvp(functions, point, jax.tree.map(jnp.ones_like, point))
+            reverse = jax.vjp(functions, *point)[1](jax.tree.map(jnp.ones_like, values))
+            inside = jnp.abs(xi) < 1.0
+            for x in (dq, values[1]) if limits else ():
+                outside = (x <= limits[0]) | (x >= limits[1])
+                inside &= ~jnp.any(outside)
+            at_rest = jnp.any(jnp.abs(dq - values[1]) < 1e-12)
+            return (values, forward, reverse), inside, at_rest
+
+        return jax.vmap(at)(xis)
+
+    trees, inside, at_rest = answers(scenario, jnp.asarray(XI))
+    finite = {label: _all_finite(tree) for label, tree in zip(LABELS, trees, strict=True)}
+    return Points(finite, np.asarray(inside), np.asarray(at_rest), np.asarray(trees[0][2]))
+
+
+def _all_finite(tree: Any) -> np.ndarray:
+    """Whether all numbers of each point are finite, bool."""
+    parts = [np.isfinite(np.asarray(x).reshape(len(XI), -1)).all(axis=1) for x in jax.tree.leaves(tree)]
+    return np.all(parts, axis=0)
