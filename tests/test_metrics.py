@@ -148,39 +148,39 @@ def test_access_by_name_and_by_attribute(short_run):
 
 # -------------------------------------------------------------------------------------------- integrals are of second order
 
-SLOW = {"controller.K2": 4.0, "observer.kf": 4.0}
+SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0})
 STEP = ij.disturbances.Step(size=[8.0, 3.0], time=0.0631)
 LOOPS = {
     "continuous": {},
-    "sampled": {"sampling": ij.Sampling(period=2e-2, delay=0.0073)},
+    "sampled": {"sampling": ij.Sampling(period=1e-2, delay=0.0037)},
     "disturbed": {"disturbance": STEP},
-    "sampled and disturbed": {"disturbance": STEP, "sampling": ij.Sampling(period=2e-2)},
+    "sampled and disturbed": {"disturbance": STEP, "sampling": ij.Sampling(period=1e-2)},
 }
 """Parts of scenarios in which nothing jumps, torque and law signals do, the disturbance does, and both."""
+QUICK = ("continuous", "sampled and disturbed")
 INTEGRALS = ("rmse", "ise", "iae", "itae", "effort", "torque_rms", "effort_above_gravity", "estimate_rmse")
 
 
-@pytest.mark.parametrize("loop", [pytest.param(x, marks=pytest.mark.slow) if x == "sampled" else x for x in LOOPS])
-def test_integrals_are_of_second_order(paper, loop):
-    """In whatever jumps; the disturbance at 0.0631 s is at no instant, and the command arrives within a step."""
-    scenario = dataclasses.replace(ij.with_parameters(paper, SLOW), **LOOPS[loop])
+@pytest.mark.parametrize("loop", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LOOPS])
+def test_integrals_are_of_second_order(loop):
+    """Whatever jumps: the disturbance does at 0.0631 s, which is at no instant, and the command arrives within a step."""
+    scenario = dataclasses.replace(SLOW, **LOOPS[loop])
     folds = (ij.metrics.Tracking(), ij.metrics.Torque(), ij.metrics.AboveGravity(), ij.metrics.Estimation())
 
-    def integrals(dt):
-        found = ij.simulate(scenario, duration=0.12, dt=dt, metrics=folds, record_every=10_000).metrics
-        return {name: np.asarray(found[name]) for name in INTEGRALS}
+    def integrals(parts):
+        return ij.simulate(scenario, duration=0.12, dt=1e-2 / parts, metrics=folds, record_every=10_000).metrics
 
-    truth, coarse, fine = integrals(2e-2 / 320), integrals(1e-2), integrals(2.5e-3)
+    coarse, fine, truth = (integrals(parts) for parts in (8, 32, 128))
     for name in INTEGRALS:
         errors = [np.max(np.abs(x[name] - truth[name]) / np.abs(truth[name])) for x in (coarse, fine)]
-        assert errors[1] < 1e-3, (name, errors)
-        # The order over two halvings; an error by chance smaller than the leading term says nothing.
-        assert errors[1] < 1e-6 or np.log2(errors[0] / errors[1]) / 2 > 1.85, (name, errors)
+        assert errors[0] < 6e-3, (name, errors)
+        # Where the leading terms cancel, a smaller one, of the cell that the jump divides, is all that is left.
+        assert errors[1] < 1e-7 or np.log2(errors[0] / errors[1]) / 2 > 1.9, (name, errors)
 
 
-def test_one_definition_serves_runs_batches_and_losses(paper):
+def test_one_definition_serves_runs_batches_and_losses():
     """A disturbance that jumps within a step, under a sampled law: the numbers of a run, a batch and a loss are the same."""
-    scenario = dataclasses.replace(ij.with_parameters(paper, SLOW), **LOOPS["sampled and disturbed"])
+    scenario = dataclasses.replace(SLOW, **LOOPS["sampled and disturbed"])
     timing = {"duration": 0.12, "dt": 1e-2}
     run = ij.simulate(scenario, **timing)
     study = ij.monte_carlo(scenario, {"disturbance.time": ij.value(ij.uniform(0.05, 0.07))}, runs=3, progress=False, **timing)

@@ -387,6 +387,7 @@ def _later_pieces(
     along: _Loop, pieces: tuple[jumps.Piece, ...], stepped: integrators.Stepped, accumulators: tuple, method: str, form: Form
 ) -> _Later:
     """The pieces after the first, each with the samples before and after the jump at which it begins."""
+    # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
     folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
     moved, parts, nodes = stepped.state, [], []
     status = jnp.int32(0) if len(pieces) > 1 else None
@@ -399,7 +400,7 @@ def _later_pieces(
                 left = along.at(last, last.begin + last.length, moved)[1]
                 left = _weighed(left, piece.begin, 0.5 * last.length, none)
                 between = accumulators = _updated(folds, accumulators, left)
-            made = _integrated(along, piece, moved, method, form)
+            made = _integrated(along, piece, moved, method, form._replace(rolled=not form.scalar))
             right = _weighed(made.first, piece.begin, 0.5 * piece.length, none)
             accumulators = _updated(folds, accumulators, right)
             return (made.state, accumulators, status | sample_status(right)), (made.slopes, left, between, right)
