@@ -6,6 +6,7 @@ observer.  alpha' is derived by hand here, and by automatic differentiation ther
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,7 +66,10 @@ class Loop:
         return M, C, G, dM
 
     def evaluate(self, t, x, since=None):
-        """The rate of (q, q', eta), and what the package records; of the steps, those count that have appeared at `since`, t if not given."""
+        """The rate of (q, q', eta), and what the package records.
+
+        Of the steps, those count that have appeared at the time `since`; t if not given.
+        """
         q, v, eta = x[:2], x[2:4], x[4:]
         M, C, G, dM_dq2 = self.arm(q)
         xd, dxd, ddxd = sine(*self.reference)(t)
@@ -108,7 +112,7 @@ class Loop:
         """The state at the end of a run whose integration is split where a step appears."""
         x = np.concatenate([self.q0, self.dq0, np.zeros(2)])
         cuts = [0.0, *sorted({time for time, _ in self.steps if 0.0 < time < duration}), duration]
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        for a, b in itertools.pairwise(cuts):
             found = solve_ivp(lambda t, x, a=a: self.evaluate(t, x, since=a)[0], (a, b), x, "DOP853", rtol=rtol, atol=0.01 * rtol)
             x = found.y[:, -1]
         return x

@@ -28,8 +28,8 @@ class Actuator(Protocol):
     """What the package asks of an actuator.
 
     One with limits also has `unlimited`, the same without them: how fast a loop is, is measured on it.  One that changes with time, such
-    as a drive that fails, also has `at(t)`, the actuator as it is at time t [s], and, if it jumps, `jump_times()`, (m,) [s], as disturbances
-    have: steps of a run are divided there.
+    as a drive that fails, also has `at(t)`, the actuator as it is at time t [s], and, if it jumps, `jump_times()`, (m,) [s], as
+    disturbances have: steps of a run are divided there.
     """
 
     def init(self, tau: jax.Array) -> State:

@@ -1,7 +1,8 @@
 """Parts of a scenario that change with time: what they are at an instant, and when they jump.
 
-A part that changes with time may have `at(t)`, itself as it is at time t [s].  One whose methods, or whose `at`, are discontinuous in time
-declares the instants by `jump_times()`; a step of a run is divided there.  Both are optional in every family but the disturbances.
+A part that changes with time may have `at(t)`, which returns the part as it is at time t [s].  A part
+that is discontinuous in time declares the instants by `jump_times()`, and steps of a run are divided
+there.  Both methods are optional in every family, but for the `jump_times` of disturbances.
 """
 
 from __future__ import annotations

@@ -138,7 +138,6 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
     One tangent through the law costs as much as the law; applying the Jacobian costs a tenth of it.  Of a sampled loop a stage is the plant
     alone: value and derivatives by 12 gains of `presets.ur5` take 4.0 times as long as the value, and 7.4 times without this.
     """
-
     jumps = scenario.jump_times().size > 0
 
     def loop(moved, t, state, dt=0.0, torque=None):

@@ -20,9 +20,9 @@ is dt |k_3 - k_2| |dt A|^2 / 30; Heun's is dt |k_2 - k_1| |dt A| / 6, where |dt 
 taken.  J is what the map from a period to the next is as a rate.
 
 What the stages of a step cannot see, a reference or a disturbance that goes through whole periods between them, is looked for on its own
-(`between_stages`).  At the jump times of a scenario a step is divided (`jumps`), and no difference reaches over one of them: there, too, a
-step's own error is told by its stages alone.  Against runs at a sixteenth of the step the estimate is a third to thirty times the error where that matters, above
-1e-4 of the tube, and larger below.
+(`between_stages`).  At the jump times of a scenario a step is divided (`jumps`), and no difference reaches over one
+of them: there, too, the stages of a step give its error.  Against runs at a sixteenth of the step the estimate is a third to thirty times
+the error where that matters, above 1e-4 of the tube, and larger below.
 """
 
 from __future__ import annotations

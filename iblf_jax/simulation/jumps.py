@@ -1,16 +1,19 @@
 """Where a step is divided: at the instants at which the right-hand side of the closed loop jumps.
 
-A Runge-Kutta step across a jump is of first order whatever the method, so a step is integrated in pieces that end where
+A Runge-Kutta step across a jump is of first order, whatever the method.  So a step is integrated in
+pieces that end where
 
-    a jump time of the scenario lies in it,      t_k < t_j <= t_(k+1)      (`Scenario.jump_times`),
-    a command of a sampled law arrives in it     (`sampling.arriving`).
+    a jump time of the scenario lies in it,   t_k < t_j <= t_(k+1)   (`Scenario.jump_times`),
+    a command of a sampled law arrives in it  (`sampling.arriving`).
 
-A jump at the end of a step belongs to that step: a piece of length 0 follows it, through which the state has a derivative by the jump time
-there too.  The lengths of the pieces carry the derivatives by jump times and delays; so the jump of the right-hand side reaches the
-derivative of the state by itself.
+A jump at the end of a step belongs to that step.  A piece of length 0 follows it, through which the
+state has a derivative by the jump time there, too.  The lengths of the pieces carry the derivatives
+by jump times and delays, so the jump of the right-hand side reaches the derivative of the state.
+Two jumps at one time have the derivative of both together, which the first of them gets.
 
-The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, one that begins there after it.  As a jump
-time may be the result of rounding, stages keep away from it by `APART` units in the last place.
+The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, one
+that begins there after it.  A jump time may be the result of rounding, so stages keep away from it
+by `APART` units in the last place.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ import jax.numpy as jnp
 from iblf_jax.simulation import integrators
 
 MOST_CUTS = 4
-"""Jumps at which one step is divided at most.  A step with more of them is one whose accuracy is not known."""
+"""Jumps at which one step is divided at most; the accuracy of a step with more is not known."""
 APART = 4.0
 """Units in the last place between a stage and a jump time."""
 
@@ -69,7 +72,7 @@ class Division(NamedTuple):
 
 @jax.custom_jvp
 def _limited(t: jax.Array, least: jax.Array, most: jax.Array) -> jax.Array:
-    """t within two limits, with the derivative of t itself."""
+    """The time t within two limits, with the derivative of t itself."""
     return jnp.minimum(jnp.maximum(t, least), most)
 
 
@@ -79,13 +82,8 @@ def _(primals, tangents):
 
 
 def stage_time(piece: Piece, t: jax.Array) -> jax.Array:
-    """The time at which a stage of a piece is evaluated, () [s]: on the piece's side of every jump."""
+    """The time at which a stage is evaluated, () [s]: on its piece's side of every jump."""
     return t if piece.earliest is None else _limited(t, piece.earliest, piece.latest)
-
-
-def end_of(piece: Piece) -> jax.Array:
-    """The end of a piece, approached from within it, () [s]."""
-    return stage_time(piece, piece.begin + piece.length)
 
 
 def divided(times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] | None = None) -> Division:
@@ -137,7 +135,7 @@ def _arrived(done: jax.Array, number: int, jumps: int, can_arrive: bool) -> Any:
 
 
 def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array, jax.Array]:
-    """Between which times the stages of a piece lie that begins after some jumps and ends before the others, () [s] each."""
+    """Between which times the stages of a piece lie, () [s] each: after some jumps, before others."""
     times = jax.lax.stop_gradient(times)
     apart = APART * jnp.finfo(times.dtype).eps * jnp.abs(times)
     earliest = jnp.max(jnp.where(passed, times + apart, span.start))
@@ -159,7 +157,7 @@ def within(times: jax.Array, after: jax.Array, until: jax.Array) -> jax.Array:
 
 
 def since_last(times: jax.Array, before: Span, arrival: tuple[jax.Array, jax.Array] | None = None) -> jax.Array:
-    """How long before the end of a step its last piece begins, () [s]: the whole step where nothing divides it.
+    """How long before the end of a step its last piece begins, () [s]; the step if it is whole.
 
     Args:
       times: the scenario's jump times, (J,) [s].

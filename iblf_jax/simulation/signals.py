@@ -72,7 +72,7 @@ class Sample(Signals):
     guard_active: Array
     saturated: Array
     step: Any = dataclasses.field(default=0.0, kw_only=True)
-    """Time since the instant before, () [s]; 0 for the first instant, and for a sample beside a jump, which is none of the run's instants."""
+    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples beside a jump."""
 
 
 def has(sample: Signals, signal: str) -> bool:

@@ -65,7 +65,17 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
     k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
     numbers |= {"slack": np.abs(wave(0.1)), "dq_lower": np.full((LENGTH, n), -0.9), "dq_upper": np.full((LENGTH, n), 1.1)}
     numbers |= {"region_margin": 0.3 + wave(0.2)[:, :REGIONS], "region_slack": np.abs(wave(0.1))[:, :REGIONS]}
-    numbers |= sides | {"q": q_d + e1, "e1": e1, "xi": e1 / k, "q_d": q_d, "tau": tau, "V": np.abs(wave(1.0))[:, 0], "t": t, "dt": dt, "step": since}
+    numbers |= sides | {
+        "q": q_d + e1,
+        "e1": e1,
+        "xi": e1 / k,
+        "q_d": q_d,
+        "tau": tau,
+        "V": np.abs(wave(1.0))[:, 0],
+        "t": t,
+        "dt": dt,
+        "step": since,
+    }
     flags = {name: rng.uniform(size=(LENGTH, n)) < 0.3 for name in ("guard_active", "saturated")}
     return samples_from({k: jnp.asarray(v) for k, v in numbers.items()}, {k: jnp.asarray(v) for k, v in flags.items()})
 

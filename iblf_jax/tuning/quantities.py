@@ -64,9 +64,9 @@ NEEDS = {"velocity_deficit": "dq_lower", "region_deficit": "region_margin"}
 def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any) -> jax.Array:
     """A signal at one sample, (n,), (2 n,) or one number a region.
 
-    error e1; torque tau; torque_rate (tau - last tau) / step, over the step before an instant, which also counts a jump of the torque within
-    it; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose
-    integral of squares is the time outside the tolerance; deficit (lower - q, q - upper), the largest of which is minus the margin;
+    error e1; torque tau; torque_rate (tau - last tau) / step, the mean over the step before an instant, jumps of the torque included;
+    outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose integral of squares is the time outside the tolerance;
+    deficit (lower - q, q - upper), the largest of which is minus the margin;
     velocity_deficit the same of the velocities; region_deficit minus the distances to the walls of the regions.
     """
     if name == "error":
