@@ -2,8 +2,7 @@
 
 At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first stage of the integrator.  Where its
 right-hand side or its signals jump, a step is integrated in pieces (`simulation.jumps`), and the metrics see the limits from both sides; a
-step without a jump costs no more than the comparison.  A state that
-runs away is frozen at its last good value and flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound
+step without a jump costs no more than the comparison.  A state that runs away is frozen at its last good value and flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound
 is remembered, because the loop is stiffest there.  The step from the last instant is not made: its sample alone counts.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps that are equal compile once.  Before
@@ -283,7 +282,8 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
     if scenario.sampling is None:
         moment = _moment(inputs, index, method, None)
         along = _Loop(at, inputs, state, ())
-        accumulators, early = carry.accumulators, ()
+        accumulators = carry.accumulators
+        early: tuple[Node, ...] = ()
     else:
         now = sampling.instant(scenario.sampling, dt, index)
         due = (now.phase == 0) & (index > 0)
@@ -395,7 +395,8 @@ def _later_pieces(
 
         def further(kept, last=last, piece=piece):
             moved, accumulators, status = kept
-            between, left = (), ()
+            between: Any = ()
+            left: Any = ()
             if folds:
                 left = along.at(last, last.begin + last.length, moved)[1]
                 left = _weighed(left, piece.begin, 0.5 * last.length, none)

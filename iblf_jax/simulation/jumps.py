@@ -104,7 +104,10 @@ def divided(times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] |
     if arrival is not None:
         places = jnp.concatenate([arrival[0][None], places])
         pending = jnp.concatenate([(arrival[1] & span.counts)[None], pending])
-    pieces, begin, since, made, done = [], span.start, None, True, jnp.zeros_like(pending)
+    pieces: list[Piece] = []
+    begin, done = span.start, jnp.zeros_like(pending)
+    since: Any = None
+    made: Any = True
     for number in range(most + 1):
         until, chosen = span.length, None
         if number < most:
