@@ -299,6 +299,7 @@ def _rollout(scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_
     samples, results, raised = _observed(scenario, folds, step_size, motion)
     status = np.bitwise_or.reduce(np.asarray(raised)) | (int(Status.NOT_FINITE) if motion.broken else 0)
     at = np.flatnonzero(motion.instant)[::record_every]
+    recorded = jax.tree.map(lambda x: x[at], samples)
     states = jax.tree.map(lambda x: jnp.asarray(x[motion.sample[at]]), motion.states)
     return Rollout(
         scenario=scenario,
@@ -312,5 +313,5 @@ def _rollout(scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_
         measured=states.held.measured,
         method=method,
         steps=int(np.sum(motion.instant)) - 1,
-        **{name: getattr(samples, name)[at] for name in SIGNALS},
+        **{name: getattr(recorded, name) for name in SIGNALS},
     )
