@@ -17,12 +17,13 @@ from iblf_jax.actuators._base import Delivered
 from iblf_jax.core import linalg
 from iblf_jax.core.status import Status
 from iblf_jax.engine import step_size
-from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.execute import run_batch, run_batch_jvp, run_for_reverse
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.tuning.quantities import Quantities
 
 RUNS = 48
 FINER = 16
@@ -235,8 +236,8 @@ def split(steps, **fields):
 
 
 def test_a_step_is_divided_where_a_disturbance_jumps():
-    """Under one step in a continuous loop at 4 and 10 ms: the error is that of a smooth loop, and the estimate is not below it."""
-    truth, scenario = split(((LATE, (20.0, 5.0)),)), with_steps(SLOW, ((LATE, (20.0, 5.0)),))
+    """Two jumps within one step of 4 or 10 ms: the error is that of a smooth loop, and the estimate is not below it."""
+    truth, scenario = split(MANY[2:4]), with_steps(SLOW, MANY[2:4])
     for dt, most in ((4e-3, 1e-7), (1e-2, 5e-6)):
         run = ij.simulate(scenario, duration=0.4, dt=dt)
         error = np.abs(np.asarray(run.q[-1]) - truth[:2])
@@ -245,9 +246,9 @@ def test_a_step_is_divided_where_a_disturbance_jumps():
         assert run.ok
 
 
-@pytest.mark.parametrize("steps", [MANY[1:4], pytest.param(MANY, marks=pytest.mark.slow)], ids=["three", "five"])
-def test_many_jumps_at_all_places_of_a_step(steps):
-    truth, scenario = split(steps), with_steps(SLOW, steps)
+@pytest.mark.slow
+def test_many_jumps_at_all_places_of_a_step():
+    truth, scenario = split(MANY), with_steps(SLOW, MANY)
     runs = {dt: ij.simulate(scenario, duration=0.4, dt=dt) for dt in (8e-3, 4e-3, 2e-3)}
     np.testing.assert_allclose(np.append(runs[4e-3].q[-1], runs[4e-3].dq[-1]), truth[:4], atol=2e-6)
     errors = [np.max(np.abs(runs[dt].q[-1] - truth[:2])) for dt in (8e-3, 2e-3)]
@@ -272,20 +273,40 @@ def test_more_jumps_than_a_step_is_divided_at_are_flagged():
     assert not int(ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3).status) & Status.INACCURATE
 
 
-def test_derivatives_by_a_jump_time_are_those_of_the_split_flow():
-    """By time, size and gain against differences of the independent program, within a step and at the end of one."""
-    for time in (LATE, 0.2):  # 0.2 is the end of a step
-        scenario = with_steps(SLOW, ((time, (20.0, 5.0)),))
+@pytest.mark.parametrize("time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"])
+def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
+    """By time and size, against differences of the independent program."""
+    scenario = with_steps(SLOW, ((time, (20.0, 5.0)),))
 
-        def end(values, scenario=scenario):
-            return ij.simulate(ij.with_parameters(scenario, values), duration=0.4, dt=4e-3, record_every=100).q[-1]
+    def end(values):
+        return ij.simulate(ij.with_parameters(scenario, values), duration=0.4, dt=4e-3, record_every=100).q[-1]
 
-        here = {"disturbance.parts[0].time": jnp.asarray(time), "disturbance.parts[0].size": jnp.array([20.0, 5.0])}
-        slopes = jax.jacfwd(end)(here)
-        by_time = (split(((time + 1e-5, (20.0, 5.0)),)) - split(((time - 1e-5, (20.0, 5.0)),))) / 2e-5
-        by_size = (split(((time, (20.01, 5.0)),)) - split(((time, (19.99, 5.0)),))) / 0.02
-        np.testing.assert_allclose(slopes["disturbance.parts[0].time"], by_time[:2], rtol=1e-5)
-        np.testing.assert_allclose(slopes["disturbance.parts[0].size"][:, 0], by_size[:2], rtol=1e-5, atol=1e-7)
+    here = {"disturbance.parts[0].time": jnp.asarray(time), "disturbance.parts[0].size": jnp.array([20.0, 5.0])}
+    slopes = jax.jacfwd(end)(here)
+    by_time = (split(((time + 1e-5, (20.0, 5.0)),)) - split(((time - 1e-5, (20.0, 5.0)),))) / 2e-5
+    by_size = (split(((time, (20.01, 5.0)),)) - split(((time, (19.99, 5.0)),))) / 0.02
+    np.testing.assert_allclose(slopes["disturbance.parts[0].time"], by_time[:2], rtol=1e-5)
+    np.testing.assert_allclose(slopes["disturbance.parts[0].size"][:, 0], by_size[:2], rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampling", [None, ij.Sampling(period=1e-2, delay=0.0033)], ids=["continuous", "sampled"])
+def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
+    """What `tune` and `sensitivity` use: losses and their derivatives by jump time and gain, against differences."""
+    scenario = canonical(with_steps(dataclasses.replace(SLOW, sampling=sampling), MANY[2:3]))
+    objective = ij.objectives.tracking() + ij.objectives.effort() + ij.objectives.torque_rate()
+    folds, dt, run, path = (Quantities(objective.quantities),), jnp.asarray(1e-2), Run(30), "disturbance.parts[0].time"
+    directions = {path: np.array([1.0, 0.0]), "controller.K2": np.array([[0.0, 0.0], [1.0, 0.0]])}
+    found = jax.jit(lambda v: run_batch_jvp(scenario, {path: v}, directions, folds, dt, run))(jnp.array([LATE, 0.05]))
+    ends = jax.jit(lambda v: run_batch(scenario, {path: v}, folds, dt, run).metrics["tuning_exact"])(jnp.array([LATE - 1e-6, LATE + 1e-6]))
+    expected = np.asarray(ends[1] - ends[0]) / 2e-6
+    np.testing.assert_allclose(found.tangents["tuning_exact"][0, 0], expected, rtol=1e-5)
+
+    def loss(time):
+        metrics = run_for_reverse(ij.with_parameters(scenario, {path: time}), folds, dt, run).metrics
+        return jnp.sum(metrics["tuning_exact"])
+
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(jnp.asarray(LATE)), np.sum(expected), rtol=1e-5)
 
 
 @pytest.mark.parametrize("backend", ["native", pytest.param("xla", marks=pytest.mark.slow), pytest.param("vmap", marks=pytest.mark.slow)])
@@ -375,7 +396,7 @@ PARTS = {
 }
 
 
-@pytest.mark.parametrize("part", [x if x in ("actuator", "reference") else pytest.param(x, marks=pytest.mark.slow) for x in PARTS])
+@pytest.mark.parametrize("part", [x if x == "actuator" else pytest.param(x, marks=pytest.mark.slow) for x in PARTS])
 def test_every_part_may_jump(part):
     """What is switched at 0.0537 s costs no order: the errors at 4 and 1 ms are those of a smooth loop."""
     quiet = dataclasses.replace(SLOW, disturbance=ij.disturbances.Nothing(), **PARTS[part]())
@@ -407,6 +428,7 @@ class NoTimes:
         return "never"
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_does_not_declare_its_jump_is_still_counted():
     """The estimate sees it in the rates, as it saw every jump before."""
     hidden = dataclasses.replace(SLOW, disturbance=Undeclared(ij.disturbances.Step(size=[20.0, 5.0], time=LATE)))

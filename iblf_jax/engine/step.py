@@ -2,8 +2,9 @@
 
 At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first stage of the integrator.  Where its
 right-hand side or its signals jump, a step is integrated in pieces (`simulation.jumps`), and the metrics see the limits from both sides; a
-step without a jump costs no more than the comparison.  A state that runs away is frozen at its last good value and flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound
-is remembered, because the loop is stiffest there.  The step from the last instant is not made: its sample alone counts.
+step without a jump costs no more than the comparison.  A state that runs away is frozen at its last good value and flagged, so that no NaN
+ever enters a batch or a gradient; the instant nearest to a bound is remembered, because the loop is stiffest there.  The step from the last
+instant is not made: its sample alone counts.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps that are equal compile once.  Before
 the first and after the last step come `start` and `verdict`, which hold no evaluation of the closed loop; what they need of it, its
