@@ -23,7 +23,11 @@ from iblf_jax.robots import Robot
 
 
 class Side(Protocol):
-    """What the package asks of one side of the bounds."""
+    """What the package asks of one side of the bounds.
+
+    One that is switched at some times also has `jump_times()`, the times at which it or its rate jumps, (m,) [s], as disturbances have:
+    steps of a run are divided there.
+    """
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for bounds that follow it.

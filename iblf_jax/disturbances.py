@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.robots import Robot
 
 
@@ -32,7 +33,11 @@ class Disturbance(Protocol):
         ...
 
     def jump_times(self) -> jax.Array:
-        """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is."""
+        """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is.
+
+        Steps of a run are divided there, so a torque that jumps and does not say so costs accuracy.  How many there are is fixed; the
+        times are computed from leaves with jnp, may differ between runs, and have derivatives.
+        """
         ...
 
 
@@ -218,7 +223,7 @@ class Sum:
 
     def jump_times(self) -> jax.Array:
         """The parts' jump times together, (m,) [s]."""
-        return jnp.concatenate([_never(), *(part.jump_times() for part in self.parts)])
+        return joined([jump_times_of(f"Sum.parts[{i}]", part) for i, part in enumerate(self.parts)])
 
 
 MEMBERS = {

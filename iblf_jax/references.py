@@ -20,7 +20,11 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
 class Reference(Protocol):
-    """What the package asks of a reference."""
+    """What the package asks of a reference.
+
+    One that is switched at some times also has `jump_times()`, the times at which q_d, q_d' or q_d" jumps, (m,) [s], as disturbances have:
+    steps of a run are divided there.
+    """
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad], twice differentiable in t [s]."""

@@ -6,6 +6,7 @@ observer.  alpha' is derived by hand here, and by automatic differentiation ther
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,6 +47,8 @@ class Loop:
     upper: tuple = (0.9, 0.14, 1.0, (np.pi / 2, 0.0))
     force_a: tuple = (0.0, 0.3, 1.0, (0.0, np.pi / 2))
     force_b: tuple = (0.0, 0.3, 0.5, (np.pi / 2, 0.0))
+    steps: tuple = ()
+    """Torques that appear at a time: pairs of time and size."""
 
     def arm(self, q):
         """M, the function (v, u) -> C(q, v) u, and G."""
@@ -62,8 +65,11 @@ class Loop:
         dM = -p3 * sin2 * np.array([[2.0, 1.0], [1.0, 0.0]])
         return M, C, G, dM
 
-    def evaluate(self, t, x):
-        """The rate of (q, q', eta), and what the package records."""
+    def evaluate(self, t, x, since=None):
+        """The rate of (q, q', eta), and what the package records.
+
+        Of the steps, those count that have appeared at the time `since`; t if not given.
+        """
         q, v, eta = x[:2], x[2:4], x[4:]
         M, C, G, dM_dq2 = self.arm(q)
         xd, dxd, ddxd = sine(*self.reference)(t)
@@ -87,6 +93,7 @@ class Loop:
         f_hat = eta + self.kf * (M @ v)
         tau = C(v) @ (alpha if self.corrected else v) + G + M @ dalpha - f_hat - self.K2 * e2 - slope
         f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
+        f = f + sum((np.asarray(size) for time, size in self.steps if time <= (t if since is None else since)), np.zeros(2))
         ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
         known = tau - C(v) @ v - G + self.kf * (M @ v) + (dM_dq2 * v[1] @ v if self.corrected else 0.0)
         deta = -self.kf * eta - self.kf * known
@@ -100,3 +107,12 @@ class Loop:
         solution = solve_ivp(lambda t, x: self.evaluate(t, x)[0], span, x0, "DOP853", t_eval=times, rtol=rtol, atol=0.01 * rtol)
         outputs = [self.evaluate(t, x)[1] for t, x in zip(times, solution.y.T, strict=True)]
         return {"q": solution.y[:2].T, "dq": solution.y[2:4].T, **{k: np.array([o[k] for o in outputs]) for k in outputs[0]}}
+
+    def end(self, duration, rtol=1e-12):
+        """The state at the end of a run whose integration is split where a step appears."""
+        x = np.concatenate([self.q0, self.dq0, np.zeros(2)])
+        cuts = [0.0, *sorted({time for time, _ in self.steps if 0.0 < time < duration}), duration]
+        for a, b in itertools.pairwise(cuts):
+            found = solve_ivp(lambda t, x, a=a: self.evaluate(t, x, since=a)[0], (a, b), x, "DOP853", rtol=rtol, atol=0.01 * rtol)
+            x = found.y[:, -1]
+        return x

@@ -10,17 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT
+from independent import Loop
 
 import iblf_jax as ij
+from iblf_jax.actuators._base import Delivered
 from iblf_jax.core import linalg
 from iblf_jax.core.status import Status
 from iblf_jax.engine import step_size
-from iblf_jax.engine.execute import run_batch
+from iblf_jax.engine.execute import run_batch, run_batch_jvp, run_for_reverse
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.tuning.quantities import Quantities
 
 RUNS = 48
 FINER = 16
@@ -245,3 +248,237 @@ def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
     with pytest.warns(ij.SimulationWarning, match="time step is too large"):
         run = ij.simulate(scenario, duration=0.5, dt=1e-2, record_every=50)
     assert int(run.status) & ij.Status.STEP_TOO_LARGE
+
+
+# ------------------------------------------------------------------------------------------ what jumps within a step
+
+SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
+LATE = 0.2137
+MANY = ((0.0, (3.0, 1.0)), (0.1, (-4.0, 2.0)), (LATE, (20.0, 5.0)), (0.2151, (-9.0, -3.0)), (7.0, (50.0, 50.0)))
+"""At the start, at the edge of a step, two within one step of 4 ms, and after the end."""
+
+
+def with_steps(scenario, steps):
+    parts = tuple(ij.disturbances.Step(size=list(size), time=time) for time, size in steps)
+    return dataclasses.replace(scenario, disturbance=ij.disturbances.Sum(parts))
+
+
+def split(steps, **fields):
+    """The end of the loop `SLOW` under steps, by a program that shares nothing with the package."""
+    loop = Loop(K2=np.full(2, 4.0), kf=np.full(2, 4.0), force_a=(0.0, 0.0, 1.0, 0.0), force_b=(0.0, 0.0, 1.0, 0.0), steps=steps, **fields)
+    return loop.end(0.4)
+
+
+def test_a_step_is_divided_where_a_disturbance_jumps():
+    """Two jumps within one step of 4 or 10 ms: the error is that of a smooth loop, and the estimate is not below it."""
+    truth, scenario = split(MANY[2:4]), with_steps(SLOW, MANY[2:4])
+    for dt, most in ((4e-3, 1e-7), (1e-2, 5e-6)):
+        run = ij.simulate(scenario, duration=0.4, dt=dt)
+        error = np.abs(np.asarray(run.q[-1]) - truth[:2])
+        assert np.all(error < most), (dt, error)
+        assert np.all(run.metrics.numerical_error > 0.3 * error)
+        assert run.ok
+
+
+@pytest.mark.slow
+def test_many_jumps_at_all_places_of_a_step():
+    truth, scenario = split(MANY), with_steps(SLOW, MANY)
+    runs = {dt: ij.simulate(scenario, duration=0.4, dt=dt) for dt in (8e-3, 4e-3, 2e-3)}
+    np.testing.assert_allclose(np.append(runs[4e-3].q[-1], runs[4e-3].dq[-1]), truth[:4], atol=2e-6)
+    errors = [np.max(np.abs(runs[dt].q[-1] - truth[:2])) for dt in (8e-3, 2e-3)]
+    assert np.log2(errors[0] / errors[1]) / 2 > 3.5, errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", TABLEAUS)
+def test_jumps_cost_no_order(method):
+    scenario, truth = with_steps(SLOW, MANY), split(MANY)
+    error = {dt: np.abs(ij.simulate(scenario, duration=0.4, dt=dt, method=method).q[-1] - truth[:2]) for dt in (2e-3, 2.5e-4)}
+    assert np.all(np.log2(error[2e-3] / error[2.5e-4]) / 3 > TABLEAUS[method].order - 0.25)
+
+
+@pytest.mark.slow
+def test_more_jumps_than_a_step_is_divided_at_are_flagged():
+    steps = tuple((0.2 + 1e-3 * (k + 0.5), (1.0, -1.0)) for k in range(6))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run = ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=1e-2)
+    assert int(run.status) & Status.INACCURATE
+    assert not int(ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3).status) & Status.INACCURATE
+
+
+@pytest.mark.parametrize("time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"])
+def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
+    """By time and size, against differences of the independent program."""
+    scenario = with_steps(SLOW, ((time, (20.0, 5.0)),))
+
+    def end(values):
+        return ij.simulate(ij.with_parameters(scenario, values), duration=0.4, dt=4e-3, record_every=100).q[-1]
+
+    here = {"disturbance.parts[0].time": jnp.asarray(time), "disturbance.parts[0].size": jnp.array([20.0, 5.0])}
+    slopes = jax.jacfwd(end)(here)
+    by_time = (split(((time + 1e-5, (20.0, 5.0)),)) - split(((time - 1e-5, (20.0, 5.0)),))) / 2e-5
+    by_size = (split(((time, (20.01, 5.0)),)) - split(((time, (19.99, 5.0)),))) / 0.02
+    np.testing.assert_allclose(slopes["disturbance.parts[0].time"], by_time[:2], rtol=1e-5)
+    np.testing.assert_allclose(slopes["disturbance.parts[0].size"][:, 0], by_size[:2], rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampling", [None, ij.Sampling(period=1e-2, delay=0.0033)], ids=["continuous", "sampled"])
+def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
+    """What `tune` and `sensitivity` use: losses and their derivatives by jump time and gain, against differences."""
+    scenario = canonical(with_steps(dataclasses.replace(SLOW, sampling=sampling), MANY[2:3]))
+    objective = ij.objectives.tracking() + ij.objectives.effort() + ij.objectives.torque_rate()
+    folds, dt, run, path = (Quantities(objective.quantities),), jnp.asarray(1e-2), Run(30), "disturbance.parts[0].time"
+    directions = {path: np.array([1.0, 0.0]), "controller.K2": np.array([[0.0, 0.0], [1.0, 0.0]])}
+    found = jax.jit(lambda v: run_batch_jvp(scenario, {path: v}, directions, folds, dt, run))(jnp.array([LATE, 0.05]))
+    ends = jax.jit(lambda v: run_batch(scenario, {path: v}, folds, dt, run).metrics["tuning_exact"])(jnp.array([LATE - 1e-6, LATE + 1e-6]))
+    expected = np.asarray(ends[1] - ends[0]) / 2e-6
+    np.testing.assert_allclose(found.tangents["tuning_exact"][0, 0], expected, rtol=1e-5)
+
+    def loss(time):
+        metrics = run_for_reverse(ij.with_parameters(scenario, {path: time}), folds, dt, run).metrics
+        return jnp.sum(metrics["tuning_exact"])
+
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(jnp.asarray(LATE)), np.sum(expected), rtol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["native", pytest.param("xla", marks=pytest.mark.slow), pytest.param("vmap", marks=pytest.mark.slow)])
+def test_every_run_of_a_batch_has_its_own_jumps(backend):
+    """Also under a sampled law whose command arrives within a step; one run jumps at a sample, one after the end."""
+    scenario = canonical(with_steps(dataclasses.replace(SLOW, sampling=ij.Sampling(period=1e-2, delay=0.0037)), MANY[2:3]))
+    folds, times = as_folds(None, jnp.float64), np.array([LATE, 0.1, 0.0537, 0.9])
+    varied = {"disturbance.parts[0].time": jnp.asarray(times)}
+    run = jax.jit(lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), Run(30), backend=backend))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no compiler
+        together = run(varied)
+    for i, time in enumerate(times):
+        one = ij.simulate(ij.with_parameters(scenario, {"disturbance.parts[0].time": time}), duration=0.3, dt=1e-2)
+        for name in ("rmse", "effort", "peak_torque", "torque_variation", "numerical_error"):
+            np.testing.assert_allclose(together.metrics[name][i], one.metrics[name], rtol=1e-9, atol=1e-14, err_msg=name)
+
+
+@ij.component
+class Switched:
+    """A reference that jumps, with its velocity, at a time."""
+
+    before: jax.Array = ij.leaf("rad")
+    after: jax.Array = ij.leaf("rad")
+    time: jax.Array = ij.leaf("s", shape="scalar")
+
+    def position(self, t):
+        return jnp.where(t >= self.time, self.after + 0.02 * jnp.sin(2.0 * t), self.before)
+
+    def jump_times(self):
+        return self.time
+
+
+@ij.component
+class Failing:
+    """A drive that gives a share of its torque from a time on."""
+
+    share: jax.Array = ij.leaf("1", shape="scalar")
+    time: jax.Array = ij.leaf("s", shape="scalar")
+    lost: jax.Array = ij.leaf("1", shape="scalar", default=0.0)
+
+    def at(self, t):
+        return dataclasses.replace(self, lost=jnp.where(t >= self.time, 1.0 - self.share, 0.0))
+
+    def jump_times(self):
+        return self.time
+
+    def init(self, tau):
+        return ()
+
+    def deliver(self, asked, dq, state):
+        return Delivered((1.0 - self.lost) * asked, jnp.zeros(asked.shape, bool), ())
+
+
+@ij.component
+@ij.robots.from_energy
+class Loaded:
+    """The two-link arm, whose tip takes up a load at a time."""
+
+    arm: ij.robots.TwoLink
+    load: jax.Array = ij.leaf("kg", shape="scalar")
+    time: jax.Array = ij.leaf("s", shape="scalar")
+
+    def at(self, t):
+        return dataclasses.replace(self.arm, payload=jnp.where(t >= self.time, self.load, 0.0))
+
+    def jump_times(self):
+        return self.time
+
+    n = property(lambda self: self.arm.n)
+
+    def mass_matrix(self, q):
+        return self.arm.mass_matrix(q)
+
+    def potential(self, q):
+        return self.arm.potential(q)
+
+    def tip(self, q):
+        return self.arm.tip(q)
+
+
+PARTS = {
+    "reference": lambda: {"reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537)},
+    "actuator": lambda: {"actuator": Failing(share=0.8, time=0.0537)},
+    "chain": lambda: {"actuator": ij.actuators.Chain((Failing(share=0.8, time=0.0537), ij.actuators.Motor(bandwidth=300.0)))},
+    "plant": lambda: {"plant": Loaded(SLOW.plant, load=0.5, time=0.0537), "model": SLOW.plant},
+}
+
+
+@pytest.mark.parametrize("part", [x if x == "actuator" else pytest.param(x, marks=pytest.mark.slow) for x in PARTS])
+def test_every_part_may_jump(part):
+    """What is switched at 0.0537 s costs no order: the errors at 4 and 1 ms are those of a smooth loop."""
+    quiet = dataclasses.replace(SLOW, disturbance=ij.disturbances.Nothing(), **PARTS[part]())
+
+    def end(dt):
+        return np.asarray(ij.simulate(quiet, duration=0.12, dt=dt).q[-1])
+
+    truth = end(1.25e-4)
+    coarse, fine = (np.max(np.abs(end(dt) - truth)) for dt in (4e-3, 1e-3))
+    assert fine < 1e-8
+    assert np.log2(coarse / fine) / 2 > 3.5, (coarse, fine)
+
+
+def test_jump_times_that_are_none_are_refused():
+    with pytest.raises(ValueError, match=r"reference.jump_times\(\).*expected times \[s\]"):
+        ij.simulate(dataclasses.replace(SLOW, reference=NoTimes(SLOW.reference)), duration=0.01, dt=1e-3)
+
+
+@ij.component
+class NoTimes:
+    """A reference that says nonsense about its jumps."""
+
+    inner: ij.references.Sinusoid
+
+    def position(self, t):
+        return self.inner.position(t)
+
+    def jump_times(self):
+        return "never"
+
+
+@pytest.mark.slow
+def test_a_disturbance_that_does_not_declare_its_jump_is_still_counted():
+    """The estimate sees it in the rates, as it saw every jump before."""
+    hidden = dataclasses.replace(SLOW, disturbance=Undeclared(ij.disturbances.Step(size=[20.0, 5.0], time=LATE)))
+    known = dataclasses.replace(SLOW, disturbance=hidden.disturbance.step)
+    errors = [np.max(ij.simulate(x, duration=0.4, dt=1e-3).metrics.numerical_error) for x in (hidden, known)]
+    assert errors[0] > 5 * errors[1]
+
+
+@ij.component
+class Undeclared:
+    """A step that does not say when it comes."""
+
+    step: ij.disturbances.Step
+
+    def torque(self, t, q, dq, plant, model):
+        return self.step.torque(t, q, dq, plant, model)
+
+    def jump_times(self):
+        return jnp.zeros(0)

@@ -24,8 +24,9 @@ def comparison():
 
 def effort(run):
     """RMS torque above gravity from a run with every step recorded."""
-    gravity = np.array([run.scenario.model.gravity(q) for q in run.q[:-1]])
-    return math.sqrt(np.mean(np.sum((np.asarray(run.tau[:-1]) - gravity) ** 2, axis=1)))
+    gravity = np.array([run.scenario.model.gravity(q) for q in run.q])
+    square = np.sum((np.asarray(run.tau) - gravity) ** 2, axis=1)
+    return math.sqrt(np.trapezoid(square, run.t) / float(run.t[-1]))
 
 
 @pytest.mark.slow

@@ -160,6 +160,26 @@ def test_one_run_is_the_run(runs_here, paper, sampled):
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 
 
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_every_run_has_its_own_jump(runs_here, paper, dtype):
+    """The steps of a sampled loop are divided where each run's disturbance jumps."""
+    soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
+    late = ij.disturbances.Step(size=[20.0, 5.0], time=0.1)
+    scenario = canonical(ij.astype(ij.with_parts(soft, sampling=ij.Sampling(1e-2, delay=3.7e-3), disturbance=late), dtype))
+    folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
+    varied, dt = {"disturbance.time": jnp.asarray([0.1, 0.0537, 0.1234, 0.9], dtype)}, jnp.asarray(1e-2, dtype)
+
+    def metrics(backend):
+        return jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, Run(20), backend=backend))(varied).metrics
+
+    found, expected = metrics("gpu"), metrics("vmap")
+    rtol = {"float64": 1e-9, "float32": 2e-3}[dtype]
+    for name in ("rmse", "effort", "torque_variation", "estimate_rmse"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=rtol, err_msg=name)
+
+
 @pytest.mark.slow
 @needs_compiler
 def test_forward_sensitivities(paper):

@@ -79,12 +79,14 @@ class Independent:
             t = k * T
             u, eta = self.law(t, *self.told(x[:2], x[2:4]), eta)
             commands.append((t + delay, np.asarray(u)))
-            cuts = [t, *(c for c, _ in commands if t + 1e-12 < c < t + T - 1e-12), t + T]
+            changes = [*(c for c, _ in commands), *np.asarray(s.jump_times())]
+            cuts = sorted({t, *(c for c in changes if t + 1e-12 < c < t + T - 1e-12), t + T})
             for a, b in itertools.pairwise(cuts):
                 asked = [u for c, u in commands if c <= a + 1e-12][-1]
 
-                def rate(t, x, asked=asked):
+                def rate(t, x, asked=asked, a=a, b=b):
                     tau, dy = self.delivered(asked, x[4:], x[2:4])
+                    t = np.clip(t, a + 1e-13, b - 1e-13)  # on this side of a jump
                     return np.concatenate([x[2:4], self.acceleration(t, x[:2], x[2:4], tau), dy])
 
                 inside = grid[(grid >= a - 1e-12) & (grid < b - 1e-12)]
@@ -130,6 +132,15 @@ def agree(scenario, program, duration=0.3, dt=5e-4, q=1e-7, tau=1e-5):
     assert np.max(np.abs(run.dq[:-1] - states[:, 2:4])) < 100 * q
     assert np.max(np.abs(run.tau[:-1] - torques)) < tau
     return run
+
+
+@pytest.mark.parametrize("delay", [0.0, pytest.param(3.7e-3, marks=pytest.mark.slow)])
+def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_program(delay):
+    """In steps as long as the period: the jump is within one, where its error was 5e-3 rad and its estimate 3e-5 rad."""
+    late = ij.disturbances.Step(size=[20.0, 5.0], time=0.2137)
+    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-2, delay=delay), disturbance=late)
+    run = agree(scenario, Independent, dt=1e-2, q=1e-6, tau=1e-3)
+    assert run.ok
 
 
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 2e-3])

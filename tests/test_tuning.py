@@ -83,16 +83,18 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
 
 @pytest.mark.slow
 def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
-    """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v, with e1_u by finite differences of recorded runs."""
+    """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v (trapezoidal rule), with e1_u by finite differences of recorded runs."""
     lanes = nominal.lanes(nominal.box.z[None])
     found = problem.slope(nominal.shared, lanes, formulation=nominal.formulation)
 
     def errors(z):
         values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.formulation.blocks}
-        return np.asarray(ij.simulate(ij.with_parameters(paper, values), **SHORT).e1)[:-1]
+        return np.asarray(ij.simulate(ij.with_parameters(paper, values), **SHORT).e1)
 
     J = central(errors, nominal.box.z)
-    expected = 2 * SHORT["dt"] * np.einsum("utn,vtn->uv", J, J)
+    weights = np.full(J.shape[1], SHORT["dt"])
+    weights[[0, -1]] /= 2
+    expected = 2 * np.einsum("utn,t,vtn->uv", J, weights, J)
     only = ij.objectives.Objective((nominal.shared.objective.terms[0],))
     shared = nominal.shared._replace(objective=only)
     formulation = nominal.formulation._replace(pieces=(1, nominal.formulation.pieces[-1]))
@@ -134,10 +136,10 @@ def test_quantities_are_what_numpy_makes_of_the_records(paper):
     margin = np.minimum(run.q - run.lower, run.upper - run.q)
     dt = SHORT["dt"]
     expected = [
-        dt * np.sum((e1 * [1.0, 2.0])[:-1][t[:-1] >= 0.1 - 1e-9] ** 2),
-        dt * np.sum(tau[:-1] ** 2),
-        np.sum(np.diff(tau[:-1], axis=0) ** 2) / dt,
-        dt * np.sum(1 / (1 + np.exp(-(np.abs(e1[:-1]) - 0.05) / 0.005))),
+        np.trapezoid((e1 * [1.0, 2.0])[t >= 0.1 - 1e-9] ** 2, dx=dt, axis=0).sum(),
+        np.trapezoid(tau**2, dx=dt, axis=0).sum(),
+        np.sum(np.diff(tau, axis=0) ** 2) / dt,
+        np.trapezoid(1 / (1 + np.exp(-(np.abs(e1) - 0.05) / 0.005)), dx=dt, axis=0).sum(),
         np.max(np.abs(tau)),
         -np.min(margin),
         np.max(np.abs(e1[t >= 0.1 - 1e-9])),

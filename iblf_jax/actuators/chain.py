@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from iblf_jax.actuators._base import Actuator, Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
+from iblf_jax.core.time import as_at, joined, jump_times_of
 
 
 @component
@@ -39,6 +41,16 @@ class Chain:
     def unlimited(self) -> Chain:
         """The same without limits."""
         return dataclasses.replace(self, parts=tuple(getattr(part, "unlimited", part) for part in self.parts))
+
+    def at(self, t: jax.Array) -> Chain:
+        """The chain as it is at time t [s]."""
+        now = copy.copy(self)
+        object.__setattr__(now, "parts", tuple(as_at(part, t) for part in self.parts))
+        return now
+
+    def jump_times(self) -> jax.Array:
+        """The parts' jump times together, (m,) [s]."""
+        return joined([jump_times_of(f"Chain.parts[{i}]", part) for i, part in enumerate(self.parts)])
 
     def init(self, tau: jax.Array) -> Any:
         """The parts' states, each of which delivers the torque."""

@@ -35,8 +35,8 @@ from iblf_jax.core.linalg import solve_spd
 from iblf_jax.engine.execute import run_from
 from iblf_jax.observers import Printed
 from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
+from iblf_jax.simulation import jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
-from iblf_jax.simulation.integrators import step
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 
@@ -293,8 +293,10 @@ class Onward:
 
     def __call__(self, inputs, place: Place, index: jax.Array, form):
         """The place after the step; the state, V2 and |f_tilde|^2/2 before it."""
-        t = (place.steps + index.astype(place.steps.dtype)) * place.size
-        made = step(self.method, partial(evaluate, inputs.scenario), t, place.state, place.size, rolled=form.rolled)
+        number = place.steps + index.astype(place.steps.dtype)
+        span = jumps.Span(number * place.size, (number + 1.0) * place.size, place.size)
+        division = jumps.divided(inputs.scenario.jump_times(), span)
+        made = jumps.integrated(self.method, partial(evaluate, inputs.scenario), division, place.state, rolled=form.rolled)
         f_tilde = made.first.disturbance - made.first.disturbance_estimate
         return place._replace(state=made.state), (place.state, (made.first.V, 0.5 * jnp.sum(f_tilde**2)))
 

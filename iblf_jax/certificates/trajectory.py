@@ -233,7 +233,7 @@ def same_tree(one: Any, other: Any) -> bool:
 
 
 def _jumps(scenario: Scenario, end: float) -> np.ndarray:
-    times = np.sort(np.ravel(np.asarray(scenario.disturbance.jump_times())))
+    times = np.sort(np.ravel(np.asarray(scenario.jump_times())))
     return times[(times > 0) & (times <= end)]
 
 

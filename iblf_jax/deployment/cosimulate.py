@@ -20,12 +20,14 @@ import numpy as np
 from iblf_jax.actuators import Ideal
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
+from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
 from iblf_jax.disturbances import Nothing
 from iblf_jax.engine.simulate import report
 from iblf_jax.engine.step import folded, sample_status
 from iblf_jax.robots import at_time
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled_if_due
+from iblf_jax.simulation.jumps import APART
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import NEARLY, Instant, Sampling, check_step, has_noise, noise_key, under_way
@@ -105,7 +107,7 @@ def cosimulate(
     result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)
     if write is not None:
-        write(result, robot, motion.whole, dt)
+        write(result, robot, motion.whole[motion.instant], dt)
     return result
 
 
@@ -144,8 +146,15 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
 
 
 class _Motion(NamedTuple):
-    """What has happened, instant by instant (T first), and sample by sample."""
+    """What has happened, row by row (R first), and sample by sample.
 
+    There is a row for each instant, and where torque or law signals jump one before the jump and one after it.
+    """
+
+    t: Any
+    """(R,) [s]."""
+    instant: Any
+    """Whether the row is that of an instant, (R,) bool."""
     q: Any
     dq: Any
     ddq: Any
@@ -153,7 +162,7 @@ class _Motion(NamedTuple):
     limited: Any
     actuator: Any
     sample: Any
-    """Number of the last sample at each instant, (T,)."""
+    """Number of the last sample at each row, (R,)."""
     whole: Any
     """Positions of everything in MuJoCo's model."""
     states: LoopState
@@ -171,7 +180,7 @@ def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
 @jax.jit
 def _delivered(scenario: Scenario, t, q, dq, asked, state):
     """What the actuator delivers, and the torque with what disturbs."""
-    delivered = scenario.actuator.deliver(asked, dq, state)
+    delivered = as_at(scenario.actuator, t).deliver(asked, dq, state)
     return delivered, delivered.tau + scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
 
 
@@ -186,15 +195,55 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
     states: list[LoopState] = []
     arrived = 0
 
+    times = np.sort(np.asarray(scenario.jump_times(), float))
+    apart = APART * np.finfo(scenario.initial.q.dtype).eps * np.abs(times)
+    jumped = 0
+
+    def beside(t: float) -> float:
+        """A time, on the side of the jumps on which the run is."""
+        if jumped > 0:
+            t = max(t, times[jumped - 1] + apart[jumped - 1])
+        if jumped < times.size:
+            t = min(t, times[jumped] - apart[jumped])
+        return t
+
     def rate(t, q, dq, actuator):
         if plain:
             return asked, ()
-        delivered, torque = _delivered(scenario, t, q, dq, asked, actuator)
+        delivered, torque = _delivered(scenario, beside(t), q, dq, asked, actuator)
         return np.asarray(torque), jax.tree.map(np.asarray, delivered.rate)
 
     stages = Stages(rate, jax.tree.map(np.asarray, state.actuator))
     rows: list[tuple] = []
     broken = False
+
+    def arrives(until: float) -> bool:
+        """Whether the next command has arrived by then."""
+        return arrived < len(commands) and arrived * period + delay <= until
+
+    def jumps(until: float) -> bool:
+        """Whether the next jump of the scenario is over by then."""
+        return jumped < times.size and times[jumped] <= until
+
+    def row(t: float, instant: bool) -> tuple:
+        """What there is to see at a time."""
+        q, dq = robot.q, robot.dq
+        stages.begin(t)
+        ddq = robot.acceleration(t)
+        tau, limited = asked, np.zeros(scenario.n, bool)
+        if not plain:
+            delivered, _ = _delivered(scenario, beside(t), q, dq, asked, stages.state)
+            tau, limited = np.asarray(delivered.tau), np.asarray(delivered.limited)
+        return t, instant, q, dq, ddq, tau, limited, stages.state, len(commands) - 1, robot.data.qpos.copy()
+
+    def change(until: float) -> None:
+        """Takes up the commands that have arrived and the jumps that are over by then."""
+        nonlocal asked, arrived, jumped
+        while arrives(until):
+            asked, arrived = commands[arrived], arrived + 1
+        while jumps(until):
+            jumped += 1
+
     robot.place(np.asarray(state.q), np.asarray(state.dq))
     with robot.driven(stages):
         for index in range(steps + 1):
@@ -202,32 +251,31 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
             q, dq = robot.q, robot.dq
             broken = broken or not (np.all(np.isfinite(q)) and np.all(np.abs(dq) < VELOCITY_LIMIT))
             if broken:
-                rows.append(rows[-1])
+                rows.append((t, True, *rows[-1][2:]))
                 continue
-            if index % every == 0:
+            # Where a command arrives or the scenario jumps within the step, MuJoCo makes two of it.
+            now, end, near = t, t + dt, NEARLY * dt
+            due = index % every == 0
+            if index > 0 and (due or arrives(now + near) or jumps(now + near)):
+                rows.append(row(now, False))
+            if due:
                 state = _law(scenario, t, state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)), len(commands), noise)
                 states.append(state)
                 commands.append(np.asarray(state.held.commands[0]))
-            # Where the next command arrives within the step, MuJoCo makes two of it.
-            now, end = t, t + dt
-            while arrived < len(commands) and arrived * period + delay <= now + NEARLY * dt:
-                asked, arrived = commands[arrived], arrived + 1
-            stages.begin(now)
-            ddq = robot.acceleration(now)
-            tau, limited = asked, np.zeros(scenario.n, bool)
-            if not plain:
-                delivered, _ = _delivered(scenario, t, q, dq, asked, stages.state)
-                tau, limited = np.asarray(delivered.tau), np.asarray(delivered.limited)
-            rows.append((q, dq, ddq, tau, limited, stages.state, len(commands) - 1, robot.data.qpos.copy()))
-            while index < steps and now < end - NEARLY * dt:
-                change = arrived * period + delay if arrived < len(commands) else end
-                h = min(change, end) - now
+            change(now + near)
+            rows.append(row(now, True))
+            while index < steps and now < end - near:
+                arrival = arrived * period + delay if arrived < len(commands) else end
+                jump = times[jumped] if jumped < times.size else end
+                h = min(arrival, jump, end) - now
                 stages.begin(now)
                 robot.step(now, h)
                 stages.finish(h)
                 now += h
-                if change < end - NEARLY * dt:
-                    asked, arrived = commands[arrived], arrived + 1
+                if now < end - near:
+                    rows.append(row(now, False))
+                    change(now + near)
+                    rows.append(row(now, False))
     columns: list[Any] = [jax.tree.map(lambda *x: np.stack(x), *column) for column in zip(*rows, strict=True)]
     return _Motion._make([*columns, jax.tree.map(lambda *x: np.stack(x), *states), broken])
 
@@ -235,11 +283,14 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
 @jax.jit
 def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     """Samples, metrics and flags of a motion."""
-    index = jnp.arange(len(motion.q))
-    t, covered = index.astype(dt.dtype) * dt, jnp.where(index < len(index) - 1, dt, 0.0)
+    t = motion.t.astype(dt.dtype)
+    half, zero = 0.5 * jnp.diff(t), jnp.zeros((1,), dt.dtype)
+    weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
+    step = jnp.where(motion.instant & (t > 0), dt, 0.0)
     said = jax.tree.map(lambda x: x[motion.sample], motion.states.held.said)
     see = jax.vmap(partial(observed, scenario))
-    samples = see(t, covered, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, said)
+    samples = see(t, weight, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, said)
+    samples = dataclasses.replace(samples, step=step)
     raised = jax.vmap(sample_status)(samples)
     return samples, folded(folds, samples), raised
 
@@ -249,7 +300,8 @@ def _rollout(scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_
     step_size = jnp.asarray(dt, scenario.initial.q.dtype)
     samples, results, raised = _observed(scenario, folds, step_size, motion)
     status = np.bitwise_or.reduce(np.asarray(raised)) | (int(Status.NOT_FINITE) if motion.broken else 0)
-    at = slice(None, None, record_every)
+    at = np.flatnonzero(motion.instant)[::record_every]
+    recorded = jax.tree.map(lambda x: x[at], samples)
     states = jax.tree.map(lambda x: jnp.asarray(x[motion.sample[at]]), motion.states)
     return Rollout(
         scenario=scenario,
@@ -262,6 +314,6 @@ def _rollout(scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_
         actuator_state=jax.tree.map(lambda x: jnp.asarray(x[at]), motion.actuator),
         measured=states.held.measured,
         method=method,
-        steps=len(motion.q) - 1,
-        **{name: getattr(samples, name)[at] for name in SIGNALS},
+        steps=int(np.sum(motion.instant)) - 1,
+        **{name: getattr(recorded, name) for name in SIGNALS},
     )

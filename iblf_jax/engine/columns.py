@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine.batch import Batch, Executor, Leaves, run_step
-from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of
-from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep, finished, start
+from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of_step
+from iblf_jax.engine.step import Advanced, Carry, Form, Inputs, Node, Run, TimeStep, finished, samples_of_step, start
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
@@ -63,7 +63,9 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
     def one(inputs):
         state = initial_state(inputs.scenario)
         sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
-        return floats_of(record(inputs.folds, tuple(fold.init(sample) for fold in inputs.folds), sample, state))
+        node = Node(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
+        found = Advanced(None, (node,) * samples_of_step(inputs.scenario), state)  # type: ignore[arg-type]
+        return floats_of(record(inputs.folds, found))
 
     return sum(math.prod(x.shape) for x in jax.eval_shape(one, inputs))
 
@@ -176,14 +178,14 @@ def columns(executor: Executor, batch: Batch, places: Places, run: Run) -> tuple
     return _stepped(executor, batch, TangentStep(TimeStep.of(run), places), directions, run)
 
 
-def outer_vectors(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Array]:
+def outer_vectors(folds: Any, found: Advanced) -> list[jax.Array]:
     """Of the curvature matrices, what has tangents."""
-    return [outer.vector for outer in outers_of(folds, begun, sample)]
+    return [outer.vector for outer in outers_of_step(folds, found)]
 
 
-def _weights(folds: Any, begun: tuple, sample: Any, state: Any) -> list[jax.Array]:
+def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
     """And their weights."""
-    return [jnp.broadcast_to(outer.weight, outer.vector.shape) for outer in outers_of(folds, begun, sample)]
+    return [outer.weight for outer in outers_of_step(folds, found)]
 
 
 def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:

@@ -1,8 +1,10 @@
 """What a step of a run is: the one definition that every executor steps.
 
-At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first stage of the integrator; a state that
-runs away is frozen at its last good value and flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound
-is remembered, because the loop is stiffest there.  The step from the last instant is not made: its sample alone counts.
+At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first stage of the integrator.  Where its
+right-hand side or its signals jump, a step is integrated in pieces (`simulation.jumps`), and the metrics see the limits from both sides; a
+step without a jump costs no more than the comparison.  A state that runs away is frozen at its last good value and flagged, so that no NaN
+ever enters a batch or a gradient; the instant nearest to a bound is remembered, because the loop is stiffest there.  The step from the last
+instant is not made: its sample alone counts.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps that are equal compile once.  Before
 the first and after the last step come `start` and `verdict`, which hold no evaluation of the closed loop; what they need of it, its
@@ -12,6 +14,7 @@ Jacobian, is stepped for too (`Probe`).
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,7 +29,7 @@ from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.switching import Loop, with_hybrid_derivative
-from iblf_jax.simulation import accuracy, integrators, sampling, stability
+from iblf_jax.simulation import accuracy, integrators, jumps, sampling, stability
 from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
@@ -162,16 +165,30 @@ def _begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple)
     return jax.tree.map(lambda yes, new, old: jnp.where(index > 0, old, new) if yes else old, chosen, _begun(folds, sample), accumulators)
 
 
+class Node(NamedTuple):
+    """A sample that the folds see."""
+
+    before: tuple
+    """Accumulators of the folds before it."""
+    sample: Sample
+    counts: Any
+    """Whether there is such a sample, () bool; True for that of the instant."""
+
+
 class Advanced(NamedTuple):
-    """One step of a run, its sample folded in."""
+    """One step of a run, its samples folded in."""
 
     carry: Carry
     """After it."""
-    sample: Sample
-    accumulators: tuple
-    """Of the folds, before the sample."""
+    nodes: tuple[Node, ...]
+    """That of the instant first, whatever the order in time."""
     state: LoopState
     """At the instant, after what is due there."""
+
+    @property
+    def sample(self) -> Sample:
+        """That of the instant."""
+        return self.nodes[0].sample
 
 
 def _as_it_is(function: Callable) -> Callable:
@@ -189,8 +206,71 @@ class Form(NamedTuple):
     """Whether it is taken apart into numbers, where equal ones are one."""
 
 
+class _Moment(NamedTuple):
+    """Where a step is in time, and how it is divided."""
+
+    span: jumps.Span
+    division: jumps.Division
+    behind: jax.Array
+    """How long before the instant the last piece of the step before begins, () [s]; 0 at the first instant."""
+    restarts: Any
+    """Whether a jump lies in this step, or among those whose rates tell of its error, () bool; None in scenarios without jump times."""
+
+
+class _Loop(NamedTuple):
+    """The closed loop along a step."""
+
+    evaluate: Callable
+    inputs: Inputs
+    state: LoopState
+    """At the instant, after what is due there."""
+    torques: tuple
+    """Where the law is sampled, what arrives at the actuator: before a command arrives within the step, and after."""
+
+    def at(self, piece: jumps.Piece, t: jax.Array, moved: LoopState) -> tuple[LoopState, Sample]:
+        """Rate and sample within a piece of the step."""
+        torque = self.torques
+        if torque and isinstance(piece.arrived, bool):
+            torque = (torque[int(piece.arrived)],)
+        elif torque:
+            torque = (jnp.where(piece.arrived, torque[1], torque[0]),)
+        return self.evaluate(self.inputs.scenario, jumps.stage_time(piece, t), still(self.state, moved), self.inputs.dt, *torque)
+
+
+def _moment(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | None) -> _Moment:
+    """Where the step from an instant is in time.
+
+    Args:
+      inputs: of the run.
+      index: number of the instant, () int.
+      method: the integrator.
+      arrivals: when commands arrive in this step and in the one before, as `jumps.divided` takes them; None where none can.
+    """
+    times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
+    start = number * dt
+    span = jumps.Span(start, (number + 1.0) * dt if times.size else start, dt, number < inputs.steps)
+    here, last = (None, None) if arrivals is None else arrivals
+    before = jumps.Span((number - 1.0) * dt, start, dt)
+    behind = jnp.where(index > 0, jumps.since_last(times, before, last), jnp.zeros_like(dt))
+    restarts = None
+    if times.size and inputs.scenario.sampling is None:
+        reach = accuracy.steps_back(method)
+        restarts = jumps.within(times, (number - reach) * dt, span.end)
+    return _Moment(span, jumps.divided(times, span, here), behind, restarts)
+
+
+def _weighed(sample: Sample, t: jax.Array, weight: jax.Array, step: jax.Array) -> Sample:
+    """A sample with its time, its weight in integrals, and the time since the instant before."""
+    return dataclasses.replace(sample, t=t, dt=weight, step=step)
+
+
+def _updated(folds: Any, accumulators: tuple, sample: Sample) -> tuple:
+    """The accumulators after a sample."""
+    return tuple(fold.update(acc, sample) for fold, acc in zip(folds, accumulators, strict=True))
+
+
 def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: Form, loop: Callable = evaluate) -> Advanced:
-    """One step: observe, integrate, freeze what runs away.
+    """One step: observe, integrate piece by piece, freeze what runs away.
 
     Args:
       inputs, carry: of the run.
@@ -199,86 +279,94 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
       form: how it is written.
       loop: stands for `closed_loop.evaluate`.
     """
-    scenario, dt, steps = inputs.scenario, inputs.dt, inputs.steps
-    t, goes_on = index.astype(dt.dtype) * dt, index.astype(dt.dtype) < steps
-    covered = jnp.where(goes_on, dt, jnp.zeros_like(dt))
+    scenario, dt = inputs.scenario, inputs.dt
     at, state = form.piece(loop), carry.state
     if scenario.sampling is None:
-        stepped = integrators.step(method, lambda t, state: at(scenario, t, state, covered), t, state, dt, rolled=form.rolled)
-        pieces = [(dt, stepped.slopes)]
+        moment = _moment(inputs, index, method, None)
+        along = _Loop(at, inputs, state, ())
+        accumulators = carry.accumulators
+        early: tuple[Node, ...] = ()
     else:
         now = sampling.instant(scenario.sampling, dt, index)
+        due = (now.phase == 0) & (index > 0)
+        t = index.astype(dt.dtype) * dt
         state = sampled_if_due(scenario, t, state, now, inputs.noise)
         arriving = sampling.arriving(scenario.sampling, dt, now, state.held.commands)
-        until = arriving.place * dt
+        before = sampling.arrival_before(scenario.sampling, dt, now)
+        arrivals = None if before is None else ((arriving.place * dt, arriving.changes), before)
+        moment = _moment(inputs, index, method, arrivals)
+        along = _Loop(at, inputs, state, (arriving.torque, arriving.next))
+        accumulators, early = _before_sample(along, carry, due, moment)
+        moment = moment._replace(behind=jnp.where(due, jnp.zeros_like(dt), moment.behind))
 
-        def moved_by(torque, since, moved, length):
-            def between(since, moved):
-                return at(scenario, t + since, still(state, moved), covered, torque)
+    first = moment.division.pieces[0]
+    stepped = _integrated(along, first, moving(state), method, form)
+    ahead = jnp.where(moment.span.counts, first.length, jnp.zeros_like(dt))
+    step = jnp.where(index > 0, dt, jnp.zeros_like(dt))
+    sample = _weighed(stepped.first, moment.span.start, 0.5 * (moment.behind + ahead), step)
 
-            return integrators.step(method, between, since, moved, length, rolled=form.rolled)
+    def at_the_instant(inputs, index, accumulators, sample):
+        begun = _begun_at(index, inputs.folds, sample, accumulators)
+        return begun, _updated(inputs.folds, begun, sample)
 
-        def rest(moved):
-            after = moved_by(arriving.next, until, moved, dt - until)
-            return after.state, after.slopes
+    begun, accumulators = form.piece(at_the_instant)(inputs, index, accumulators, sample)
+    if scenario.sampling is None:
+        stepped, accumulators = _across_jumps(along, first, state, method, stepped, begun, accumulators)
+    later = _later_pieces(along, moment.division.pieces, stepped, accumulators, method, form)
+    parts = [(first.length, stepped.slopes), *later.parts]
 
-        stepped = moved_by(arriving.torque, jnp.zeros_like(dt), moving(state), until)
-        pieces, after = [(until, stepped.slopes)], stepped.state
-        if scenario.sampling.queue:
-            none = jax.tree.map(jnp.zeros_like, stepped.slopes)
-            after, slopes = jax.lax.cond(arriving.changes, rest, lambda moved: (moved, none), after)
-            pieces.append((dt - until, slopes))
-        stepped = stepped._replace(state=still(state, after))
-
-    def folded_in(inputs, carry, index, goes_on, stepped, pieces):
-        folds, dt, sample = inputs.folds, inputs.dt, stepped.first
-        begun = _begun_at(index, folds, sample, carry.accumulators)
-        accumulators = tuple(fold.update(acc, sample) for fold, acc in zip(folds, begun, strict=True))
-        if scenario.sampling is None:
-            stepped, accumulators = _across_jumps(inputs, carry.state, method, stepped, begun, accumulators)
+    def at_the_end(inputs, carry, index, sample, parts, later, before, goes_on, restarts, overfull):
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-        here = Nearest(near, sample.t, jax.lax.stop_gradient(surroundings(carry.state)))
+        here = Nearest(near, sample.t, jax.lax.stop_gradient(surroundings(before)))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
-        width, held = sample.upper - sample.lower, scenario.sampling is not None
-        estimate = accuracy.observed(carry.accuracy, method, dt, index, pieces, width, held)
-
+        held = inputs.scenario.sampling is not None
+        width = sample.upper - sample.lower
+        estimate = accuracy.observed(carry.accuracy, method, inputs.dt, index, parts, width, held, restarts, overfull)
+        moved, raised = later
         status = carry.status | sample_status(sample)
-        sound = is_sound(stepped.state) & (status & int(Status.NOT_FINITE) == 0)
-        after = keep_if(sound & goes_on, stepped.state, carry.state)
+        status = status if raised is None else status | raised
+        sound = is_sound(moved) & (status & int(Status.NOT_FINITE) == 0)
         status |= flag(~sound & goes_on, Status.NOT_FINITE)
-        return Advanced(Carry(after, accumulators, status, nearest, estimate), sample, begun, carry.state)
+        return keep_if(sound & goes_on, moved, before), status, nearest, estimate
 
-    return form.piece(folded_in)(inputs, carry._replace(state=state), index, goes_on, stepped, pieces)
+    moved, division = still(state, later.moved), moment.division
+    after, status, nearest, estimate = form.piece(at_the_end)(
+        inputs, carry, index, sample, parts, (moved, later.status), state, moment.span.counts, moment.restarts, division.overfull
+    )
+    nodes = (Node(begun, sample, True), *early, *later.nodes)
+    return Advanced(Carry(after, later.accumulators, status, nearest, estimate), nodes, state)
 
 
 def _across_jumps(
-    inputs: Inputs, before: LoopState, method: str, stepped: integrators.Stepped, begun: tuple, accumulators: tuple
+    along: _Loop, piece: jumps.Piece, before: LoopState, method: str, stepped: integrators.Stepped, begun: tuple, accumulators: tuple
 ) -> tuple[integrators.Stepped, tuple]:
-    """A step and the accumulators after it, with their derivatives across jumps of the command; values stay as they are.
+    """A piece of a step and the accumulators, with their derivatives across jumps of the command; values stay as they are.
 
     Args:
-      inputs: of the run.
-      before: state at the start of the step.
+      along: the loop, whose law is not sampled.
+      piece: of the step.
+      before: state at its start.
       method: the integrator.
-      stepped: the step.
-      begun, accumulators: of the folds, before and after its sample.
+      stepped: what the integrator has made of it.
+      begun, accumulators: of the folds, before and after the sample at its start.
     """
-    scenario, dt, t = inputs.scenario, inputs.dt, stepped.first.t
+    inputs, dt = along.inputs, along.inputs.dt
+    counts = piece.begin < (inputs.steps - 0.5) * dt  # no metric counts what comes after the end of a run
 
     def rate(t, state):
-        return evaluate(scenario, t, state, dt)
+        return evaluate(inputs.scenario, jumps.stage_time(piece, t), state, dt)
 
     def gains_of(sample):
         def sums(weight):
             weighed = dataclasses.replace(sample, dt=weight)
-            folded = zip(inputs.folds, begun, strict=True)
-            return _split_floats(tuple(fold.update(acc, weighed) for fold, acc in folded))[0]
+            return _split_floats(_updated(inputs.folds, begun, weighed))[0]
 
-        return jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+        gains = jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+        return [jnp.where(counts, gain, jnp.zeros_like(gain)) for gain in gains]
 
     floats, replaced = _split_floats(accumulators)
-    loop = Loop(scenario, rate, gains_of)
-    after, floats = with_hybrid_derivative(loop, method, t, before, dt, stepped, floats)
+    loop = Loop(inputs.scenario, rate, gains_of)
+    after, floats = with_hybrid_derivative(loop, method, piece.begin, before, piece.length, stepped, floats)
     return stepped._replace(state=after), replaced(floats)
 
 
@@ -296,10 +384,101 @@ def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
     return [leaves[i] for i in places], replaced
 
 
-def recorded(folds: Any, begun: tuple, sample: Sample, state: LoopState):
+def _integrated(along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, form: Form) -> integrators.Stepped:
+    """One step of the integrator over a piece."""
+    return integrators.step(method, lambda t, x: along.at(piece, t, x), piece.begin, moved, piece.length, rolled=form.rolled)
+
+
+def _before_sample(along: _Loop, carry: Carry, due: jax.Array, moment: _Moment) -> tuple[tuple, tuple[Node, ...]]:
+    """The accumulators after the sample just before the law runs, where it is due; and that sample.
+
+    The law's signals, and without a delay the torque, jump there.
+    """
+    folds, scenario, dt = along.inputs.folds, along.inputs.scenario, along.inputs.dt
+    if not folds:
+        return carry.accumulators, ()
+    held = carry.state.held.commands
+    torque = sampling.torque_before(scenario.sampling, dt, held, along.state.held.commands)  # type: ignore[arg-type]
+    t, behind = moment.span.start, moment.behind
+    seen_at = t if moment.division.pieces[0].earliest is None else jumps.before_jumps(scenario.jump_times(), t)
+
+    def seen(accumulators):
+        sample = along.evaluate(scenario, seen_at, carry.state, dt, torque)[1]
+        sample = _weighed(sample, t, 0.5 * behind, jnp.zeros_like(dt))
+        return _updated(folds, accumulators, sample), sample
+
+    after, sample = _if(due, seen, carry.accumulators)
+    return after, (Node(carry.accumulators, sample, due),)
+
+
+def _if(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
+    """`made(kept)`, new values and anything else, where a condition holds; else the values as they are, and zeros."""
+    shapes = jax.eval_shape(made, kept)[1]
+
+    def otherwise(kept):
+        return kept, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    return jax.lax.cond(condition, made, otherwise, kept)
+
+
+class _Later(NamedTuple):
+    """What the pieces of a step after the first give."""
+
+    moved: LoopState
+    """At the end of the step."""
+    accumulators: tuple
+    parts: list[tuple[jax.Array, list]]
+    """Length [s] of each piece, and the slopes of its stages."""
+    nodes: tuple[Node, ...]
+    status: Any
+    """The flags that its samples raise, () int32; None where there are none."""
+
+
+def _later_pieces(
+    along: _Loop, pieces: tuple[jumps.Piece, ...], stepped: integrators.Stepped, accumulators: tuple, method: str, form: Form
+) -> _Later:
+    """The pieces after the first, each with the samples before and after the jump at which it begins."""
+    # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
+    folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
+    moved, parts, nodes = stepped.state, [], []
+    status = jnp.int32(0) if len(pieces) > 1 else None
+    for last, piece in itertools.pairwise(pieces):
+
+        def further(kept, last=last, piece=piece):
+            moved, accumulators, status = kept
+            between: Any = ()
+            left: Any = ()
+            if folds:
+                left = along.at(last, last.begin + last.length, moved)[1]
+                left = _weighed(left, piece.begin, 0.5 * last.length, none)
+                between = accumulators = _updated(folds, accumulators, left)
+            made = _integrated(along, piece, moved, method, form._replace(rolled=not form.scalar))
+            right = _weighed(made.first, piece.begin, 0.5 * piece.length, none)
+            accumulators = _updated(folds, between, right) if folds else ()
+            if along.inputs.scenario.sampling is None:
+                made, accumulators = _across_jumps(along, piece, moved, method, made, between, accumulators)
+            return (made.state, accumulators, status | sample_status(right)), (made.slopes, left, between, right)
+
+        before = accumulators
+        (moved, accumulators, status), (slopes, left, between, right) = _if(piece.made, further, (moved, accumulators, status))
+        parts.append((piece.length, slopes))
+        if folds:
+            nodes += [Node(before, left, piece.made), Node(between, right, piece.made)]
+    return _Later(moved, accumulators, parts, tuple(nodes), status)
+
+
+def recorded(folds: Any, found: Advanced):
     """What a run keeps of an instant: the sample, and the states of law and observer."""
+    state = found.state
     states = (state.controller, state.observer, state.actuator, state.held.measured if state.held else ())
-    return {name: getattr(sample, name) for name in SIGNALS}, *states
+    return {name: getattr(found.sample, name) for name in SIGNALS}, *states
+
+
+def samples_of_step(scenario: Scenario) -> int:
+    """How many samples the folds see of a step at most: `Advanced.nodes`."""
+    arrives = scenario.sampling is not None and scenario.sampling.queue > 0
+    cuts = min(scenario.jump_times().size, jumps.MOST_CUTS) + arrives
+    return 1 + (scenario.sampling is not None) + 2 * cuts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,7 +487,7 @@ class TimeStep:
 
     method: str
     record: Callable | None = None
-    """Function (folds, their accumulators before the sample, sample, state) of an instant."""
+    """Function (folds, what `advance` found) of an instant."""
 
     @staticmethod
     def of(run: Run) -> TimeStep:
@@ -318,7 +497,7 @@ class TimeStep:
     def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, form: Form):
         """The carry after the step, and what is recorded."""
         found = advance(inputs, carry, index, self.method, form)
-        return found.carry, self.record(inputs.folds, found.accumulators, found.sample, found.state) if self.record else ()
+        return found.carry, self.record(inputs.folds, found) if self.record else ()
 
 
 class Probed(NamedTuple):
@@ -421,8 +600,7 @@ def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
 def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
     """The results of all folds over a run that is over, its samples with time first."""
     first = jax.tree.map(lambda x: x[0], samples)
-    update = lambda acc, sample: (tuple(fold.update(a, sample) for fold, a in zip(folds, acc, strict=True)), None)  # noqa: E731
-    return finished(folds, jax.lax.scan(update, _begun(folds, first), samples)[0])
+    return finished(folds, jax.lax.scan(lambda acc, sample: (_updated(folds, acc, sample), None), _begun(folds, first), samples)[0])
 
 
 def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, instants: Probed) -> Outcome:

@@ -23,9 +23,8 @@ from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import STEP_SIZE_CHUNK
 from iblf_jax.engine.step import Run
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import accuracy, jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
-from iblf_jax.simulation.integrators import step as one_step
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.simulation.stability import SLOWEST, jacobian
@@ -38,8 +37,8 @@ LOOKS = 33
 """Places along the reference at which modes are measured."""
 MOST_TRIED = 5_000_000
 """Steps of the longest run that is tried."""
-CUTS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.236), (0.618, 0.382))
-"""Start and size, in steps, of what is integrated for each step: it, and its three parts."""
+CUTS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.618), (0.618, 1.0))
+"""Start and end, in steps, of what is integrated for each step: it, and its three parts."""
 
 
 class Pair(NamedTuple):
@@ -90,24 +89,28 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
     n = scenario.n
 
     def chunk(scenario, dt, steps, pair):
-        cuts = jnp.asarray(CUTS, dt.dtype)
+        cuts, times = jnp.asarray(CUTS, dt.dtype), scenario.jump_times()
 
         def one(pair, _):
-            begin = pair.step.astype(dt.dtype) * dt
+            number = pair.step.astype(dt.dtype)
+            begin, after = number * dt, (number + 1.0) * dt
 
             def part(both, cut):
                 coarse, fine = both
-                whole_step, t, h = cut[1] == 1.0, begin + cut[0] * dt, cut[1] * dt
+                whole_step, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
                 x = jnp.where(whole_step, coarse, fine)
 
-                stepped = one_step(method, partial(evaluate, scenario), t, whole(x), h, rolled=True)
+                span = jumps.Span(begin + cut[0] * dt, jnp.where(cut[1] == 1.0, after, begin + cut[1] * dt), h)
+                stepped = jumps.integrated(method, partial(evaluate, scenario), jumps.divided(times, span), whole(x), rolled=True)
                 new, sample = ravel_pytree(stepped.state)[0], stepped.first
-                seen = (stepped.slopes, sample.upper - sample.lower, sample.xi)
+                seen = (stepped.parts, sample.upper - sample.lower, sample.xi)
                 return (jnp.where(whole_step, new, coarse), jnp.where(whole_step, fine, new)), seen
 
-            (coarse, fine), (slopes, widths, xis) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
-            width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], slopes)
-            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, [(dt, of_coarse)], width)
+            (coarse, fine), (parts, widths, xis) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
+            width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], parts)
+            reach = accuracy.steps_back(method)
+            restarts = jumps.within(times, (number - reach) * dt, after) if times.size else None
+            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, of_coarse, width, restarts=restarts)
             near = jnp.max(jnp.abs(xis[1]))
             nearest = jax.tree.map(partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest)
             off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)

@@ -32,10 +32,11 @@ class Robot(Protocol):
     the tip, is one of them in every member, so that any robot can carry what its model does not know.
 
     Two methods more are used where a member has them, through `at_time` and `friction_torque` below: `at(t)`, the robot as it is at
-    time t [s], for one that changes while it moves; and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.  Both
-    are of the plant only: law and observer know neither, and (2.1) has them in f.  A third, `energy_gradient(q, v)`, is used by the
-    function of this name where a member has something shorter than the general formula.  A class may name its `geometry_fields`, a tuple
-    of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
+    time t [s], for one that changes while it moves, with `jump_times()`, (m,) [s], if it jumps then, as disturbances have (steps of a run
+    are divided there); and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.  Both are of the plant only: law and
+    observer know neither, and (2.1) has them in f.  A third, `energy_gradient(q, v)`, is used by the function of this name where a member
+    has something shorter than the general formula.  A class may name its `geometry_fields`, a tuple of fields whose zeros, ones and equal
+    numbers may be compiled in (`engine.mechanism`).
     """
 
     @property

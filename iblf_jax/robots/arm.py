@@ -199,6 +199,10 @@ class Arm:
         object.__setattr__(now, "carried", self.carried.at(t))
         return now
 
+    def jump_times(self) -> jax.Array:
+        """When the arm picks up its load, and when all of the load hangs on it, (2,) [s]; (0,) where it does not pick one up."""
+        return self.carried.jump_times()
+
     # ------------------------------------------------------------------------------------------------------- where things are
 
     @traced_once

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.time import no_times
 from iblf_jax.robots.spatial import pseudo_inertia
 
 
@@ -57,6 +58,15 @@ class Payload:
         for name, value in (("mass", share * self.mass), ("inertia", share * self.inertia), ("start", None)):
             object.__setattr__(now, name, value)
         return now
+
+    def jump_times(self) -> jax.Array:
+        """When the share begins to rise, and when it is 1, (2,) [s]; none for a load that is there from the start.
+
+        The third derivative of the share jumps there.  Within a step that is longer than `rise`, the load itself does.
+        """
+        if self.start is None:
+            return no_times()
+        return jnp.stack([self.start, self.start + self.rise])
 
     def moments(self) -> jax.Array:
         """Its pseudo-inertia about the tip's origin, (4, 4); zero while it has a start that no `at` has looked at."""

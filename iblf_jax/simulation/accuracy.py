@@ -20,8 +20,9 @@ is dt |k_3 - k_2| |dt A|^2 / 30; Heun's is dt |k_2 - k_1| |dt A| / 6, where |dt 
 taken.  J is what the map from a period to the next is as a rate.
 
 What the stages of a step cannot see, a reference or a disturbance that goes through whole periods between them, is looked for on its own
-(`between_stages`).  Against runs at a sixteenth of the step the estimate is a third to thirty times the error where that matters, above
-1e-4 of the tube, and larger below.
+(`between_stages`).  At the jump times of a scenario a step is divided (`jumps`), and no difference reaches over one
+of them: there, too, the stages of a step give its error.  Against runs at a sixteenth of the step the estimate is a third to thirty times
+the error where that matters, above 1e-4 of the tube, and larger below.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.robots import at_time
 from iblf_jax.simulation.closed_loop import LoopState, surroundings
 from iblf_jax.simulation.integrators import Tableau, tableau
+from iblf_jax.simulation.jumps import within
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST
 
@@ -100,6 +102,12 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
+def steps_back(method: str) -> int:
+    """Over how many steps the differences reach that tell of a step's error."""
+    table = tableau(method)
+    return (len(table.differences) - 1) // (2 if table.halfway else 1)
+
+
 def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     """The estimate before the first step.
 
@@ -113,7 +121,7 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     none = jnp.zeros((2 * n,), jacobian.dtype)
     if state.held:
         return Accuracy((none,) if len(table.c) == 1 else (), none, response(jacobian, n)[:, :n], none[:n], none[0])
-    pending = (none,) * ((len(table.differences) - 1) // (2 if table.halfway else 1))
+    pending = (none,) * steps_back(method)
     return Accuracy(pending, none, response(jacobian, n), none[:n], none[0])
 
 
@@ -131,6 +139,8 @@ def observed(
     pieces: list[tuple[jax.Array, list[LoopState]]],
     width: jax.Array,
     held: bool = False,
+    restarts: Any = None,
+    overfull: Any = None,
 ) -> Accuracy:
     """The estimate after one more instant.
 
@@ -139,20 +149,29 @@ def observed(
       method: the integrator.
       dt: time step, () [s].
       index: number of the instant, () int.
-      pieces: length [s] of what the step from it was made of, and the slopes of the stages there: one, or two where the torque is held.
+      pieces: length [s] of each piece of the step from it (`jumps`), and the slopes of the stages there.
       width: of the tube, (n,) [rad].
       held: whether the torque is, as in a sampled loop.
+      restarts: whether the differences reach over a jump, or there is one in this step, () bool; None where there are no jumps.
+      overfull: whether a step has more jumps than it is divided at, () bool; None where that cannot be.
     """
     table, n = tableau(method), width.size
+    if overfull is not None:
+        accuracy = accuracy._replace(
+            error=jnp.where(overfull, jnp.inf, accuracy.error), relative=jnp.where(overfull, jnp.inf, accuracy.relative)
+        )
     if held:
-        return _observed_within(accuracy, table, dt, pieces, width)
-    ((_, slopes),) = pieces
+        return _observed_within(accuracy, table, dt, pieces, width, restarts)
+    slopes = pieces[0][1]
     weights, each = table.differences[::-1], 2 if table.halfway else 1
     width = jax.lax.stop_gradient(width)
     here = _rate(accuracy, slopes[0])
     complete = index >= len(accuracy.pending)
     error = accuracy.pending[0] + weights[0] * here
-    drift = (1.0 - SLOWEST * dt) * accuracy.drift + jnp.where(complete, dt, 0.0) * error
+    added = jnp.where(complete, dt, 0.0) * error
+    if restarts is not None:
+        added = jnp.where(restarts, sum(_by_stages(partial(_rate, accuracy), table, length, slopes) for length, slopes in pieces), added)
+    drift = (1.0 - SLOWEST * dt) * accuracy.drift + added
     pending = [x + weights[each * (k + 1)] * here for k, x in enumerate((*accuracy.pending[1:], jnp.zeros_like(here)))]
     if table.halfway:
         middle = _rate(accuracy, slopes[table.halfway])
@@ -162,8 +181,21 @@ def observed(
     return Accuracy(tuple(pending), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
 
 
+def _by_stages(rate: Callable, table: Tableau, length: jax.Array, slopes: list[LoopState]) -> jax.Array:
+    """The error of one step of this length by the slopes of its stages, in terms of `rate` of a slope; 0 for a method of one stage."""
+    if len(table.c) == 1:
+        return jnp.zeros_like(rate(slopes[0]))
+    late = table.halfway or 1
+    later = jax.tree.map(jnp.subtract, slopes[late], slopes[late - 1])
+    early = jax.tree.map(jnp.subtract, slopes[1], slopes[0]) if table.halfway else slopes[0]
+    sizes = [sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part))) for part in (early, later)]
+    fast = jnp.minimum((2.0 if table.halfway else 1.0) * sizes[1] / jnp.maximum(sizes[0], jnp.finfo(length.dtype).tiny), 2.0)
+    error = rate(later) * (fast**2 / 3.0 if table.halfway else fast * 5.0 / 3.0)
+    return jax.lax.stop_gradient(length) * error
+
+
 def _observed_within(
-    accuracy: Accuracy, table: Tableau, dt: jax.Array, pieces: list[tuple[jax.Array, list[LoopState]]], width: jax.Array
+    accuracy: Accuracy, table: Tableau, dt: jax.Array, pieces: list[tuple[jax.Array, list[LoopState]]], width: jax.Array, restarts: Any
 ) -> Accuracy:
     """As `observed`, from the stages of one step; a method of one stage is held against the step before."""
     n, drift, before = width.size, (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending
@@ -172,16 +204,13 @@ def _observed_within(
         return _rate(accuracy, slope._replace(observer=(), actuator=()))
 
     for length, slopes in pieces:
-        if before:
-            here = moved(slopes[0])
-            error, before = (here - before[0]) / 2.0, (here,)
-        else:
-            late = table.halfway or 1
-            later = jax.tree.map(jnp.subtract, slopes[late], slopes[late - 1])
-            early = jax.tree.map(jnp.subtract, slopes[1], slopes[0]) if table.halfway else slopes[0]
-            sizes = [sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part))) for part in (early, later)]
-            fast = jnp.minimum((2.0 if table.halfway else 1.0) * sizes[1] / jnp.maximum(sizes[0], jnp.finfo(dt.dtype).tiny), 2.0)
-            error = moved(later) * (fast**2 / 3.0 if table.halfway else fast * 5.0 / 3.0)
+        if not before:
+            drift = drift + _by_stages(moved, table, length, slopes)
+            continue
+        here = moved(slopes[0])
+        error, before = (here - before[0]) / 2.0, (here,)
+        if restarts is not None:
+            error = jnp.where(restarts, 0.0, error)
         drift = drift + jax.lax.stop_gradient(length) * error
     size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
     relative = jnp.maximum(accuracy.relative, jnp.max(size / jax.lax.stop_gradient(width)))
@@ -233,8 +262,14 @@ def unseen(scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Arra
     # The difference of two positions is rounded, the more so the later it is: that much is no error.
     noise = 4.0 * jnp.finfo(dt.dtype).eps * (jnp.abs(ends[:, 0]) + starts[:, None] * jnp.abs(rate)) / dt
     missed = jnp.maximum(jnp.abs(rate - (ends[:, -1] - ends[:, 0]) / dt) - noise, 0.0)
-    missed = jnp.max(missed.reshape(-1, n), axis=0)
+    missed = jnp.max(missed.reshape(INSTANTS, -1, n), axis=1)
     push = jnp.abs(jnp.sum(own * torques[:, stages], axis=1) - jnp.sum(exact * torques[:, others], axis=1))
+    jumps = scenario.jump_times()
+    if jumps.size:
+        # A step is divided at the jumps that are declared: its stages see them.
+        divided = jax.vmap(lambda start: within(jumps, start, start + 2.0 * dt))(starts - 0.5 * dt)[:, None]
+        missed, push = jnp.where(divided, 0.0, missed), jnp.where(divided, 0.0, push)
+    missed = jnp.max(missed, axis=0)
     width = jnp.min((tube.upper - tube.lower)[:, 0], axis=0)
     # A sampled law reads them at its samples: what they do between is no error of the step.
     return Unseen(missed if scenario.sampling is None else jnp.zeros_like(missed), jnp.max(push, axis=0), width)

@@ -26,6 +26,7 @@ from iblf_jax.actuators import Ideal
 from iblf_jax.controllers import Command
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.time import as_at
 from iblf_jax.regions import margins
 from iblf_jax.robots import at_time, friction_torque
 from iblf_jax.sensors import Measurement
@@ -237,7 +238,7 @@ def evaluate(
       scenario: what runs.
       t: time, () [s].
       state: state at t.
-      dt: the time that the sample stands for, () [s].
+      dt: weight of the sample in an integral over time, () [s].
       torque: what arrives at the actuator, (n,) [N m], where the law is sampled; the last command if not given.
     """
     model, q, dq = scenario.model, state.q, state.dq
@@ -247,7 +248,7 @@ def evaluate(
         asked, said = command.tau, said_by(command, f_hat)
     else:
         asked, said = state.held.commands[0] if torque is None else torque, state.held.said
-    delivered = scenario.actuator.deliver(asked, dq, state.actuator)
+    delivered = as_at(scenario.actuator, t).deliver(asked, dq, state.actuator)
     ddq = acceleration(scenario, t, q, dq, delivered.tau)
     rate = LoopState(dq, ddq, (), (), delivered.rate)
     if scenario.sampling is None:
@@ -272,7 +273,7 @@ def observed(
     Args:
       scenario: its reference, bounds and model are looked at.
       t: time, () [s].
-      dt: the time that the sample stands for, () [s].
+      dt: weight of the sample in an integral over time, () [s].
       q, dq, ddq: motion, (n,) each.
       tau: torque that acts, (n,) [N m].
       limited: whether the actuator gave less than was asked, (n,) bool.
@@ -290,6 +291,7 @@ def observed(
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
+        step=jnp.zeros_like(t),
         q=q,
         dq=dq,
         tau=tau,

@@ -1,8 +1,14 @@
 """Metrics: what a run is judged by, each a fold over its samples.
 
 A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`; it sees every step whatever is recorded, so the same
-definition serves one recorded run, a million runs that store no trajectory, and a tuning loss.  Integrals are sums over the steps,
-sum_k dt g(t_k) from t = 0 to the last step before the end; peaks and margins see the last sample too.
+definition serves one recorded run, a million runs that store no trajectory, and a tuning loss.
+
+Integrals are sums by the trapezoidal rule, of second order in the step,
+
+    int_0^T g dt = sum_k dt_k g(t_k),      dt_k = dt, and dt/2 for the first and the last sample (`Sample.dt`).
+
+Where signals jump, at a sample of a sampled law, at the arrival of a command, or at a jump time of the scenario, the fold sees both limits
+as samples of one time, so the rule is applied to each smooth part by itself.
 
 A fold is a component: thresholds are leaves.  Its `units` name what `finish` returns.
 """
@@ -88,7 +94,8 @@ class Tracking:
 
 class _SettlingState(NamedTuple):
     outside: jax.Array
-    last_outside: jax.Array
+    since: jax.Array
+    """Time of the first sample inside after the last one outside."""
     overshoot: jax.Array
     side: jax.Array
 
@@ -115,13 +122,12 @@ class Settling:
     def update(self, acc: _SettlingState, sample: Sample) -> _SettlingState:
         """Adds one sample."""
         outside = ~(jnp.abs(sample.e1) < self.tolerance)
-        # Settled from the sample after the last one outside: the time that this sample reaches to.
-        last = jnp.where(outside, sample.t + sample.dt, acc.last_outside)
-        return _SettlingState(outside, last, jnp.maximum(acc.overshoot, -acc.side * sample.e1), acc.side)
+        since = jnp.where(acc.outside & ~outside, sample.t, acc.since)
+        return _SettlingState(outside, since, jnp.maximum(acc.overshoot, -acc.side * sample.e1), acc.side)
 
     def finish(self, acc: _SettlingState) -> dict[str, jax.Array]:
         """settling_time and overshoot, each (n,)."""
-        return {"settling_time": jnp.where(acc.outside, jnp.inf, acc.last_outside), "overshoot": acc.overshoot}
+        return {"settling_time": jnp.where(acc.outside, jnp.inf, acc.since), "overshoot": acc.overshoot}
 
 
 def _first_outside(acc: Any, margin: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:

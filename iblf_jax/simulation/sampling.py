@@ -130,17 +130,48 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
     if sampling.queue == 0:
         one = jnp.ones_like(dt)
         return Arriving(_if_possible(sampling, dt, sampling.delay, commands[0]), commands[0], one, one < 0)
+    age, place, changes = _arrival(sampling, dt, now.phase)
+    old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
+    return Arriving(_if_possible(sampling, dt, age, old), new, jnp.where(changes, place, 1.0), changes)
+
+
+def _arrival(sampling: Sampling, dt: jax.Array, phase: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of a step so many steps after a sample: the age of the command at work at its start, counted from the newest, in samples; where the
+    one after it arrives [steps]; and whether that is within the step.
+    """
     delay = sampling.delay / dt
     whole = jnp.round(delay)
     near = NEARLY + 4.0 * jnp.finfo(dt.dtype).eps * delay
     delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0))
-    steps, phase = _steps(sampling, dt), now.phase.astype(dt.dtype)
-    # The command at work at the start of this step, counted from the newest, and where the one after it arrives.
+    steps, phase = _steps(sampling, dt), phase.astype(dt.dtype)
     age = jnp.maximum(jnp.ceil(jax.lax.stop_gradient(delay - phase) / steps), 0.0)
     place = delay - phase - (age - 1.0) * steps
-    changes = (age > 0) & (place <= 1.0)
-    old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
-    return Arriving(_if_possible(sampling, dt, age, old), new, jnp.where(changes, place, 1.0), changes)
+    return age, place, (age > 0) & (place <= 1.0)
+
+
+def arrival_before(sampling: Sampling, dt: jax.Array, now: Instant) -> tuple[jax.Array, jax.Array] | None:
+    """When a command arrived in the step before an instant, counted from that step's start, () [s], and whether one did."""
+    if sampling.queue == 0:
+        return None
+    steps = _steps(sampling, dt).astype(now.phase.dtype)
+    _, place, changes = _arrival(sampling, dt, jnp.where(now.phase == 0, steps, now.phase) - 1)
+    return place * dt, changes
+
+
+def torque_before(sampling: Sampling, dt: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:
+    """The torque that is at work just before a sample, (n,) [N m].
+
+    Args:
+      sampling: the period and the delay.
+      dt: of the step, () [s].
+      before: the commands before the sample, newest first, (queue + 1, n) [N m].
+      after: those after it.
+    """
+    if sampling.queue == 0:
+        return before[0]
+    # A command that arrives with the sample is that of the step before, so what is at work is at least one sample old.
+    age, _, _ = _arrival(sampling, dt, jnp.zeros((), jnp.int32))
+    return _chosen(after, jnp.maximum(age, 1.0))
 
 
 def _if_possible(sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array) -> jax.Array:

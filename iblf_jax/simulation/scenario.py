@@ -23,6 +23,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
+from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.disturbances import Disturbance, Nothing
 from iblf_jax.observers import NoObserver, Observer
 from iblf_jax.references import Reference
@@ -152,6 +153,17 @@ class Scenario:
     def n(self) -> int:
         """Number of joints."""
         return self.plant.n
+
+    def jump_times(self) -> jax.Array:
+        """The times at which the right-hand side of the closed loop jumps, (m,) [s], in no order: those that its parts declare."""
+        parts: dict[str, Any] = {"plant": self.plant, "reference": self.reference}
+        for name, bounds in (("bounds", self.bounds), ("velocity_bounds", self.velocity_bounds)):
+            if bounds is not None:
+                parts |= {f"{name}.lower": bounds.lower, f"{name}.upper": bounds.upper}
+        parts |= {f"controller[{i}]": layer for i, layer in enumerate(layers(self.controller))}
+        parts |= {"observer": self.observer, "disturbance": self.disturbance, "actuator": self.actuator}
+        dtype = jnp.result_type(self.initial.q)
+        return joined([jump_times_of(name, part, dtype) for name, part in parts.items()], dtype)
 
     @property
     def setting(self) -> Setting:

@@ -62,11 +62,17 @@ class Sample(Signals):
     """The loop at one instant: what is recorded, and what else metrics fold over."""
 
     dt: Array
-    """The time that this sample stands for in a sum over time, () [s]: the step, and 0 for the last sample."""
+    """Weight of this sample in an integral over time, sum dt g, () [s].
+
+    The weights are those of the trapezoidal rule: the step, half of it for the first and the last sample.  Where signals jump there are two
+    samples of one time, the limits from either side, each with half of the time to its neighbour.
+    """
     gravity: Array
     """G0(q), what holding the model still takes [N m]."""
     guard_active: Array
     saturated: Array
+    step: Any = dataclasses.field(default=0.0, kw_only=True)
+    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples beside a jump."""
 
 
 def has(sample: Signals, signal: str) -> bool:

@@ -125,8 +125,8 @@ def vector_field(scenario: Scenario) -> VectorField:
 
     It takes (t, x) for SciPy and (t, x, args) for diffrax, works under `jit`, `vmap`, `grad` and `jacfwd`, and is differentiable by
     every leaf of the scenario: make it inside the function that you differentiate.  Nothing stops or freezes a run that leaves its
-    bounds: metrics, status and warnings belong to `simulate`.  Where the torque on the plant jumps, at `scenario.disturbance.jump_times()`,
-    tell an adaptive solver so.
+    bounds: metrics, status and warnings belong to `simulate`.  An adaptive solver has to know where the right-hand side
+    jumps: `scenario.jump_times()`.
 
     Args:
       scenario: what runs, of n joints.

@@ -56,7 +56,8 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
 def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
     """A made-up run of n joints, (LENGTH, ...), at steps of so many seconds, all its numbers apart from each other."""
     t = np.arange(LENGTH) * step
-    dt = np.where(np.arange(LENGTH) < LENGTH - 1, step, 0.0)
+    dt = np.where((np.arange(LENGTH) > 0) & (np.arange(LENGTH) < LENGTH - 1), step, 0.5 * step)
+    since = np.where(np.arange(LENGTH) > 0, step, 0.0)
     angle = 0.08 * np.arange(LENGTH)[:, None]
 
     def wave(size):
@@ -69,7 +70,17 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
     k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
     numbers |= {"slack": np.abs(wave(0.1)), "dq_lower": np.full((LENGTH, n), -0.9), "dq_upper": np.full((LENGTH, n), 1.1)}
     numbers |= {"region_margin": 0.3 + wave(0.2)[:, :REGIONS], "region_slack": np.abs(wave(0.1))[:, :REGIONS]}
-    numbers |= sides | {"q": q_d + e1, "e1": e1, "xi": e1 / k, "q_d": q_d, "tau": tau, "V": np.abs(wave(1.0))[:, 0], "t": t, "dt": dt}
+    numbers |= sides | {
+        "q": q_d + e1,
+        "e1": e1,
+        "xi": e1 / k,
+        "q_d": q_d,
+        "tau": tau,
+        "V": np.abs(wave(1.0))[:, 0],
+        "t": t,
+        "dt": dt,
+        "step": since,
+    }
     flags = {name: rng.uniform(size=(LENGTH, n)) < 0.3 for name in ("guard_active", "saturated")}
     return samples_from({k: jnp.asarray(v) for k, v in numbers.items()}, {k: jnp.asarray(v) for k, v in flags.items()})
 
@@ -103,7 +114,7 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     """On a run without any error or torque, nothing is NaN, and nor is any derivative."""
-    still, kept = jax.tree.map(jnp.zeros_like, samples), ("t", "dt", "lower", "upper", "q_d")
+    still, kept = jax.tree.map(jnp.zeros_like, samples), ("t", "dt", "step", "lower", "upper", "q_d")
     rest = dataclasses.replace(still, q=samples.q_d, **{name: getattr(samples, name) for name in kept})
     moving, flags = parts(rest)
 

@@ -206,5 +206,5 @@ def check_disturbance(disturbance: Any, *, plant: Any = None, model: Any = None,
         findings.stop_if_any()
         jump = find_jump(lambda t: fitted.torque(t, q, dq, plant, model), 0.0, duration, tuple(known))
         at = "" if jump is None else f"{jump:.6g}"
-        remedy = "Return that time in jump_times(): the envelopes of Theorem 2 restart there"
+        remedy = "Return that time in jump_times(): steps of a run are divided there"
         findings.require(jump is None, f"the torque jumps at t = {at} s, which jump_times() does not say", remedy)

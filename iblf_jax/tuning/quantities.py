@@ -2,7 +2,7 @@
 
 Two kinds cover what gains are tuned for, over a signal y(t), a vector:
 
-    TimeIntegral   sum_k dt |y(t_k)|^2
+    TimeIntegral   int |y|^2 dt = sum_k dt_k |y(t_k)|^2, by the weights of the samples (`Sample.dt`: the trapezoidal rule)
     Peak           max_j p_j,   p_j the largest y_i(t_k) of one entry i of the signal within one window of time
 
 The pieces p_j are smooth where their maximum is not: a requirement on a peak is one on each of its pieces.  In a term of the objective
@@ -99,8 +99,9 @@ def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
 def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any, joints: Selection = None) -> jax.Array:
     """A signal of the selected joints at one sample, (k,), (2 k,) or one number a region.
 
-    error e1; torque tau; torque_rate (tau - last tau) / dt; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose
-    integral of squares is the time outside the tolerance; deficit (lower - q, q - upper), the largest of which is minus the margin;
+    error e1; torque tau; torque_rate (tau - last tau) / step, the mean over the step before an instant, jumps of the torque included;
+    outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose integral of squares is the time outside the tolerance;
+    deficit (lower - q, q - upper), the largest of which is minus the margin;
     velocity_deficit the same of the velocities; region_deficit minus the distances to the walls of the regions.
     """
 
@@ -112,7 +113,8 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any, joints
     if name == "torque":
         return of_joints(sample.tau)
     if name == "torque_rate":
-        return of_joints(sample.tau - last) / jnp.where(sample.dt > 0, sample.dt, 1.0)
+        change = of_joints(sample.tau - last)
+        return jnp.where(sample.step > 0, change / jnp.where(sample.step > 0, sample.step, 1.0), 0.0)
     if name == "outside":
         e1 = of_joints(sample.e1)
         size = jnp.where(e1 >= 0, e1, -e1)
@@ -125,9 +127,14 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any, joints
     return jnp.concatenate([of_joints(sample.lower - sample.q), of_joints(sample.q - sample.upper)])
 
 
+def _last_torque(acc, sample: Sample) -> jax.Array:
+    """The torque of the last instant: a sample beside a jump is none."""
+    return jnp.where((sample.step > 0) | (sample.t <= 0), sample.tau, acc[1])
+
+
 @component
 class TimeIntegral:
-    """sum_k dt sum_i (w_i y_i(t_k))^2 over the samples with t >= after and the joints i that are selected.
+    """int |w y|^2 dt over the samples with t >= after.
 
     Args:
       signal: "error", "torque", "torque_rate" or "outside"; "error" if not given.
@@ -154,13 +161,23 @@ class TimeIntegral:
         y = weights * signal_of(self.signal, sample, acc[1], self.tolerance, self.joints)
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y, 0.0)
 
+    def _weight(self, acc, sample: Sample) -> jax.Array:
+        """Weight of a sample, () [s]."""
+        if self.signal == "torque_rate":
+            return sample.step  # the difference quotient holds for all of the step before
+        # Half of the time since the sample before is in the weight.  Where counting begins within that time, what is left of it counts.
+        before = acc[2]
+        left = jnp.maximum(sample.t - self.after, 0.0)
+        return jnp.where(before < self.after, sample.dt - 0.5 * (sample.t - before) + left, sample.dt)
+
     def init(self, sample: Sample):
         """Zero; the first torque has no predecessor but itself."""
-        return jnp.zeros_like(sample.t), sample.tau
+        return jnp.zeros_like(sample.t), sample.tau, sample.t
 
     def update(self, acc, sample: Sample):
         """Adds one sample."""
-        return acc[0] + sample.dt * jnp.sum(self._at(acc, sample) ** 2), sample.tau
+        total = acc[0] + self._weight(acc, sample) * jnp.sum(self._at(acc, sample) ** 2)
+        return total, _last_torque(acc, sample), sample.t
 
     def finish(self, acc):
         """The integral, three times."""
@@ -169,7 +186,7 @@ class TimeIntegral:
     def curvature(self, acc, sample: Sample) -> Outer:
         """2 dt y_u . y_v."""
         y = self._at(acc, sample)
-        return Outer(y, jnp.broadcast_to(2 * sample.dt, y.shape))
+        return Outer(y, jnp.broadcast_to(2 * self._weight(acc, sample), y.shape))
 
     def hessian(self, products: jax.Array, pieces: jax.Array, slopes: jax.Array) -> jax.Array:
         """The sum of products itself."""
@@ -254,7 +271,7 @@ class Peak:
             begun, none = sample.t >= edge, jnp.zeros((1,), bool)
             inside = jnp.concatenate([~none, begun]) & ~jnp.concatenate([begun, none])
             above = above & inside[:, None]
-        return jnp.where(above, y, acc[0]), sample.tau
+        return jnp.where(above, y, acc[0]), _last_torque(acc, sample)
 
     def finish(self, acc):
         """The smooth maximum, the maximum, and the pieces."""

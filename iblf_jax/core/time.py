@@ -1,0 +1,58 @@
+"""Parts of a scenario that change with time: what they are at an instant, and when they jump.
+
+A part that changes with time may have `at(t)`, which returns the part as it is at time t [s].  A part
+that is discontinuous in time declares the instants by `jump_times()`, and steps of a run are divided
+there.  Both methods are optional in every family, but for the `jump_times` of disturbances.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core import checks
+
+T = TypeVar("T")
+
+
+def as_at(part: T, t: jax.Array) -> T:
+    """A part as it is at time t [s]: itself, unless it has a method `at`."""
+    return part.at(t) if hasattr(part, "at") else part
+
+
+def no_times(dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
+    """The jump times of what never jumps, (0,) [s]."""
+    return jnp.zeros((0,), dtype)
+
+
+def jump_times_of(name: str, part: Any, dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
+    """The jump times of a part, (m,) [s] in a floating-point type; none if it declares none.
+
+    Args:
+      name: of the part, for the error message.
+      part: any part of a scenario.
+      dtype: of the times; JAX's default if not given.
+
+    Raises:
+      ValueError: `jump_times` fails, or does not return times.
+    """
+    if not hasattr(part, "jump_times"):
+        return no_times(dtype)
+    expected = "times [s], one number or (m,), made of the fields by jnp"
+    try:
+        times = jnp.asarray(part.jump_times(), dtype)
+    except Exception as error:
+        got = f"{type(error).__name__}: {checks.line(str(error))}"
+        remedy = "Their number may not depend on the numbers of the fields; return jnp.zeros(0) for none."
+        raise checks.fail(f"{name}.jump_times()", got, expected, remedy) from error
+    if times.ndim > 1 or not jnp.issubdtype(times.dtype, jnp.floating):
+        raise checks.fail(f"{name}.jump_times()", times, expected)
+    return times.reshape(-1)
+
+
+def joined(times: list[jax.Array], dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
+    """Jump times of several parts together, (m,) [s]."""
+    some = [x for x in times if x.size]
+    return jnp.concatenate(some) if some else no_times(dtype)
