@@ -1,6 +1,6 @@
 """The claim with weights, which holds for every positive K2 and kf.
 
-    V_w = sum_i w_i V1_i + 1/2 e2^T M0 e2 + (w_f/2) |f_tilde|^2,   w_f > 0 [1/(N m s)]
+    V_w = sum_i w_i V1_i + 1/2 e2^T M0 e2 + (w_f/2) |f_tilde|^2,   w_f > 0 [rad/(N m)]
     V_w' <= -rho V_w + (w_f/(2 b)) |f'|^2                                                                                        (W.1)
     rho = min( decay rate of V1,  2 (1 - a) mu,  2 min_i(kf_i - b/2 - 1/(4 a K2_i w_f)) ),   mu = lambda_min(M0^-1 K2)           (W.2)
 
@@ -37,7 +37,7 @@ class Weights(NamedTuple):
     b: float
     """[1/s]; 0 in case 1."""
     w_f: float
-    """[1/(N m s)]."""
+    """[rad/(N m)]."""
     rho: float
     """[1/s]."""
     rho2: float

@@ -40,7 +40,7 @@ def rates(whole: Whole) -> list[Line]:
         found = whole.weights[case]
         limits = (np.min(whole.claim.decay), 2.0 * whole.slowest, 2.0 * np.min(whole.claim.kf))
         least = ("the decay rate of V1", "K2 over M0", "kf")[int(np.argmin(limits))]
-        chosen = f"a = {found.a:.4g}, w_f = {found.w_f:.4g} 1/(N m s)" + (f", b = {found.b:.4g} 1/s" if case == 2 else "")
+        chosen = f"a = {found.a:.4g}, w_f = {found.w_f:.4g} rad/(N m)" + (f", b = {found.b:.4g} 1/s" if case == 2 else "")
         note = f"chosen for the smallest mean of the envelope: {chosen}; lambda_min(M0^-1 K2) = {whole.slowest:.4g} 1/s; limited by {least}"
         margin = float(np.min(weighted.rate_terms(whole.claim, whole.slowest, found.a, found.b, found.w_f)))
         counts = not (case == 2 and whole.case == 1)
