@@ -26,6 +26,7 @@ from iblf_jax.core.devices import default, platform
 
 F = TypeVar("F", bound=Callable)
 
+LARGEST_INTEGER = 2**63 - 1
 MOST_STEPS = 2**31 - 1
 """Steps are counted in int32 inside the compiled loop."""
 
@@ -601,7 +602,7 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
 def recorded_every(value: Any, steps: int) -> int:
     """Every how many steps to record, as the compiled loops count it, in int32.
 
-    A number past the last step is as good as any further one.  One that is larger than the number
-    of steps which any run can have is refused.
+    Every number past the last step has the same effect: only the first instant is recorded.  A number
+    that no integer type of a computer holds is a mistake, and refused.
     """
-    return min(positive_integer("record_every", value, most=MOST_STEPS), steps + 1, MOST_STEPS)
+    return min(positive_integer("record_every", value, most=LARGEST_INTEGER), steps + 1, MOST_STEPS)

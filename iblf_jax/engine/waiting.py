@@ -19,5 +19,7 @@ def wait_until_ready(outputs: Any) -> None:
     """
     begin = time.monotonic()
     for array in jax.tree.leaves(outputs):
-        while isinstance(array, jax.Array) and not array.is_ready():  # type: ignore[attr-defined]
+        if not isinstance(array, jax.Array) or isinstance(array, jax.core.Tracer):
+            continue  # under a transformation nothing is computed yet
+        while not array.is_ready():  # type: ignore[attr-defined]
             time.sleep(min(SHARE * (time.monotonic() - begin), LONGEST))
