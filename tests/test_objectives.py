@@ -309,6 +309,8 @@ def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joint
         (lambda o: o.tracking(joints={0}), "tracking: joints"),
         (lambda o: o.tracking(weights=[[1.0]]), "tracking: weights"),
         (lambda o: o.peak_torque_below([1.0, 2.0], weights=[1.0, 2.0, 3.0]), "peak_torque_below: weights"),
+        (lambda o: o.peak_torque_below(5.0, weights=-1.0), "peak_torque_below: weights: got -1.*>= 0"),
+        (lambda o: o.tracking(weights=[0.0, 0.0]), "tracking: weights: got .*at least one weight > 0"),
     ],
 )
 def test_errors_name_the_argument_of_the_function(call, message):
