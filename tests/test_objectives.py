@@ -337,6 +337,12 @@ def test_joints_that_the_robot_does_not_have(goal, message, paper):
         ij.tune(paper, ["controller.k1"], goal(ij.objectives), **TUNING)
 
 
+def test_the_name_of_a_requirement_calls_a_slice_joints():
+    below = ij.objectives.error_below
+    assert "of joints 0:2 <" in below(0.1, joints=slice(0, 2)).name
+    assert "of joint 1 <" in below(0.1, joints=1).name
+
+
 def test_names_of_joints_become_indices():
     scenario = ij.presets.ur5()
     names = scenario.plant.joints

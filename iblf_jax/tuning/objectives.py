@@ -371,7 +371,8 @@ def _of_joints(chosen: Selection) -> str:
         return ""
     if isinstance(chosen[0], bool):
         chosen = tuple(i for i, taken in enumerate(chosen) if taken)
-    word = "joint" if len(chosen) == 1 else "joints"
+    one = len(chosen) == 1 and ":" not in str(chosen[0])
+    word = "joint" if one else "joints"
     return f" of {word} {', '.join(map(str, chosen))}"
 
 
