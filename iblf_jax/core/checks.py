@@ -509,7 +509,7 @@ def file_path(name: str, value: Any, what: str = "a file") -> Path:
     try:
         text = os.fspath(value)
         if not isinstance(text, str) or not text or "\0" in text:
-            raise fail(name, value, expected)
+            raise fail(name, value, expected, "Nothing is there." if not text else "")
         os.lstat(text)
     except (FileNotFoundError, NotADirectoryError):
         pass
