@@ -432,6 +432,7 @@ REFUSED = {
     "tunable low": (([], float("nan"), "x"), []),
     "tunable high": (([], float("nan"), "x"), []),
     "factor shared": (NO_FLAGS, []),
+    "factor distribution": ((None, float("nan"), 3.0, ij.uniform), ["ij.factor(ij.uniform(low, high))"]),
     "save_scenario path": ((None, *NO_PATHS, f"{NO_FOLDER}/scenario.toml"), []),
 }
 
@@ -461,6 +462,15 @@ def test_a_duration_that_no_step_can_be_tried_on_is_refused(monkeypatch):
     refuses(lambda: ij.recommended_dt(WEAK, duration=3e7), "duration", "at most")
     sampled = dataclasses.replace(WEAK, sampling=ij.Sampling(period=1e-3))
     refuses(lambda: ij.recommended_dt(sampled, duration=3e7), "duration", "at most")
+
+
+def test_a_file_or_folder_that_does_not_exist_is_named_with_its_argument(tmp_path):
+    gains, place = ["controller.K2"], tmp_path / "none" / "state.npz"
+    with pytest.raises(FileNotFoundError, match=r"checkpoint: got .*The folder .*none does not exist: create it first\.$"):
+        ij.tune(WEAK, gains, ij.objectives.tracking(), duration=0.01, dt=1e-3, checkpoint=place)
+    refuses(lambda: ij.load_rollouts(tmp_path / "none.nc"), "path", "Nothing is there.")
+    with pytest.raises(ValueError, match=r"Nothing is there\.$"):
+        ij.robots.load(tmp_path / "none.urdf")
 
 
 def test_misspelt_parts_and_fields_get_a_suggestion():

@@ -309,6 +309,8 @@ def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joint
         (lambda o: o.tracking(joints={0}), "tracking: joints"),
         (lambda o: o.tracking(weights=[[1.0]]), "tracking: weights"),
         (lambda o: o.peak_torque_below([1.0, 2.0], weights=[1.0, 2.0, 3.0]), "peak_torque_below: weights"),
+        (lambda o: o.peak_torque_below(5.0, weights=-1.0), "peak_torque_below: weights: got -1.*>= 0"),
+        (lambda o: o.tracking(weights=[0.0, 0.0]), "tracking: weights: got .*at least one weight > 0"),
     ],
 )
 def test_errors_name_the_argument_of_the_function(call, message):
@@ -333,6 +335,12 @@ def test_errors_name_the_argument_of_the_function(call, message):
 def test_joints_that_the_robot_does_not_have(goal, message, paper):
     with pytest.raises(ValueError, match=message):
         ij.tune(paper, ["controller.k1"], goal(ij.objectives), **TUNING)
+
+
+def test_the_name_of_a_requirement_calls_a_slice_joints():
+    below = ij.objectives.error_below
+    assert "of joints 0:2 <" in below(0.1, joints=slice(0, 2)).name
+    assert "of joint 1 <" in below(0.1, joints=1).name
 
 
 def test_names_of_joints_become_indices():

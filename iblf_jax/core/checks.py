@@ -526,10 +526,10 @@ def file_path(name: str, value: Any, what: str = "a file") -> Path:
 
 
 def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
-    """The path of a file that is there, or a ValueError; FileNotFoundError where nothing is."""
+    """The path of a file that is there, or a ValueError; a MissingFileError where nothing is."""
     path = file_path(name, value, what)
     if not path.exists():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+        raise MissingFileError(fail(name, str(path), f"the path of {what}", "Nothing is there."))
     if not path.is_file():
         raise fail(name, str(path), f"the path of {what}", "It is a folder." if path.is_dir() else "It is not a file.")
     return path
@@ -542,13 +542,21 @@ class UnwritableError(OSError, ValueError):
     """
 
 
+class MissingFileError(FileNotFoundError, ValueError):
+    """A path at which nothing is, or whose folder does not exist.
+
+    It is a refusal like every other, and the FileNotFoundError that programs which open files expect.
+    """
+
+
 def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
-    """A path where a file can be written, or a ValueError; FileNotFoundError where its folder is not there."""
+    """A path where a file can be written, or a ValueError; a MissingFileError where its folder does not exist."""
     path = file_path(name, value, what)
     if path.is_dir():
         raise fail(name, str(path), f"the path of {what}", "It is a folder.")
     if not path.parent.exists():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+        remedy = f"The folder {path.parent} does not exist: create it first."
+        raise MissingFileError(fail(name, str(path), f"the path of {what}", remedy))
     if path.exists() and not path.is_file():  # a device, such as /dev/null
         return path
     _can_be_written(name, path, path.parent, f"the path of {what} in a folder that can be written")

@@ -176,11 +176,11 @@ def contents(field: str, path: Path, most: int, expected: str, remedy: str = "")
     try:
         if not path.is_file():
             found = "It is a directory." if path.is_dir() else "It is not a file." if path.exists() else "Nothing is there."
-            raise checks.fail(field, str(path), expected, f"{found} {remedy}")
+            raise checks.fail(field, str(path), expected, f"{found} {remedy}".strip())
         with path.open("rb") as file:
             return file.read(most + 1)
     except OSError as error:
-        raise checks.fail(field, str(path), expected, f"It cannot be read: {error}. {remedy}") from None
+        raise checks.fail(field, str(path), expected, f"It cannot be read: {error}. {remedy}".strip()) from None
 
 
 def label(element: ET.Element) -> str:

@@ -209,9 +209,7 @@ class Perturbation:
     def check(self) -> None:
         """Raises ValueError for something that is not a distribution."""
         if not is_distribution(self.distribution):
-            raise checks.fail(
-                f"{self.kind}(...)", self.distribution, "a distribution", f"Write ij.{self.kind}(ij.uniform(low, high)), for example."
-            )
+            raise _no_distribution(self.kind, self.distribution)
         checks.one_of("Perturbation.kind", self.kind, KINDS)
         object.__setattr__(self, "shared", checks.flag("Perturbation.shared", self.shared))
 
@@ -334,6 +332,18 @@ def choice(values: Any, weights: Any = None) -> Choice:
     return Choice(values, jnp.ones(checks.as_floats("choice: values", values).shape) if weights is None else weights)
 
 
+def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
+    """A perturbation; what is no distribution is refused before the fields of the component are read."""
+    if not is_distribution(distribution):
+        raise _no_distribution(kind, distribution)
+    return Perturbation(distribution, kind, shared)
+
+
+def _no_distribution(kind: str, given: Any) -> ValueError:
+    remedy = f"Write ij.{kind}(ij.uniform(low, high)), for example."
+    return checks.fail(f"{kind}: distribution", given, "a distribution", remedy)
+
+
 def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:
     """The leaf is its nominal value times a draw.
 
@@ -351,7 +361,7 @@ def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:
 
     Source: design of this package.
     """
-    return Perturbation(distribution, "factor", shared)
+    return _perturbation("factor", distribution, shared)
 
 
 def offset(distribution: Distribution, *, shared: bool = False) -> Perturbation:
@@ -371,7 +381,7 @@ def offset(distribution: Distribution, *, shared: bool = False) -> Perturbation:
 
     Source: design of this package.
     """
-    return Perturbation(distribution, "offset", shared)
+    return _perturbation("offset", distribution, shared)
 
 
 def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
@@ -391,7 +401,7 @@ def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
 
     Source: design of this package.
     """
-    return Perturbation(distribution, "value", shared)
+    return _perturbation("value", distribution, shared)
 
 
 MEMBERS = {"uniform": Uniform, "normal": Normal, "log_uniform": LogUniform, "choice": Choice, "joint_normal": JointNormal}

@@ -336,7 +336,7 @@ def _reasons(status: Sequence[int]) -> str:
         if count == len(status):
             words.append(text)
         elif count:
-            words.append(f"{count} times {text}")
+            words.append(f"{text} (in {count} of them)")
     return "; ".join(words) or "the effort is not finite"
 
 

@@ -337,8 +337,8 @@ def _limit(function: str, name: str, value: Any, example: str) -> jax.Array:
     return array
 
 
-def _choice(function: str, joints: Any, weights: Any) -> tuple[Selection, Any]:
-    """The joints that count, and their weights.
+def _choice(function: str, joints: Any, weights: Any, sign: str | None = "nonnegative") -> tuple[Selection, Any]:
+    """The joints that count, and their weights, of the sign that the function takes.
 
     Floating-point numbers as `joints` were weights in earlier versions.  They are no indices, so they still mean that.
     """
@@ -352,7 +352,10 @@ def _choice(function: str, joints: Any, weights: Any) -> tuple[Selection, Any]:
         )
         joints, weights = None, joints
     chosen = selection(f"{function}: joints", joints)
-    return chosen, _number(function, "weights", 1.0 if weights is None else weights, most=1)
+    found = _number(function, "weights", 1.0 if weights is None else weights, sign, most=1)
+    if sign is not None and checks.is_concrete(found) and not jnp.any(found > 0):
+        raise checks.fail(f"{function}: weights", weights, "at least one weight > 0")
+    return chosen, found
 
 
 def _in_words(values: Any, unit: str) -> str:
@@ -368,7 +371,8 @@ def _of_joints(chosen: Selection) -> str:
         return ""
     if isinstance(chosen[0], bool):
         chosen = tuple(i for i, taken in enumerate(chosen) if taken)
-    word = "joint" if len(chosen) == 1 else "joints"
+    one = len(chosen) == 1 and ":" not in str(chosen[0])
+    word = "joint" if one else "joints"
     return f" of {word} {', '.join(map(str, chosen))}"
 
 
@@ -551,7 +555,7 @@ def metric(fold: Fold, name: str, *, joints: Any = None, weights: Any = None, sc
     """
     name = checks.word("name", name, "the name of one of the fold's results")
     if holds_weights(joints):
-        chosen, w = _choice("metric", joints, weights)
+        chosen, w = _choice("metric", joints, weights, sign=None)
     else:
         chosen, w = selection("metric: joints", joints), 1.0 if weights is None else weights
     return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)
