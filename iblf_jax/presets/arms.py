@@ -7,10 +7,14 @@ neither the network nor a parser of robot descriptions.
 proportion to its inertia.  The inertia of a wrist is a thousandth of a shoulder's, so one number for all joints will not do: the loop's
 modes are about K2 / M, and
 
-    K2_i = rate min(sum_j |M_ij(q)|, 4 M_ii(q))
+    K2_i = rate M_ii max(1, min(sum_j |M_ij| / M_ii, 4, 4 / sum_j |(M^-1)_ij| sqrt(M_ii M_jj)))
 
-makes them `rate` on a joint that moves by itself and up to four times that where heavier joints push it, which is what a light wrist at the
-end of an arm needs.  The slope of the barrier is a spring besides, of stiffness w ds/de1, whatever K2 is.  With
+makes them `rate` on a joint that moves by itself and up to four times that where heavier joints push it, which is what a
+light wrist at the end of an arm needs.  The last term keeps the eigenvalues of M^-1 K2 below four times the rate, where
+`rate` M_ii does so: filters, drives and the delay of sampling allow no faster modes, and joints whose axes are nearly
+parallel move against each other with much less inertia than M_ii.
+
+The slope of the barrier is a spring besides, of stiffness w ds/de1, whatever K2 is.  With
 
     w_i = min(1, M_ii (rate/2)^2 / max_t ds_i/de1(e1 = 0))
 
@@ -51,7 +55,8 @@ ARMS = ("ur5", "iiwa14")
 RATE = 25.0
 """1/s.  The modes of the velocity errors on every joint of `arm_scenario`."""
 COUPLED = 4.0
-"""How much above rate M_ii the gain of a joint may be for the inertia that couples it to others [1]."""
+"""How much above rate M_ii the gain of a joint may be for the inertia that couples it to others, and how much above `rate` the fastest mode
+may be for that [1]."""
 LEAST_K2 = 0.6
 """N m s/rad; above the 1/2 of Theorem 2 (3.17), for claims with the paper's own weights."""
 TIMES = np.linspace(0.0, 20.0, 81)
@@ -100,9 +105,17 @@ def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = LEAST_K
 
 
 def _coupled_gain(robot: Robot, q: jax.Array) -> jax.Array:
-    """The gain rate min(sum_j |M_ij(q)|, 4 M_ii(q)), (n,) [N m s/rad]."""
+    """The gain of `arm_scenario` at a position, (n,) [N m s/rad].
+
+    With D the diagonal of M and R = D^(1/2) M^-1 D^(1/2), M^-1 K2 has the eigenvalues of R (K2/D), which are at most
+    max_i (K2_i/M_ii) sum_j |R_ij|, the largest sum of the sizes in a column.
+    """
     M = mass_matrix_at(robot, q.astype(jnp.result_type(float)))
-    return RATE * jnp.minimum(jnp.sum(jnp.abs(M), axis=1), COUPLED * jnp.diagonal(M))
+    inertia = jnp.diagonal(M)
+    size = jnp.sqrt(inertia)
+    coupling = jnp.sum(jnp.abs(M), axis=1) / inertia
+    fastest = jnp.sum(jnp.abs(jnp.linalg.inv(M) * size[:, None] * size), axis=1)
+    return RATE * inertia * jnp.maximum(jnp.minimum(jnp.minimum(coupling, COUPLED), COUPLED / fastest), 1.0)
 
 
 def inertial_weight(robot: Robot, reference: Reference, bounds: Bounds, barrier: Barrier, rate: float = RATE) -> jax.Array:
@@ -165,8 +178,9 @@ def arm_scenario(
 ) -> Scenario:
     """A scenario on an arm, with what follows from the arm's own numbers: bounds, saturation, gains.
 
-    k1 = 2, K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, the barrier's weight as `inertial_weight`, kf = 20; the law within the
-    arm's `effort`; bounds at its joint limits; a start on the reference at rest.
+    k1 = 2, K2 between 25 M_ii and 100 M_ii with M at the start (more than 25 where heavier joints push a lighter one, as far as no mode
+    of M^-1 K2 becomes faster than 100 1/s for it), the barrier's weight as `inertial_weight`, kf = 20; the law within the arm's `effort`;
+    bounds at its joint limits; a start on the reference at rest.
 
     Args:
       robot: with `limits` and `effort`, such as `iblf_jax.robots.load` gives; it is the plant.
