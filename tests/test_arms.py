@@ -257,32 +257,23 @@ def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are(parts):
 
 
 @pytest.mark.parametrize("name", ["ur5", "iiwa14"])
-def test_joints_that_move_against_each_other_get_no_faster_mode(name):
-    """The last axes of an arm are nearly parallel in some positions: with up to 100 M_ii, M^-1 K2 of the iiwa14 had a mode of 765 1/s."""
+def test_joints_that_move_against_each_other_get_no_fast_mode(name):
+    """Axes of an arm are nearly parallel in some positions: with up to 100 M_ii, M^-1 K2 of the iiwa14 had a mode of 2195 1/s."""
     scenario = getattr(ij.presets, name)()
-    M = np.asarray(scenario.model.mass_matrix(scenario.reference.position(jnp.zeros(()))))
-    inertia, taken = np.diagonal(M), np.asarray(get(scenario, "controller.K2"))
+    taken = np.asarray(get(scenario, "controller.K2"))
+
+    def inertia(t):
+        return np.asarray(scenario.model.mass_matrix(scenario.reference.position(jnp.asarray(t))))
+
+    start = inertia(0.0)
+    without = 25.0 * np.minimum(np.abs(start).sum(axis=1), 4.0 * np.diagonal(start))
+    assert np.all(taken <= without * (1 + 1e-9))
 
     def fastest(gains):
-        return np.abs(np.linalg.eigvals(np.linalg.solve(M, np.diag(gains)))).max()
+        return max(np.abs(np.linalg.eigvals(np.linalg.solve(inertia(t), np.diag(gains)))).max() for t in np.arange(0.0, 20.0, 2.5))
 
-    assert np.all(taken >= 25.0 * inertia * (1 - 1e-9))
-    assert np.all(taken <= 100.0 * inertia * (1 + 1e-9))
-    assert fastest(taken) <= 1.01 * max(100.0, fastest(25.0 * inertia))
-    coupling = np.abs(M).sum(axis=1) / inertia
-    assert fastest(25.0 * inertia * np.minimum(coupling, 4.0)) > 1.3 * fastest(taken)
-
-
-def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
-    """ds/de1 at e1 = 0 is that of the barrier: 2/k^2 of the integral one, 1 of the tangent."""
-    for law, stiffness in (("integral", 2 / 0.3**2), ("log", 1 / 0.3**2), ("mapping", 1.0), ("dynamic_surface", 2 / 0.3**2)):
-        scenario = arms.arm_scenario(
-            arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), law=law, bounds=narrow(0.3)
-        )
-        inertia = jnp.diagonal(scenario.model.mass_matrix(scenario.reference.position(jnp.zeros(()))))
-        np.testing.assert_allclose(get(scenario, "controller.weight"), np.minimum(1.0, inertia * 12.5**2 / stiffness), rtol=1e-9)
-    with pytest.raises(ValueError, match="bounds: got 3"):
-        arms.arm_scenario(arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), bounds=3)
+    assert 50.0 < fastest(taken) < 100.0
+    assert fastest(without) > 200.0
 
 
 # --------------------------------------------------------------------------------------------------------------- the whole chain
