@@ -186,12 +186,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
         texts.append("The step was small enough for the fastest mode: look at the gains, the start and the disturbance.")
     elif status & Status.INACCURATE:
-        error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
-        dt = _smaller_step(result, steps)
-        texts.append(
-            f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where {100 * TOLERANCE:g} % are tolerated: "
-            f"dt = {float(result.dt):g} s is too large for what drives this loop. Take {dt}."
-        )
+        texts.append(_about_accuracy(result, status, steps))
     if status & Status.INFINITE_SLOPE:
         texts.append(
             "At an isolated instant the derivative of the closed loop with respect to a state is infinite, as that of "
@@ -224,6 +219,15 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             "further from the bounds, or give the barrier a smaller guard."
         )
     return texts
+
+
+def _about_accuracy(result: Rollout, status: Status, steps: int) -> str:
+    """How inaccurate a run is, and what helps."""
+    error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
+    size = f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where {100 * TOLERANCE:g} % are tolerated"
+    if status & Status.SAMPLING_TOO_SLOW:
+        return f"{size}: a loop that grows from one period to the next magnifies every error, whatever dt is."
+    return f"{size}: dt = {float(result.dt):g} s is too large for what drives this loop. Take {_smaller_step(result, steps)}."
 
 
 def _smaller_step(result: Rollout, steps: int) -> str:

@@ -7,10 +7,14 @@ neither the network nor a parser of robot descriptions.
 proportion to its inertia.  The inertia of a wrist is a thousandth of a shoulder's, so one number for all joints will not do: the loop's
 modes are about K2 / M, and
 
-    K2_i = rate min(sum_j |M_ij(q)|, 4 M_ii(q))
+    K2_i = rate M_ii min(sum_j |M_ij| / M_ii, 4, 4 / max_t sum_j |R_ij|),   R = D^(1/2) M(q_d(t))^-1 D^(1/2)
 
-makes them `rate` on a joint that moves by itself and up to four times that where heavier joints push it, which is what a light wrist at the
-end of an arm needs.  The slope of the barrier is a spring besides, of stiffness w ds/de1, whatever K2 is.  With
+with M at the start and D its diagonal makes them `rate` on a joint that moves by itself and up to four times that where
+heavier joints push it, which is what a light wrist at the end of an arm needs.  With the last term no eigenvalue of M^-1 K2
+is above four times the rate along the reference: filters, drives and the delay of sampling allow no faster modes, and
+joints whose axes are nearly parallel move against each other with much less inertia than M_ii.
+
+The slope of the barrier is a spring besides, of stiffness w ds/de1, whatever K2 is.  With
 
     w_i = min(1, M_ii (rate/2)^2 / max_t ds_i/de1(e1 = 0))
 
@@ -51,11 +55,12 @@ ARMS = ("ur5", "iiwa14")
 RATE = 25.0
 """1/s.  The modes of the velocity errors on every joint of `arm_scenario`."""
 COUPLED = 4.0
-"""How much above rate M_ii the gain of a joint may be for the inertia that couples it to others [1]."""
+"""How much above rate M_ii the gain of a joint may be for the inertia that couples it to others, and how much above `rate` the fastest mode
+may be for that [1]."""
 LEAST_K2 = 0.6
 """N m s/rad; above the 1/2 of Theorem 2 (3.17), for claims with the paper's own weights."""
 TIMES = np.linspace(0.0, 20.0, 81)
-"""Times at which tubes are looked at for where they are narrowest [s]."""
+"""Times at which tubes are looked at for where they are narrowest, and arms for where their modes are fastest [s]."""
 
 
 def arm(name: str) -> Arm:
@@ -80,6 +85,12 @@ def _start_of(reference: Reference) -> jax.Array:
     return reference.position(jnp.zeros(()))
 
 
+@jax.jit
+def _positions_of(reference: Reference, times: jax.Array) -> jax.Array:
+    """Where a reference is at some times (T,): (T, n), or (T,) for one number for all joints [rad]."""
+    return jax.vmap(reference.position)(times)
+
+
 def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = LEAST_K2) -> jax.Array:
     """K2_i = max(rate M_ii(q), least), (n,) [N m s/rad]: about `rate` for the loop's modes on every joint.
 
@@ -99,10 +110,22 @@ def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = LEAST_K
     return jnp.maximum(given["rate"] * inertia, given["least"])
 
 
-def _coupled_gain(robot: Robot, q: jax.Array) -> jax.Array:
-    """The gain rate min(sum_j |M_ij(q)|, 4 M_ii(q)), (n,) [N m s/rad]."""
-    M = mass_matrix_at(robot, q.astype(jnp.result_type(float)))
-    return RATE * jnp.minimum(jnp.sum(jnp.abs(M), axis=1), COUPLED * jnp.diagonal(M))
+def _coupled_gain(robot: Robot, reference: Reference) -> jax.Array:
+    """The gain of `arm_scenario`, (n,) [N m s/rad].
+
+    With D the diagonal of M at the start and R = D^(1/2) M^-1 D^(1/2), M^-1 K2 has the eigenvalues of R K2/D.  The largest
+    sum of the sizes in a column, max_i (K2_i/D_i) sum_j |R_ji|, is above all of them.
+    """
+    positions = _positions_of(reference, jnp.asarray(TIMES, jnp.result_type(float)))
+    if positions.ndim == 1:
+        positions = jnp.repeat(positions[:, None], robot.n, axis=1)
+    matrices = jnp.stack([mass_matrix_at(robot, q) for q in positions.astype(jnp.result_type(float))])
+    inertia = jnp.diagonal(matrices[0])
+    size = jnp.sqrt(inertia)
+    coupling = jnp.sum(jnp.abs(matrices[0]), axis=1) / inertia
+    sums = jnp.sum(jnp.abs(jnp.linalg.inv(matrices) * size[:, None] * size), axis=1)
+    share = jnp.minimum(jnp.minimum(coupling, COUPLED), COUPLED / jnp.max(sums, axis=0))
+    return RATE * inertia * share
 
 
 def inertial_weight(robot: Robot, reference: Reference, bounds: Bounds, barrier: Barrier, rate: float = RATE) -> jax.Array:
@@ -165,8 +188,10 @@ def arm_scenario(
 ) -> Scenario:
     """A scenario on an arm, with what follows from the arm's own numbers: bounds, saturation, gains.
 
-    k1 = 2, K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, the barrier's weight as `inertial_weight`, kf = 20; the law within the
-    arm's `effort`; bounds at its joint limits; a start on the reference at rest.
+    k1 = 2; K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, less where joints that move against each other would
+    have modes of M^-1 K2 above 100 1/s along the reference; the barrier's weight as `inertial_weight`; kf = 20; the law within
+    the arm's `effort`;
+    bounds at its joint limits; a start on the reference at rest.
 
     Args:
       robot: with `limits` and `effort`, such as `iblf_jax.robots.load` gives; it is the plant.
@@ -193,8 +218,7 @@ def arm_scenario(
     start = _start_of(reference)
     known = robot if model is None else model
     bounds = bounds if bounds is not None else bounds_.from_limits(robot)
-    q = jnp.broadcast_to(start, (robot.n,)) if jnp.ndim(start) == 0 else start
-    K2 = inertial_gain(known, q, least=_coupled_gain(known, q))
+    K2 = _coupled_gain(known, reference)
     if law == "pd":  # its gains by name are for one size of joint
         controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)
     else:
