@@ -307,6 +307,22 @@ def test_more_jumps_than_a_step_is_divided_at_are_flagged():
     assert not int(ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3).status) & Status.INACCURATE
 
 
+def test_jumps_at_one_time_are_one_cut():
+    """Six parts that jump together divide a step once, so it is not one with more jumps than it is divided at."""
+    steps = tuple((LATE, (5.0 - k, 0.5)) for k in range(6))
+    run = ij.simulate(with_steps(SLOW, steps), duration=0.4, dt=4e-3)
+    np.testing.assert_allclose(run.q[-1], split(steps)[:2], atol=1e-6)
+    assert run.ok
+
+
+@pytest.mark.slow
+def test_a_recommended_step_is_divided_at_every_jump():
+    steps = tuple((0.02 + 1e-5 * k, (1.0, -1.0)) for k in range(9))
+    scenario = with_steps(SLOW, steps)
+    dt = ij.recommended_dt(scenario, duration=0.04)
+    assert not int(ij.simulate(scenario, duration=0.04, dt=dt).status) & Status.INACCURATE
+
+
 @pytest.mark.parametrize("time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"])
 def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
     """By time and size, against differences of the independent program."""

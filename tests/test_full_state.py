@@ -28,6 +28,8 @@ class FullLoop(Loop):
     fastest: tuple = ((0.6, 0.5), (0.1, 0.0), 1.0, H)
     factor: float = 2.0
     """2 for integral barriers, 1 for logarithmic ones: the slope is factor e/(k^2 - e^2)."""
+    push: tuple = (0.0, 0.0)
+    """A constant torque that the law does not know."""
 
     def full(self, t, x, above=None):
         """The rate of (q, q', eta), the torque, V1 + phi of each joint (for integral barriers), and e2.
@@ -52,7 +54,7 @@ class FullLoop(Loop):
         w = -(self.K2 + kappa2) * e2 - s1 * (K**2 - e2**2) / self.factor - self.c * s2
         f_hat = eta + self.kf * (M @ v)
         tau = C(v) @ v + G + M @ (dalpha + w) - f_hat
-        f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
+        f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0] + self.push
         ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
         deta = -self.kf * (f_hat + tau - C(v) @ v - G + dM * v[1] @ v)
         return np.concatenate([v, ddq, deta]), tau, -np.log(1 - (e1 / k) ** 2) - np.log(1 - (e2 / K) ** 2), e2
@@ -293,11 +295,16 @@ def test_a_gradient_is_the_difference():
 class Pieces:
     """The independent loop from event to event of e2_i = 0: each joint above 0, below it, or (None) sliding along it."""
 
-    def __init__(self, loop, duration):
+    def __init__(self, loop, duration, push=None):
+        """`push`: time and size of a torque that appears during the run."""
         self.loop, self.passed = loop, []
+        time, size = push or (duration, (0.0, 0.0))
         start = np.concatenate([loop.q0, loop.dq0, np.zeros(4)])
         self.mode = [bool(x) for x in loop.full(0.0, start[:6])[3] > 0]
         t, x = 0.0, start
+        while t < time:
+            t, x = self.until_an_event(t, x, time)
+        self.loop = dataclasses.replace(loop, push=size)
         while t < duration:
             t, x = self.until_an_event(t, x, duration)
         self.q, self.dq, (self.ise, self.effort) = x[:2], x[2:4], x[6:]
@@ -397,7 +404,32 @@ def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces(factor):
     found = np.asarray(jax.jacfwd(outcome)(gains))
     np.testing.assert_allclose(jax.grad(lambda x: outcome(x)[0])(gains), found[0], rtol=1e-12)
     np.testing.assert_allclose(found[0], true[0], rtol=0.01)
+    np.testing.assert_allclose(found[1], true[1], rtol=0.03)
     np.testing.assert_allclose(found[2:], true[2:], rtol=0.01, atol=2e-3 * np.max(np.abs(true[2:])))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("time", [0.0031, 0.00366], ids=["before", "behind"])
+def test_a_disturbance_and_the_command_jump_in_one_step(time):
+    """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears: derivatives by its time and by k1."""
+    size, loop = (3.0, -1.0), FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), K2=np.full(2, 12.0), kf=np.full(2, 100.0))
+    step = ij.disturbances.Step(size=list(size), time=time)
+    scenario = dataclasses.replace(loop.scenario, disturbance=ij.disturbances.Sum((loop.scenario.disturbance, step)))
+
+    def integrals(values):
+        changed = {"disturbance.parts[1].time": values[0], "controller.k1": jnp.full(2, values[1])}
+        metrics = ij.simulate(ij.with_parameters(scenario, changed), duration=0.03, dt=1e-3).metrics
+        return jnp.array([jnp.sum(metrics.ise), metrics.effort])
+
+    def true(time, k1):
+        run = Pieces(dataclasses.replace(loop, k1=np.full(2, k1)), 0.03, (time, size))
+        assert run.passed == [(0, True)]
+        return np.array([run.ise, run.effort])
+
+    by_time = (true(time + 2e-6, 2.0) - true(time - 2e-6, 2.0)) / 4e-6
+    by_k1 = (true(time, 2.002) - true(time, 1.998)) / 4e-3
+    found = jax.jacfwd(integrals)(jnp.array([time, 2.0]))
+    np.testing.assert_allclose(found, np.stack([by_time, by_k1], axis=1), rtol=0.02)
 
 
 @pytest.mark.slow
@@ -421,6 +453,7 @@ def test_where_e2_slides_along_0_derivatives_are_those_of_the_sliding_motion():
     true = slopes_in_pieces(0.25, kf=20.0)
     found = jax.jacfwd(outcome_by(0.25, 1e-3))(jnp.array([*(GAINS | {"kf": 20.0}).values()]))
     np.testing.assert_allclose(found[0], true[0], rtol=0.02)
+    np.testing.assert_allclose(found[1], true[1], rtol=0.1)
 
 
 @pytest.mark.slow

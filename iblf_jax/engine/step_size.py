@@ -101,16 +101,18 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
                 x = jnp.where(whole_step, coarse, fine)
 
                 span = jumps.Span(begin + cut[0] * dt, jnp.where(cut[1] == 1.0, after, begin + cut[1] * dt), h)
-                stepped = jumps.integrated(method, partial(evaluate, scenario), jumps.divided(times, span), whole(x), rolled=True)
+                division = jumps.divided(times, span)
+                stepped = jumps.integrated(method, partial(evaluate, scenario), division, whole(x), rolled=True)
                 new, sample = ravel_pytree(stepped.state)[0], stepped.first
-                seen = (stepped.parts, sample.upper - sample.lower, sample.xi)
+                seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.overfull)
                 return (jnp.where(whole_step, new, coarse), jnp.where(whole_step, fine, new)), seen
 
-            (coarse, fine), (parts, widths, xis) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
+            (coarse, fine), (parts, widths, xis, overfull) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
             width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], parts)
             reach = accuracy.steps_back(method)
             restarts = jumps.within(times, (number - reach) * dt, after) if times.size else None
-            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, of_coarse, width, restarts=restarts)
+            overfull = None if overfull is None else overfull[0]
+            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, of_coarse, width, restarts=restarts, overfull=overfull)
             near = jnp.max(jnp.abs(xis[1]))
             nearest = jax.tree.map(partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest)
             off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)

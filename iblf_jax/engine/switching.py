@@ -112,8 +112,12 @@ class Progress(NamedTuple):
     """Of the state at the end of the last piece, on that piece's side of the surface."""
     sliding: LoopState
     """What keeps the state on the surfaces along which it slides: added to its rate."""
+    gains: list[jax.Array]
+    """What accumulators gain per second in the last piece, on that piece's side of the surface."""
+    sliding_gains: list[jax.Array]
+    """What sliding adds to what they gain per second."""
     gained: list[jax.Array]
-    """What accumulators gain as the pieces become longer or shorter: 0 in value."""
+    """What accumulators gain in the pieces, by the midpoint rule."""
     usable: jax.Array
     """Whether every crossing was found within about a step, () bool."""
 
@@ -152,9 +156,10 @@ def with_hybrid_derivative(
     signs = jax.lax.stop_gradient(Signs(start, end, touched))
 
     def in_pieces(after):
-        return _in_pieces(loop, t, before, dt, after, stepped.slopes[0], signs)
+        return _in_pieces(loop, t, before, dt, after, stepped.slopes[0], gains, signs)
 
     after = stepped.state, sums
+    gains = loop.gains_of(stepped.first)
     reached = jnp.any(signs.changed | signs.touched)
     return _with_derivative_of(after, jax.lax.cond(reached, in_pieces, lambda same: same, after))
 
@@ -194,20 +199,27 @@ def _in_pieces(
     dt: jax.Array,
     after: tuple[LoopState, list[jax.Array]],
     slope: LoopState,
+    gains: list[jax.Array],
     signs: Signs,
 ) -> tuple[LoopState, list[jax.Array]]:
-    """The end of the step by (J.2), piece by piece; `after` where it reaches no surface or a crossing was not found."""
+    """The end of the step by (J.2), piece by piece; `after` where it reaches no surface or a crossing was not found.
+
+    The accumulators get what they gain in the pieces in place of what the trapezoidal rule gives for the whole step, `gains` per second
+    at its start.
+    """
     crossings = _crossings(signs, signs.changed | _slides(loop, t, before, slope, signs))
     none = jax.tree.map(jnp.zeros_like, before)
     nothing = [jnp.zeros_like(x) for x in after[1]]
-    start = Progress(before, jnp.zeros_like(dt), none, none, nothing, jnp.any(crossings.crossed))
+    start = Progress(before, jnp.zeros_like(dt), none, none, nothing, nothing, nothing, jnp.any(crossings.crossed))
 
     def piece(progress, number):
         return _piece(loop, t, dt, crossings, number, progress), None
 
     numbers = jnp.arange(signs.start.size + 1, dtype=crossings.rank.dtype)
     done, _ = jax.lax.scan(piece, start, numbers)
-    found = done.state, [x + more for x, more in zip(after[1], done.gained, strict=True)]
+    end = loop.evaluate(t + dt, _with_derivative_of(after[0], done.state))[1]
+    whole = [0.5 * dt * (first + last) for first, last in zip(gains, loop.gains_of(end), strict=True)]
+    found = done.state, [x + more - less for x, more, less in zip(after[1], done.gained, whole, strict=True)]
     return jax.tree.map(lambda new, old: jnp.where(done.usable, new, old), found, after)
 
 
@@ -251,7 +263,8 @@ def _piece(loop: Loop, t: jax.Array, dt: jax.Array, crossings: Crossings, number
     came_from = crossings.numbered(number - 1)
     arriving = along(came_from, since, state, before.rate)[1]
     leaving = along(came_from, since, state, first)[1]
-    added = _sliding(arriving, leaving, before.rate, first)
+    share = _share(arriving, leaving)
+    added = _mixed(share, before.rate, first)
     first, sliding = _sum(first, added), _sum(before.sliding, added)
 
     aims = jnp.any(target)
@@ -266,22 +279,26 @@ def _piece(loop: Loop, t: jax.Array, dt: jax.Array, crossings: Crossings, number
     correction, late = _time_to(g, dg, dt)
 
     length = length + correction
-    stretch = length - jax.lax.stop_gradient(length)
-    gains = loop.gains_of(jax.lax.stop_gradient(sample))
-    gained = [x + gain * stretch for x, gain in zip(before.gained, gains, strict=True)]
+    gains = _sum(loop.gains_of(sample), before.sliding_gains)
+    more = _mixed(share, before.gains, gains)
+    gains, sliding_gains = _sum(gains, more), _sum(before.sliding_gains, more)
+    gained = [x + gain * length for x, gain in zip(before.gained, gains, strict=True)]
     usable = before.usable & ((early & late) | ~aims)
-    return Progress(_moved(reached, correction, last), since + length, last, sliding, gained, usable)
+    return Progress(_moved(reached, correction, last), since + length, last, sliding, gains, sliding_gains, gained, usable)
 
 
-def _sliding(arriving: jax.Array, leaving: jax.Array, old: LoopState, new: LoopState) -> LoopState:
-    """What (J.3) adds to the rate beyond a surface: 0 where that rate moves the state on.
+def _share(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
+    """The share a of (J.3) that the rate before a surface has beyond it, () [1]: 0 where the state moves on.
 
     Args:
       arriving, leaving: rates of the switching function before and beyond the surface, ().
-      old, new: rates of the state there.
     """
     slides = arriving * leaving < 0
-    share = jnp.where(slides, leaving, 0.0) / jnp.where(slides, leaving - arriving, 1.0)
+    return jnp.where(slides, leaving, 0.0) / jnp.where(slides, leaving - arriving, 1.0)
+
+
+def _mixed(share: jax.Array, old: Any, new: Any) -> Any:
+    """What (J.3) adds beyond a surface to a rate, or to a signal that is integrated, from those before and beyond it."""
     return jax.tree.map(lambda a, b: share * (a - b), old, new)
 
 
@@ -305,7 +322,7 @@ def _moved(state: LoopState, time: jax.Array, rate: LoopState) -> LoopState:
     return jax.tree.map(lambda x, dx: x + time * dx, state, rate)
 
 
-def _sum(one: LoopState, other: LoopState) -> LoopState:
+def _sum(one: Any, other: Any) -> Any:
     return jax.tree.map(jnp.add, one, other)
 
 

@@ -9,7 +9,7 @@ pieces that end where
 A jump at the end of a step belongs to that step.  A piece of length 0 follows it, through which the
 state has a derivative by the jump time there, too.  The lengths of the pieces carry the derivatives
 by jump times and delays, so the jump of the right-hand side reaches the derivative of the state.
-Two jumps at one time have the derivative of both together, which the first of them gets.
+Jumps at one time are one cut.  They have the derivative of all together, which the first of them gets.
 
 The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, one
 that begins there after it.  A jump time may be the result of rounding, so stages keep away from it
@@ -23,11 +23,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from iblf_jax.simulation import integrators
 
 MOST_CUTS = 4
-"""Jumps at which one step is divided at most; the accuracy of a step with more is not known."""
+"""Different jump times at which one step is divided at most; the accuracy of a step with more is not known."""
 APART = 4.0
 """Units in the last place between a stage and a jump time."""
 
@@ -67,7 +68,7 @@ class Division(NamedTuple):
 
     pieces: tuple[Piece, ...]
     overfull: Any
-    """Whether there are more jumps than `MOST_CUTS`, () bool; None where that cannot be."""
+    """Whether jumps lie at more times than `MOST_CUTS`, () bool; None where that cannot be."""
 
 
 @jax.custom_jvp
@@ -111,8 +112,9 @@ def divided(times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] |
     for number in range(most + 1):
         until, chosen = span.length, None
         if number < most:
-            chosen = _first(places, pending)
-            until = jnp.where(jnp.any(chosen), jnp.sum(jnp.where(chosen, places, 0.0)), span.length)
+            first = _first(places, pending)
+            until = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, places, 0.0)), span.length)
+            chosen = _with_equal_times(first, places, pending, count, span) if count > MOST_CUTS else first
         earliest, latest = _limits(times, passed | done[-count:], span) if count else (None, None)
         arrived = _arrived(done, number, count, arrival is not None)
         pieces.append(Piece(begin, until if since is None else until - since, made, earliest, latest, arrived))
@@ -128,6 +130,16 @@ def _first(places: jax.Array, pending: jax.Array) -> jax.Array:
         return pending
     order = jnp.where(pending, jax.lax.stop_gradient(places), jnp.inf)
     return pending & (jnp.arange(places.size, dtype=jnp.int32) == jnp.argmin(order).astype(jnp.int32))
+
+
+def _with_equal_times(first: jax.Array, places: jax.Array, pending: jax.Array, jumps: int, span: Span) -> jax.Array:
+    """The event that comes first with those of the pending jumps at its time, (E,) bool, if it is a jump itself."""
+    apart = APART * jnp.finfo(places.dtype).eps * jnp.abs(span.end)
+    place = jax.lax.stop_gradient(jnp.sum(jnp.where(first, places, 0.0)))
+    equal = jnp.abs(jax.lax.stop_gradient(places) - place) <= apart
+    is_jump = np.arange(places.size) >= places.size - jumps
+    together = pending & equal & is_jump & jnp.any(first & is_jump)
+    return first | together
 
 
 def _arrived(done: jax.Array, number: int, jumps: int, can_arrive: bool) -> Any:
