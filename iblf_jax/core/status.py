@@ -49,7 +49,8 @@ class Status(enum.IntFlag):
     """The tip, or the origin of a joint, touched or crossed the wall of a region that it must stay in."""
 
     INFINITE_SLOPE = 16384
-    """At an instant that was looked at, a derivative of the loop is infinite, as that of |e2|^a sign(e2) with a < 1 is at e2 = 0."""
+    """A run is inaccurate, or its step too large, and at an instant that was looked at a derivative of the loop is infinite, as that of
+    |e2|^a sign(e2) with a < 1 is at e2 = 0, or nearly so, as that of sharp dry friction is at a reversal."""
 
 
 VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED
@@ -79,7 +80,7 @@ WORDS = {
     Status.VELOCITY_VIOLATED: "a velocity bound was violated",
     Status.REGION_VIOLATED: "a region was left",
     Status.FILTER_INFEASIBLE: "the safety filter's conditions could not all be met",
-    Status.INFINITE_SLOPE: "a derivative of the law is infinite at an isolated instant",
+    Status.INFINITE_SLOPE: "a derivative of the loop is infinite, or nearly so, at an isolated instant",
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
 """What each flag says, in the order in which it is told."""

@@ -189,10 +189,10 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         texts.append(_about_accuracy(result, status, steps))
     if status & Status.INFINITE_SLOPE:
         texts.append(
-            "At an isolated instant the derivative of the closed loop with respect to a state is infinite, as that of "
-            "|e2|^a sign(e2) with a < 1 is with respect to e2 = q' - alpha where e2 = 0. That is no fast mode, so the time step "
-            f"is judged by differences of {WIDEST:g} rad/s there. Derivatives of the run are not reliable; replace such a power by "
-            "e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta."
+            "At an isolated instant the derivative of the closed loop with respect to a state is infinite or nearly so, as that of "
+            "|e2|^a sign(e2) with a < 1 is with respect to e2 = q' - alpha where e2 = 0, or that of sharp dry friction at a reversal. That "
+            f"is no fast mode, so the time step is judged by differences of {WIDEST:g} rad/s there. Derivatives of the run are not "
+            "reliable; replace such a power by e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta."
         )
     if status & Status.SAMPLING_TOO_SLOW:
         texts.append(

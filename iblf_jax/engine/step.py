@@ -619,8 +619,9 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
     limit = integrators.tableau(method).stability
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
     steep = jnp.any(stability.is_steep(instants.jacobian), axis=-1) & (inputs.dt * steepest > limit)
-    status |= flag(jnp.any(steep), Status.INFINITE_SLOPE)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
+    suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
+    status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = accuracy.results(estimate)
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(stability.resolved(instants.jacobian))

@@ -10,7 +10,7 @@ Derivatives of the loop are central differences of its rate: the rate is compile
 A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0, and one instant there says nothing about the time step:
 the oscillation that a step excites ends where the difference quotient over its amplitude is small enough.  A smooth loop has the same
 derivative by differences of any small size.  So every derivative is measured by differences of three sizes, h0, 10 h0 and WIDEST (less near
-a bound, where the barrier is stiff indeed); where that of 10 h0 is much smaller than that of h0, the one of WIDEST counts (`resolved`).
+a bound, where the barrier is stiff indeed); where one of the larger ones gives much less than h0, the one of WIDEST counts (`resolved`).
 
 Where the law is sampled, what counts is the map from one period to the next.  Its derivative follows from those of plant and law: the
 plant's state goes with exp(A t), A its rate's derivative, while the torque is held.  The loop is stable only while the spectral radius of
@@ -123,9 +123,14 @@ def room_around(scenario: Scenario, t: jax.Array, plant: LoopState, size: int) -
 
 
 def is_steep(jacobians: jax.Array) -> jax.Array:
-    """Which columns of a Jacobian are infinite derivatives, (..., m) bool, from those by differences of three sizes, (..., 3, m, m)."""
+    """Which columns of a Jacobian are infinite derivatives or nearly so, (..., m) bool.
+
+    Args:
+      jacobians: by differences of three sizes, (..., 3, m, m).  Close to an infinite derivative the two small ones agree, and the large
+        one is smaller.
+    """
     lengths = jnp.sum(jnp.abs(jacobians), axis=-2)
-    return lengths[..., 1, :] < STEEP * lengths[..., 0, :]
+    return jnp.minimum(lengths[..., 1, :], lengths[..., 2, :]) < STEEP * lengths[..., 0, :]
 
 
 def resolved(jacobians: jax.Array) -> jax.Array:
