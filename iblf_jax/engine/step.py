@@ -563,24 +563,14 @@ def probe_steps(scenario: Scenario) -> int:
     return 3 * watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
 
 
-def fastest_modes(scenario: Scenario, probed: Probed) -> tuple[jax.Array, jax.Array]:
-    """The mode that a `Probe` has found, of what a step integrates, and that by differences of the smallest size, () each [1/s].
-
-    The second is the larger one where a derivative is infinite.
-    """
-    both = jnp.stack([stability.resolved(probed.jacobian), probed.jacobian[0]])
-    mode, steepest = jax.vmap(partial(_mode_of, scenario))(both)
-    if len(both[0]) < probed.state.size and scenario.sampling is None:
-        mode = stability.growth_rate(probed.growth)
-    return mode, steepest
-
-
-def _mode_of(scenario: Scenario, jacobian: jax.Array) -> jax.Array:
-    """The mode of what a step integrates, () [1/s]."""
-    size = len(jacobian)
+def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
+    """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
+    jacobian = stability.resolved(probed.jacobian)
     if scenario.sampling is not None:
         size = ravel_pytree(moving(initial_state(scenario)))[0].size
-    return stability.growth_rate_by(jacobian[:size, :size])
+        return stability.growth_rate_by(jacobian[:size, :size])
+    complete = len(jacobian) == probed.state.size
+    return stability.growth_rate_by(jacobian) if complete else stability.growth_rate(probed.growth)
 
 
 def probed(time: jax.Array, around: Any, watched: int, unseen: accuracy.Unseen) -> Probed:
@@ -614,11 +604,13 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
       instants: what it has found at some of them.
     """
     estimate = accuracy.between_stages(carry.accuracy, unseen)
-    modes, steepest = jax.vmap(partial(fastest_modes, inputs.scenario))(instants)
+    modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
-    steep = jnp.any(stability.is_steep(instants.jacobian), axis=-1) & (inputs.dt * steepest > limit)
+    # A column is at least as long as the mode that it alone would make.
+    steepest = jnp.sum(jnp.abs(instants.jacobian[:, 0]), axis=-2)
+    steep = stability.is_steep(instants.jacobian) & (inputs.dt * steepest > limit)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
     suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
