@@ -541,10 +541,11 @@ class Probe:
         around = whole(x)
         plant = around if inputs.scenario.sampling is None else around.plant
         rooms = stability.room_around(inputs.scenario, carry.time, plant, x.size)
-        steep = jnp.any(stability.is_steep(carry.jacobian))
         room = jnp.where(iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype))
         sizes = stability.difference_sizes(x, direction, room)
-        widest = (level == 2) | ((iteration >= 0) & steep)
+        widest = level == 2
+        if len(watched) < x.size:  # a power iteration follows, across infinite slopes by the widest differences
+            widest |= (iteration >= 0) & jnp.any(stability.is_steep(carry.jacobian))
         size = jnp.where(widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0]))
         w, growth = stability.along(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
