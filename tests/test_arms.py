@@ -238,10 +238,18 @@ def test_a_light_wrist_keeps_narrow_bounds_at_500_hz_and_did_not_with_the_papers
         assert float(run.metrics.sampling_radius) > 1.05
 
 
+SLOW_PARTS = {
+    "sensor": ij.sensors.Encoder(counts=131072, velocity=ij.sensors.FilteredDifference(cutoff=400.0)),
+    "actuator": ij.actuators.Motor(bandwidth=400.0),
+}
+"""Filter and drive with a lag of 2.5 ms each."""
+
+
 @pytest.mark.slow
-def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are():
+@pytest.mark.parametrize("parts", [{}, SLOW_PARTS], ids=["ideal", "encoder and motor"])
+def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are(parts):
     unknown = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25)), "initial.q": ij.offset(ij.uniform(-0.04, 0.04))}
-    scenario = ij.with_parts(light_wrist(), **LAB)
+    scenario = ij.with_parts(light_wrist(), **LAB, **parts)
     study = ij.monte_carlo(scenario, unknown, runs=16, seed=0, duration=1.0, dt=1e-3, progress=False)
     assert not len(study.failed)
     assert np.all(np.asarray(study.status) == 0)

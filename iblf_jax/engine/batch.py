@@ -156,7 +156,9 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]
         return probed(jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen)
 
     found = _probed(executor, batch, batch.each(around))
-    return batch.each(lambda inputs, found: start(inputs, method, resolved(found.jacobian)), found), found
+    return batch.each(
+        lambda inputs, found: start(inputs, method, resolved(found.jacobian, inputs.scenario.sampling is not None)), found
+    ), found
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:

@@ -545,7 +545,7 @@ class Probe:
         sizes = stability.difference_sizes(x, direction, room)
         widest = level == 2
         if len(watched) < x.size:  # a power iteration follows, across infinite slopes by the widest differences
-            widest |= (iteration >= 0) & jnp.any(stability.is_steep(carry.jacobian))
+            widest |= (iteration >= 0) & jnp.any(stability.is_steep(carry.jacobian, inputs.scenario.sampling is not None))
         size = jnp.where(widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0]))
         w, growth = stability.along(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
@@ -566,7 +566,7 @@ def probe_steps(scenario: Scenario) -> int:
 
 def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
     """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
-    jacobian = stability.resolved(probed.jacobian)
+    jacobian = stability.resolved(probed.jacobian, scenario.sampling is not None)
     if scenario.sampling is not None:
         size = ravel_pytree(moving(initial_state(scenario)))[0].size
         return stability.growth_rate_by(jacobian[:size, :size])
@@ -611,13 +611,13 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
     # A column is at least as long as the mode that it alone would make.
     steepest = jnp.sum(jnp.abs(instants.jacobian[:, 0]), axis=-2)
-    steep = stability.is_steep(instants.jacobian) & (inputs.dt * steepest > limit)
+    steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (inputs.dt * steepest > limit)
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
     suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = accuracy.results(estimate)
     if inputs.scenario.sampling is not None:
-        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(stability.resolved(instants.jacobian))
+        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(stability.resolved(instants.jacobian, sampled=True))
         radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)

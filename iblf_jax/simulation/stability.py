@@ -122,20 +122,25 @@ def room_around(scenario: Scenario, t: jax.Array, plant: LoopState, size: int) -
     return jnp.concatenate([*near, rest])
 
 
-def is_steep(jacobians: jax.Array) -> jax.Array:
+def is_steep(jacobians: jax.Array, sampled: bool) -> jax.Array:
     """Which columns of a Jacobian are infinite derivatives or nearly so, (..., m) bool.
 
     Args:
       jacobians: by differences of three sizes, (..., 3, m, m).  Close to an infinite derivative the two small ones agree, and the large
         one is smaller.
+      sampled: whether they are of a sampled loop.  There the large one tells nothing: a position that moves so far between two samples is
+        a velocity at which the torque saturates.
     """
     lengths = jnp.sum(jnp.abs(jacobians), axis=-2)
-    return jnp.minimum(lengths[..., 1, :], lengths[..., 2, :]) < STEEP * lengths[..., 0, :]
+    larger = lengths[..., 1, :]
+    if not sampled:
+        larger = jnp.minimum(larger, lengths[..., 2, :])
+    return larger < STEEP * lengths[..., 0, :]
 
 
-def resolved(jacobians: jax.Array) -> jax.Array:
-    """The Jacobian that counts, (..., m, m), from those by differences of three sizes, (..., 3, m, m)."""
-    steep = is_steep(jacobians)[..., None, :]
+def resolved(jacobians: jax.Array, sampled: bool) -> jax.Array:
+    """The Jacobian that counts, (..., m, m), from those by differences of three sizes, (..., 3, m, m), as for `is_steep`."""
+    steep = is_steep(jacobians, sampled)[..., None, :]
     return jnp.where(steep, jacobians[..., 2, :, :], jacobians[..., 0, :, :])
 
 
@@ -155,7 +160,7 @@ def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     units = jnp.eye(x.size, dtype=x.dtype)
     sizes = jax.vmap(lambda unit, room: difference_sizes(x, unit, room))(units, room)
     found = jax.lax.map(column, (jnp.repeat(units, 3, axis=0), sizes.ravel()))
-    return resolved(jnp.transpose(found.reshape(x.size, 3, x.size), (1, 2, 0)))
+    return resolved(jnp.transpose(found.reshape(x.size, 3, x.size), (1, 2, 0)), scenario.sampling is not None)
 
 
 def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
