@@ -33,7 +33,7 @@ import iblf_jax as ij
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Run
-from iblf_jax.lowering import toolchain
+from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
 

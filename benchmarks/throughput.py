@@ -31,11 +31,11 @@ import numpy as np
 from _timing import compile_seconds, in_turn, report
 
 import iblf_jax as ij
-from iblf_jax import lowering
+from iblf_jax import kernels
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Run
-from iblf_jax.lowering import toolchain
+from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 

@@ -10,8 +10,19 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
-from iblf_jax.controllers.systems import observer_of
+from iblf_jax import (
+    actuators,
+    barriers,
+    bounds,
+    controllers,
+    disturbances,
+    observers,
+    references,
+    regions,
+    robots,
+    sensors,
+)
+from iblf_jax.control.controllers.systems import observer_of
 
 TARGET = Path(__file__).with_name("members.md")
 

@@ -4,21 +4,16 @@ from iblf_jax import _start as _start
 
 # isort: split
 import importlib as _importlib
+import sys as _sys
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
-from iblf_jax import actuators as actuators
-from iblf_jax import barriers as barriers
-from iblf_jax import bounds as bounds
-from iblf_jax import controllers as controllers
-from iblf_jax import disturbances as disturbances
-from iblf_jax import observers as observers
 from iblf_jax import presets as presets
-from iblf_jax import references as references
-from iblf_jax import regions as regions
-from iblf_jax import robots as robots
-from iblf_jax import sensors as sensors
-from iblf_jax.bounds import Bounds as Bounds
+from iblf_jax.control import actuators as actuators
+from iblf_jax.control import barriers as barriers
+from iblf_jax.control import controllers as controllers
+from iblf_jax.control import observers as observers
+from iblf_jax.control import sensors as sensors
 from iblf_jax.core import linalg as linalg
 from iblf_jax.core import pytree as pytree
 from iblf_jax.core import status as status
@@ -58,10 +53,34 @@ from iblf_jax.studies.distributions import normal as normal
 from iblf_jax.studies.distributions import offset as offset
 from iblf_jax.studies.distributions import uniform as uniform
 from iblf_jax.studies.distributions import value as value
+from iblf_jax.world import bounds as bounds
+from iblf_jax.world import disturbances as disturbances
+from iblf_jax.world import references as references
+from iblf_jax.world import regions as regions
+from iblf_jax.world import robots as robots
+from iblf_jax.world.bounds import Bounds as Bounds
 
 __version__ = _version("iblf_jax")
 _bound_programs()
 _finish_at_exit()
+
+_PUBLIC_MODULES = {
+    "control": ("actuators", "barriers", "controllers", "observers", "sensors"),
+    "world": ("bounds", "disturbances", "references", "regions", "robots"),
+}
+"""Folder -> its modules, which users import as `iblf_jax.NAME`."""
+
+
+def _keep_public_import_paths() -> None:
+    """Make `import iblf_jax.robots` the same module as `iblf_jax.world.robots`, submodules included."""
+    for folder, names in _PUBLIC_MODULES.items():
+        for name in names:
+            home = f"iblf_jax.{folder}.{name}"
+            for module in [key for key in _sys.modules if key == home or key.startswith(f"{home}.")]:
+                _sys.modules[module.replace(home, f"iblf_jax.{name}", 1)] = _sys.modules[module]
+
+
+_keep_public_import_paths()
 
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates

@@ -20,9 +20,9 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world.robots import joint_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 
 from iblf_jax.engine import gpu
-from iblf_jax.lowering import toolchain
-from iblf_jax.lowering.emit_c import CUDA, source
+from iblf_jax.kernels import toolchain
+from iblf_jax.kernels.emit_c import CUDA, source
 
 FOLDER = Path(__file__).parent
 IMAGE = b"image of a kernel, which a driver would load"

@@ -8,7 +8,18 @@ from __future__ import annotations
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
+from iblf_jax import (
+    actuators,
+    barriers,
+    bounds,
+    controllers,
+    disturbances,
+    observers,
+    references,
+    regions,
+    robots,
+    sensors,
+)
 from iblf_jax.simulation import metrics
 
 TWO_LINK = ij.presets.customary_two_link()

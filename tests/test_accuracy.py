@@ -13,7 +13,7 @@ from conftest import SHORT
 from independent import Loop
 
 import iblf_jax as ij
-from iblf_jax.actuators._base import Delivered
+from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import linalg
 from iblf_jax.core.status import Status
 from iblf_jax.engine import step_size

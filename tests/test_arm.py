@@ -11,11 +11,11 @@ import pytest
 from arm_cases import ARMS, REAL, as_mjcf, dynamics_of, random_arm, without_constraints
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
 from members import TWO_LINK
 
 import iblf_jax as ij
 from iblf_jax.core.linalg import solve_spd
-from iblf_jax.robots import Arm, Payload, coriolis_from_mass_matrix
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import canonical

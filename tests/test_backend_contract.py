@@ -17,7 +17,7 @@ import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
 from iblf_jax.engine import execute
 from iblf_jax.engine.step import Run
-from iblf_jax.lowering import toolchain
+from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from iblf_jax.barriers import Integral, Log, guard_is_active, guarded_error
+from iblf_jax.bounds import Tube
 from scipy.integrate import quad
 
-from iblf_jax.barriers import Integral, Log, guard_is_active, guarded_error
-from iblf_jax.barriers._base import bound_motion_gain
-from iblf_jax.bounds import Tube
+from iblf_jax.control.barriers._base import bound_motion_gain
 
 INSIDE = st.floats(-0.998, 0.998)
 WIDTH = st.floats(1e-3, 1e3)

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from iblf_jax.bounds import Tube, tube_at
 from scipy.integrate import quad
 
 import iblf_jax as ij
 from iblf_jax import barriers
-from iblf_jax.barriers._series import log_remainder, sinc
-from iblf_jax.bounds import Tube, tube_at
+from iblf_jax.control.barriers._series import log_remainder, sinc
 
 K1 = jnp.array([1.3, 2.1])
 MARGIN = jnp.array([0.1, 0.1])

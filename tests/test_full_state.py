@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers
-from iblf_jax.barriers._base import ratio_jumps
 from iblf_jax.certificates.proof_terms import rounding, terms_at
-from iblf_jax.controllers._base import switching_functions
+from iblf_jax.control.barriers._base import ratio_jumps
+from iblf_jax.control.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import initial_state
 
 H = np.pi / 2

@@ -9,7 +9,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import controllers, observers
-from iblf_jax.controllers.adaptive_rbf import sobol_centres
+from iblf_jax.control.controllers.adaptive_rbf import sobol_centres
 from iblf_jax.core.pytree import rewrapped, unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state, rate
 

@@ -15,7 +15,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.deployment import live
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.kernels.toolchain import ToolchainError
 
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
 NODE = shutil.which("node")

@@ -17,9 +17,9 @@ import pytest
 from arm_cases import ARMS, as_mjcf, dynamics_of, random_arm, without_constraints
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from iblf_jax.robots import description
 
 import iblf_jax as ij
-from iblf_jax.robots import description
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -17,11 +17,11 @@ from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.step import Form, Inputs, Run, TimeStep, start
-from iblf_jax.lowering import passes, program
-from iblf_jax.lowering.from_jaxpr import closed
-from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.packed import Shapes, pack
-from iblf_jax.lowering.passes import written_out
+from iblf_jax.kernels import passes, program
+from iblf_jax.kernels.from_jaxpr import closed
+from iblf_jax.kernels.operations import OPERATIONS
+from iblf_jax.kernels.packed import Shapes, pack
+from iblf_jax.kernels.passes import written_out
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.metrics import standard

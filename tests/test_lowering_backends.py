@@ -21,8 +21,8 @@ from iblf_jax.core.cache import directory
 from iblf_jax.engine import execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
-from iblf_jax.lowering import packed, toolchain
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.kernels import packed, toolchain
+from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral

@@ -26,12 +26,12 @@ from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
 from iblf_jax.engine.executors import lowered_on, program_of
 from iblf_jax.engine.step import Inputs, Run, TimeStep
-from iblf_jax.lowering import nvrtc
-from iblf_jax.lowering.emit_c import CUDA, source
-from iblf_jax.lowering.layout import Layout
-from iblf_jax.lowering.packed import Shapes, pack
-from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.kernels import nvrtc
+from iblf_jax.kernels.emit_c import CUDA, source
+from iblf_jax.kernels.layout import Layout
+from iblf_jax.kernels.packed import Shapes, pack
+from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 

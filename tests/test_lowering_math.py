@@ -17,11 +17,11 @@ from test_lowering_backends import needs_compiler
 from iblf_jax.engine import native, vector_math, xla
 from iblf_jax.engine.evaluator import Evaluator
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.lowering import emit_c, toolchain
-from iblf_jax.lowering.identities import fold
-from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.packed import Packed
-from iblf_jax.lowering.program import Builder, finished, kind_of
+from iblf_jax.kernels import emit_c, toolchain
+from iblf_jax.kernels.identities import fold
+from iblf_jax.kernels.operations import OPERATIONS
+from iblf_jax.kernels.packed import Packed
+from iblf_jax.kernels.program import Builder, finished, kind_of
 
 LINE = np.linspace(-30, 30, 4001)
 UNIT = np.linspace(-0.999, 0.999, 4001)

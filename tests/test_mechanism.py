@@ -18,8 +18,8 @@ from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep
-from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import LANE, TIME
+from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.program import LANE, TIME
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import iblf_jax as ij
 from iblf_jax.observers import Momentum, NoObserver, Printed
 from iblf_jax.robots import mass_matrix_rate
+
+import iblf_jax as ij
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
 
 

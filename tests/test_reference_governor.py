@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers
-from iblf_jax.controllers.reference_governor import GovernorState
+from iblf_jax.control.controllers.reference_governor import GovernorState
 
 LAWS = {"pd": controllers.PDGravity(Kp=[30.0, 10.0], Kd=[1.5, 0.3]), "computed_torque": controllers.ComputedTorque(Kp=[40.0, 30.0], Kd=3.0)}
 

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arm_cases import random_arm
+from iblf_jax.regions import along, in_words, margins, position_of
 from independent import Loop
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, plotting, regions
 from iblf_jax.files.scenario import load_scenario, save_scenario, scenario_to_toml
-from iblf_jax.regions import along, in_words, margins, position_of
 from iblf_jax.simulation import metrics
 
 RUN = {"duration": 1.5, "dt": 1e-3}

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
+from iblf_jax.controllers import Saturated
 
 import iblf_jax as ij
 from iblf_jax.cli import main
-from iblf_jax.controllers import Saturated
 from iblf_jax.files import scenario as scenario_file
 from iblf_jax.files.study import load_study_file
 from iblf_jax.files.tuning import load_tuning_file

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from iblf_jax.robots import PlanarChain, TwoLink, mass_matrix_rate
 
 import iblf_jax as ij
-from iblf_jax.robots import PlanarChain, TwoLink, mass_matrix_rate
 from iblf_jax.simulation import integrators
 
 

@@ -21,7 +21,7 @@ import study_cases as cases
 
 import iblf_jax as ij
 from iblf_jax.engine import native
-from iblf_jax.lowering import toolchain
+from iblf_jax.kernels import toolchain
 from iblf_jax.studies import interrupt, store, sweep
 
 SCENARIO = ij.presets.zhang_yan_2024()

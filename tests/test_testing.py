@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from iblf_jax.controllers import Command
 
 import iblf_jax as ij
-from iblf_jax.controllers import Command
 from iblf_jax.testing import ContractError
 from iblf_jax.testing._contract import Findings, in_dtype
 from iblf_jax.testing.own_claims import check_claims

@@ -25,8 +25,8 @@ from iblf_jax import cli
 from iblf_jax.core import drafts
 from iblf_jax.core.cache import _reloads_badly, directory, keep_programs, processor
 from iblf_jax.engine import execute, native
-from iblf_jax.lowering import nvrtc, toolchain
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.kernels import nvrtc, toolchain
+from iblf_jax.kernels.toolchain import ToolchainError
 
 SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { return 41; }'
 OTHER = SOURCE.replace("41", "42")
@@ -649,7 +649,7 @@ def is_running(number):
         return False
 
 
-BUILD = "import sys; from iblf_jax.lowering import toolchain as t; print(t.loaded(t.built(sys.argv[1])[0]).value())"
+BUILD = "import sys; from iblf_jax.kernels import toolchain as t; print(t.loaded(t.built(sys.argv[1])[0]).value())"
 
 
 @needs_compiler

@@ -14,7 +14,7 @@ from made_up_runs import ALWAYS
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import execute, native, plan, step, transformable
-from iblf_jax.lowering.program import UnsupportedError
+from iblf_jax.kernels.program import UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
 PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from iblf_jax.bounds import tube_at
 from scipy.interpolate import make_interp_spline
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, disturbances, references
-from iblf_jax.bounds import tube_at
 from iblf_jax.simulation import closed_loop
 
 TWO_LINK = ij.presets.customary_two_link()

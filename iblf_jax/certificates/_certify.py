@@ -9,18 +9,24 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import actuators, sensors
 from iblf_jax.certificates import claims, own_law, weighted_lines
-from iblf_jax.certificates.lines import applicable_case, bounds_along, left_side, of_stretch, over_run
+from iblf_jax.certificates.lines import (
+    applicable_case,
+    bounds_along,
+    left_side,
+    of_stretch,
+    over_run,
+)
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
 from iblf_jax.certificates.retrace import believed, grid
 from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
+from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
 from iblf_jax.engine.plan import CERTIFY_RECORDED
 from iblf_jax.engine.simulate import SimulationWarning, simulate
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
+from iblf_jax.world.robots import joint_names
 
 WORST = 16
 

@@ -25,7 +25,7 @@ import numpy as np
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.eigenvalues import maximise
 from iblf_jax.certificates.proof_terms import terms_at
-from iblf_jax.controllers import Backstepping
+from iblf_jax.control.controllers import Backstepping
 from iblf_jax.core import checks
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters

@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.actuators import Ideal
 from iblf_jax.certificates import own_law
-from iblf_jax.controllers import Backstepping, FullState
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.controllers import Backstepping, FullState
+from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
-from iblf_jax.observers import Momentum, Printed
 from iblf_jax.simulation.scenario import Scenario
 
 CASES = (1, 2)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine.plan import CERTIFY_TOGETHER
-from iblf_jax.robots import Robot
+from iblf_jax.world.robots import Robot
 
 GRID = {1: 257, 2: 65, 3: 21}
 """Points an axis, by number of joints."""

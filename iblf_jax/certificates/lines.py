@@ -18,7 +18,7 @@ import numpy as np
 from iblf_jax.certificates import claims, own_law, weighted
 from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, SEEN_ONLY, Line
 from iblf_jax.certificates.trajectory import Trajectory, Whole
-from iblf_jax.controllers import FullState
+from iblf_jax.control.controllers import FullState
 from iblf_jax.core.status import Status
 from iblf_jax.engine.plan import CERTIFY_STRETCH
 from iblf_jax.simulation.scenario import Scenario

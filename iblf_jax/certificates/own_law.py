@@ -26,9 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.actuators import Ideal
 from iblf_jax.certificates.result import NOT_APPLICABLE, OWN_INEQUALITY, Line
-from iblf_jax.controllers import LyapunovLaw, Saturated
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.controllers import LyapunovLaw, Saturated
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped

@@ -27,18 +27,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.bounds import NARROWEST
 from iblf_jax.certificates import own_law
 from iblf_jax.certificates.claims import decay_phi, decay_rate, law_of
-from iblf_jax.controllers import Backstepping, FullState
+from iblf_jax.control.controllers import Backstepping, FullState
+from iblf_jax.control.observers import Printed
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.engine.execute import run_from
-from iblf_jax.observers import Printed
-from iblf_jax.robots import at_time, friction_torque, mass_matrix_rate
 from iblf_jax.simulation import jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
+from iblf_jax.world.bounds import NARROWEST
+from iblf_jax.world.robots import at_time, friction_torque, mass_matrix_rate
 
 ROUNDING = 2.0
 """Units of the last place by which V2' may be off, relative to the sizes of its terms; 0.1 is the most that was seen (tests)."""

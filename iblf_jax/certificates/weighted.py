@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.controllers import Backstepping
-from iblf_jax.observers import Momentum
+from iblf_jax.control.controllers import Backstepping
+from iblf_jax.control.observers import Momentum
 from iblf_jax.simulation.scenario import Scenario
 
 SHARES = np.linspace(0.02, 0.98, 97)

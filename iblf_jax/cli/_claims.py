@@ -174,7 +174,7 @@ def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def theorem_1(runs: Pair) -> PaperClaim:
     """Theorem 1, xi^2/2 <= V1 <= xi^2/(1 - xi^2), along the run of the integral form."""
-    from iblf_jax.barriers import Integral
+    from iblf_jax.control.barriers import Integral
 
     run = next(iter(runs.values()))
     V1, xi = _along(run, Integral())
@@ -216,7 +216,7 @@ def _all_digits(values: Any) -> str:
 
 def remark(runs: Pair) -> str:
     """What the comparison rests on: the two barriers differ by a factor of two, here confirmed along the run."""
-    from iblf_jax.barriers import Integral, Log
+    from iblf_jax.control.barriers import Integral, Log
 
     run = next(iter(runs.values()))
     (integral, _), (log, _) = _along(run, Integral()), _along(run, Log(p=1))

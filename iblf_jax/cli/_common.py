@@ -161,8 +161,8 @@ def number(value: Any) -> str:
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
     """Metrics of runs side by side, one column a joint, with units."""
     from iblf_jax.core import tables
-    from iblf_jax.robots import joint_names
     from iblf_jax.simulation.signals import OF_REGIONS
+    from iblf_jax.world.robots import joint_names
 
     first = next(iter(runs.values()))
     joints = joint_names(first.scenario.plant, first.n)

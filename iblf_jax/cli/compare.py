@@ -40,7 +40,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.controllers import LAWS
+    from iblf_jax.control.controllers import LAWS
     from iblf_jax.studies.compare import compare
 
     file = scenario_of(args)

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.sensors import Ideal, Measurement
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine.plan import LIMITS
-from iblf_jax.lowering.packed import Shapes, lowered
-from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import Program
-from iblf_jax.sensors import Ideal, Measurement
+from iblf_jax.kernels.packed import Shapes, lowered
+from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.program import Program
 from iblf_jax.simulation.closed_loop import answered, stepping_observer
 from iblf_jax.simulation.scenario import Scenario
 

@@ -17,22 +17,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.actuators import Ideal
+from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
-from iblf_jax.disturbances import Nothing
 from iblf_jax.engine.simulate import report
 from iblf_jax.engine.step import folded, sample_status
-from iblf_jax.robots import at_time
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled_if_due
 from iblf_jax.simulation.jumps import APART
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import NEARLY, Instant, Sampling, check_step, has_noise, noise_key, under_way
+from iblf_jax.simulation.sampling import (
+    NEARLY,
+    Instant,
+    Sampling,
+    check_step,
+    has_noise,
+    noise_key,
+    under_way,
+)
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import SIGNALS
+from iblf_jax.world.disturbances import Nothing
+from iblf_jax.world.robots import at_time
 
 
 @notices.each_warning_once

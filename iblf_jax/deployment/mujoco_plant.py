@@ -17,9 +17,9 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.robots.description import Shown, read
-from iblf_jax.robots.load import locked_position
-from iblf_jax.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unknown
+from iblf_jax.world.robots.description import Shown, read
+from iblf_jax.world.robots.load import locked_position
+from iblf_jax.world.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unknown
 
 INTEGRATORS = ("RK4", "Euler", "implicit", "implicitfast")
 

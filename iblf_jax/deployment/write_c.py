@@ -14,9 +14,9 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.deployment.c_names import Parameters, comment, number
 from iblf_jax.deployment.control_law import FLAGS, ControlLaw
-from iblf_jax.lowering.emit_c import header, plain_function
-from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.program import INPUTS, Program
+from iblf_jax.kernels.emit_c import header, plain_function
+from iblf_jax.kernels.operations import OPERATIONS
+from iblf_jax.kernels.program import INPUTS, Program
 from iblf_jax.simulation.scenario import Scenario
 
 SEGMENT = 500

@@ -18,7 +18,18 @@ import numpy as np
 
 from iblf_jax.engine.batch import Batch, Executor, Leaves, run_step
 from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of_step
-from iblf_jax.engine.step import Advanced, Carry, Form, Inputs, Node, Run, TimeStep, finished, samples_of_step, start
+from iblf_jax.engine.step import (
+    Advanced,
+    Carry,
+    Form,
+    Inputs,
+    Node,
+    Run,
+    TimeStep,
+    finished,
+    samples_of_step,
+    start,
+)
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 

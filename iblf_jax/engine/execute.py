@@ -30,10 +30,10 @@ from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.mechanism import Mechanism, known_of
 from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, Run, TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
-from iblf_jax.lowering.packed import Shapes
-from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import Program, UnsupportedError
-from iblf_jax.lowering.toolchain import StoppedError, ToolchainError, stop_compilers
+from iblf_jax.kernels.packed import Shapes
+from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.program import Program, UnsupportedError
+from iblf_jax.kernels.toolchain import StoppedError, ToolchainError, stop_compilers
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 

@@ -14,7 +14,7 @@ from iblf_jax.engine import plan
 from iblf_jax.engine.batch import Batch, Executor, Leaves
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.step import Form, Probe, keep_if
-from iblf_jax.lowering.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
+from iblf_jax.kernels.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
 
 
 def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:

@@ -16,10 +16,10 @@ from iblf_jax.engine.execute import automatic, inputs_of
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.step import Run, TimeStep
-from iblf_jax.lowering.operations import OPERATIONS
-from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import LANE, SHARED, TIME, Program
-from iblf_jax.lowering.toolchain import threads
+from iblf_jax.kernels.operations import OPERATIONS
+from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.program import LANE, SHARED, TIME, Program
+from iblf_jax.kernels.toolchain import threads
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get

@@ -19,12 +19,12 @@ import numpy as np
 
 from iblf_jax.core import devices
 from iblf_jax.engine import plan
-from iblf_jax.lowering import nvrtc
-from iblf_jax.lowering.emit_c import CUDA, header, sizes, source
-from iblf_jax.lowering.layout import Layout
-from iblf_jax.lowering.packed import Packed, record_shapes
-from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.toolchain import ToolchainError, built, compiler, loaded
+from iblf_jax.kernels import nvrtc
+from iblf_jax.kernels.emit_c import CUDA, header, sizes, source
+from iblf_jax.kernels.layout import Layout
+from iblf_jax.kernels.packed import Packed, record_shapes
+from iblf_jax.kernels.program import Program
+from iblf_jax.kernels.toolchain import ToolchainError, built, compiler, loaded
 
 _registered: set[str] = set()
 

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine import plan
-from iblf_jax.lowering.emit_c import header, source
-from iblf_jax.lowering.packed import Packed, Shapes, record_shapes
-from iblf_jax.lowering.program import Program
-from iblf_jax.lowering.toolchain import ToolchainError, build_ahead, built, compiler, loaded, threads
+from iblf_jax.kernels.emit_c import header, source
+from iblf_jax.kernels.packed import Packed, Shapes, record_shapes
+from iblf_jax.kernels.program import Program
+from iblf_jax.kernels.toolchain import ToolchainError, build_ahead, built, compiler, loaded, threads
 
 _registered: set[str] = set()
 

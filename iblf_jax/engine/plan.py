@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iblf_jax.lowering.program import LoweringLimits
+from iblf_jax.kernels.program import LoweringLimits
 
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a user may ask for a batch to be executed; "vmap" is the scan executor."""

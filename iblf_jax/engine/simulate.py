@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.bounds import tube_at
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
@@ -20,8 +19,6 @@ from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
 from iblf_jax.engine.transformable import run_transformable
-from iblf_jax.regions import in_words
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
@@ -30,6 +27,9 @@ from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.stability import RADIUS, WIDEST
+from iblf_jax.world.bounds import tube_at
+from iblf_jax.world.regions import in_words
+from iblf_jax.world.robots import joint_names
 
 MOST_SAMPLES = 20_000_000
 """More are not recorded, lest a slip in `duration` or `dt` fill the memory: for two joints they take some 5 GB."""

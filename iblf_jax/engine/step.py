@@ -25,14 +25,23 @@ import numpy as np
 from jax.extend.core import Var
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.bounds import NARROWEST
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 from iblf_jax.simulation import accuracy, integrators, jumps, sampling, stability
-from iblf_jax.simulation.closed_loop import LoopState, change, evaluate, initial_state, moving, sampled_if_due, still, surroundings
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    change,
+    evaluate,
+    initial_state,
+    moving,
+    sampled_if_due,
+    still,
+    surroundings,
+)
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
+from iblf_jax.world.bounds import NARROWEST
 
 
 class Run(NamedTuple):

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.controllers._base import switching_functions
+from iblf_jax.control.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import Stepped, stage_states, tableau
 from iblf_jax.simulation.scenario import Scenario

@@ -28,8 +28,8 @@ from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, number
 from iblf_jax.engine.executors import scan
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.step import Outcome, Run, recorded
-from iblf_jax.lowering.program import UnsupportedError
-from iblf_jax.lowering.toolchain import ToolchainError
+from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
 

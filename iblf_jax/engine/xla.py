@@ -20,9 +20,9 @@ from iblf_jax.core import devices
 from iblf_jax.engine import plan
 from iblf_jax.engine.evaluator import Entry, Evaluator, Table, on_cpu
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.lowering.packed import Packed
-from iblf_jax.lowering.passes import written_out
-from iblf_jax.lowering.program import LANE, SHARED, TIME, Program, UnsupportedError, frontier
+from iblf_jax.kernels.packed import Packed
+from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.program import LANE, SHARED, TIME, Program, UnsupportedError, frontier
 
 
 def run(

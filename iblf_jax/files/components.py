@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax import actuators, barriers, bounds, controllers, disturbances, observers, references, regions, robots, sensors
+from iblf_jax.control import actuators, barriers, controllers, observers, sensors
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.files.values import (
@@ -32,6 +32,7 @@ from iblf_jax.files.values import (
     plain_static,
     without_none,
 )
+from iblf_jax.world import bounds, disturbances, references, regions, robots
 
 FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     robots.Robot: ("robots", robots.MEMBERS),

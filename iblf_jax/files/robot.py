@@ -20,14 +20,14 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from iblf_jax.controllers import Controller, within_effort
+from iblf_jax.control.controllers import Controller, within_effort
 from iblf_jax.core import checks
-from iblf_jax.disturbances import Disturbance
 from iblf_jax.files.components import construct, decode, encode, encode_fields
 from iblf_jax.files.values import Words, as_table, known_keys, numbers
 from iblf_jax.presets.arms import arm_scenario
-from iblf_jax.references import Reference
-from iblf_jax.robots import Robot, load
+from iblf_jax.world.disturbances import Disturbance
+from iblf_jax.world.references import Reference
+from iblf_jax.world.robots import Robot, load
 
 KEYS = ("file", "base", "tip", "locked", "gravity", "repair")
 ROBOTS = ("robot", "plant", "model")

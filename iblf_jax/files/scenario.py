@@ -39,7 +39,15 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.files.components import construct, decode_fields, encode_fields, field_hints
 from iblf_jax.files.robot import names_a_file, with_robots_read
-from iblf_jax.files.values import Words, as_table, decode_static, did_you_mean, known_keys, numbers, toml_tables
+from iblf_jax.files.values import (
+    Words,
+    as_table,
+    decode_static,
+    did_you_mean,
+    known_keys,
+    numbers,
+    toml_tables,
+)
 from iblf_jax.presets import PRESETS
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.paths import parameters, with_parameters

@@ -50,7 +50,6 @@ from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
 from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, numbers
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation import metrics
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -65,6 +64,7 @@ from iblf_jax.tuning.objectives import Objective, checked
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
+from iblf_jax.world.robots import joint_names
 
 components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
 components.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))

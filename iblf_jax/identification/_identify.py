@@ -15,13 +15,29 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.replay import slopes, slopes_under
-from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, coordinates, to_x, to_z, with_widths
+from iblf_jax.identification.coordinates import (
+    DELAY,
+    OFFSET,
+    Coordinates,
+    coordinates,
+    to_x,
+    to_z,
+    with_widths,
+)
 from iblf_jax.identification.log import Log, Said, read
 from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
 from iblf_jax.identification.result import FINEST, LACKS, Identification, judged
 from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
 from iblf_jax.identification.smoothing import Smoothed, smoothed
-from iblf_jax.identification.standstill import BETTER, HOPELESS, NONE, SLOW, WORSE, by_the_law, free_about_standstill
+from iblf_jax.identification.standstill import (
+    BETTER,
+    HOPELESS,
+    NONE,
+    SLOW,
+    WORSE,
+    by_the_law,
+    free_about_standstill,
+)
 from iblf_jax.identification.structure import LeftOut, left_out
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical

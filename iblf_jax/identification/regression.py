@@ -24,7 +24,7 @@ from iblf_jax.identification.coordinates import Coordinates, scales, to_x, to_z
 from iblf_jax.identification.log import Said
 from iblf_jax.identification.search import WEAK, Around, search
 from iblf_jax.identification.smoothing import Smoothed
-from iblf_jax.robots import joint_names
+from iblf_jax.world.robots import joint_names
 
 ROUNDS = 3
 LITTLE = 0.3

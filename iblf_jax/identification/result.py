@@ -19,11 +19,11 @@ from iblf_jax.identification.shooting import Prior, Refined, Windows
 from iblf_jax.identification.statistics import UNKNOWN, Known, Whiteness, in_words, known, whiteness
 from iblf_jax.identification.structure import LeftOut, biased, remedy_for
 from iblf_jax.identification.structure import in_words as in_words_of
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.paths import parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.distributions import Perturbation, joint_normal, value
+from iblf_jax.world.robots import joint_names
 
 WHITE, SLIGHT = 1e-3, 0.05
 """Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is above the second."""

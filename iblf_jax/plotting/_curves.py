@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.actuators import Ideal as IdealActuator
+from iblf_jax.control.actuators import Ideal as IdealActuator
+from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status, describe
-from iblf_jax.robots import joint_names
-from iblf_jax.sensors import Ideal as IdealSensor
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.world.robots import joint_names
 
 POINTS = 2400
 """About as many points as a line of a figure can show."""

@@ -20,10 +20,10 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct, plain
 from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, show, transient_end
-from iblf_jax.regions import in_words
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world.regions import in_words
+from iblf_jax.world.robots import joint_names
 
 Runs = Rollout | Mapping[str, Rollout]
 

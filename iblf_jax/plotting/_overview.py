@@ -13,10 +13,19 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, plain, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
-from iblf_jax.plotting._panels import QUANTITIES, Plotted, Window, draw, draw_frame, say_what_is_cut, set_limits, show
+from iblf_jax.plotting._panels import (
+    QUANTITIES,
+    Plotted,
+    Window,
+    draw,
+    draw_frame,
+    say_what_is_cut,
+    set_limits,
+    show,
+)
 from iblf_jax.plotting._workspace import draw_paths
-from iblf_jax.regions import in_words
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.world.regions import in_words
 
 WIDTH = 10.0
 COLUMNS = 4

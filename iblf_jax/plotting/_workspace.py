@@ -19,7 +19,7 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, plain
 from iblf_jax.plotting._figures import Runs
-from iblf_jax.regions import HalfSpace, Region, Sphere, in_words, row_of
+from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
 
 GRID = 301
 """Points on a side of the grid on which a wall in the plane is sought."""

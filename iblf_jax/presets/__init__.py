@@ -8,20 +8,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from iblf_jax import bounds as bounds_
-from iblf_jax import disturbances, references
-from iblf_jax.controllers import LAWS as LAWS
-from iblf_jax.controllers import FullState, Saturated, law_by_name
-from iblf_jax.controllers.systems import observer_of
+from iblf_jax.control.controllers import LAWS as LAWS
+from iblf_jax.control.controllers import FullState, Saturated, law_by_name
+from iblf_jax.control.controllers.systems import observer_of
+from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
-from iblf_jax.observers import Momentum, Printed
 from iblf_jax.presets.arms import arm as arm
 from iblf_jax.presets.arms import arm_scenario as arm_scenario
 from iblf_jax.presets.arms import iiwa14 as iiwa14
 from iblf_jax.presets.arms import ur5 as ur5
-from iblf_jax.robots import TwoLink
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Initial, Scenario
+from iblf_jax.world import bounds as bounds_
+from iblf_jax.world import disturbances, references
+from iblf_jax.world.robots import TwoLink
 
 
 def customary_two_link() -> TwoLink:

@@ -33,21 +33,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import bounds as bounds_
-from iblf_jax import disturbances, references
-from iblf_jax.barriers import Barrier
-from iblf_jax.barriers._base import CLAIMS
-from iblf_jax.bounds import Bounds
-from iblf_jax.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
-from iblf_jax.controllers.systems import observer_of
+from iblf_jax.control.barriers import Barrier
+from iblf_jax.control.barriers._base import CLAIMS
+from iblf_jax.control.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
+from iblf_jax.control.controllers.systems import observer_of
+from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
-from iblf_jax.disturbances import Disturbance, Nothing
-from iblf_jax.observers import Momentum, Printed
-from iblf_jax.references import Reference
-from iblf_jax.robots import Arm, Robot
-from iblf_jax.robots._base import mass_matrix_at
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
+from iblf_jax.world import bounds as bounds_
+from iblf_jax.world import disturbances, references
+from iblf_jax.world.bounds import Bounds
+from iblf_jax.world.disturbances import Disturbance, Nothing
+from iblf_jax.world.references import Reference
+from iblf_jax.world.robots import Arm, Robot
+from iblf_jax.world.robots._base import mass_matrix_at
 
 ARMS = ("ur5", "iiwa14")
 """The arms that come with the package."""

@@ -37,12 +37,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
-from iblf_jax.robots import at_time
 from iblf_jax.simulation.closed_loop import LoopState, surroundings
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.jumps import within
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST
+from iblf_jax.world.robots import at_time
 
 TOLERANCE = 0.005
 """Estimated error of a position, relative to the width of its tube, above which a run is flagged INACCURATE."""

@@ -22,17 +22,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.actuators import Ideal
-from iblf_jax.controllers import Command
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.controllers import Command
+from iblf_jax.control.sensors import Measurement
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
-from iblf_jax.regions import margins
-from iblf_jax.robots import at_time, friction_torque
-from iblf_jax.sensors import Measurement
 from iblf_jax.simulation.sampling import Instant, normals
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
+from iblf_jax.world.regions import margins
+from iblf_jax.world.robots import at_time, friction_torque
 
 
 class Said(NamedTuple):

@@ -14,24 +14,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax import regions
-from iblf_jax.actuators import Actuator
-from iblf_jax.actuators import Ideal as IdealActuator
-from iblf_jax.bounds import Bounds, speed_limits_at, tube_at
-from iblf_jax.controllers import Controller, Setting
+from iblf_jax.control.actuators import Actuator
+from iblf_jax.control.actuators import Ideal as IdealActuator
+from iblf_jax.control.controllers import Controller, Setting
+from iblf_jax.control.observers import NoObserver, Observer
+from iblf_jax.control.sensors import Ideal as IdealSensor
+from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, notices
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
-from iblf_jax.disturbances import Disturbance, Nothing
-from iblf_jax.observers import NoObserver, Observer
-from iblf_jax.references import Reference
-from iblf_jax.robots import Robot
-from iblf_jax.robots._base import mass_matrix_at
-from iblf_jax.sensors import Ideal as IdealSensor
-from iblf_jax.sensors import Sensor
 from iblf_jax.simulation.sampling import Sampling, with_room
+from iblf_jax.world import regions
+from iblf_jax.world.bounds import Bounds, speed_limits_at, tube_at
+from iblf_jax.world.disturbances import Disturbance, Nothing
+from iblf_jax.world.references import Reference
+from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots._base import mass_matrix_at
 
 
 @component

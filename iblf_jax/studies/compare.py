@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.controllers import KEEPERS, LAWS, Controller, Saturated, law_by_name
-from iblf_jax.controllers.systems import observer_of
+from iblf_jax.control.controllers import KEEPERS, LAWS, Controller, Saturated, law_by_name
+from iblf_jax.control.controllers.systems import observer_of
+from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
@@ -29,7 +30,6 @@ from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.engine.step import Run
-from iblf_jax.observers import NoObserver
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
 from iblf_jax.simulation.paths import with_parameters

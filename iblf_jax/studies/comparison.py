@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.barriers import Integral
+from iblf_jax.control.barriers import Integral
 from iblf_jax.core import tables
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe

@@ -18,7 +18,14 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.blocks import Results, StudyInputs, StudyRun, _execute, block_size, with_chosen_backend
+from iblf_jax.studies.blocks import (
+    Results,
+    StudyInputs,
+    StudyRun,
+    _execute,
+    block_size,
+    with_chosen_backend,
+)
 from iblf_jax.studies.designs import split, unit_points
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Lanes, sample_size, targets_of

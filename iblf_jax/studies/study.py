@@ -24,8 +24,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.core.status import VIOLATED as LEFT
 from iblf_jax.engine.simulate import SimulationWarning, simulate_unchecked
-from iblf_jax.regions import in_words
-from iblf_jax.robots import joint_names
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
@@ -36,6 +34,8 @@ from iblf_jax.studies.blocks import Results, block_size, run_blocks
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.setup import StudySetup
 from iblf_jax.studies.statistics import Probability
+from iblf_jax.world.regions import in_words
+from iblf_jax.world.robots import joint_names
 
 if TYPE_CHECKING:
     import xarray

@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.bounds import tube_at
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status
-from iblf_jax.regions import margins
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, own_dims
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import block_size, run_blocks
 from iblf_jax.studies.config import describe_component
+from iblf_jax.world.bounds import tube_at
+from iblf_jax.world.regions import margins
 
 if TYPE_CHECKING:
     import xarray

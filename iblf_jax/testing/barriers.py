@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.barriers import Barrier
-from iblf_jax.barriers._base import CLAIMS
-from iblf_jax.bounds import Tube
+from iblf_jax.control.barriers import Barrier
+from iblf_jax.control.barriers._base import CLAIMS
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints, scenario_of
+from iblf_jax.world.bounds import Tube
 
 XI = (-40.0, -3.0, -1.0 - 1e-9, -1.0, -1.0 + 1e-9, -0.9, -0.3, -1e-9, 0.0, 1e-9, 0.3, 0.9, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 3.0, 40.0)
 """Where every barrier is looked at, in xi: far outside, on and about the wall, inside, on and about zero."""

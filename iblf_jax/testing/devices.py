@@ -9,9 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.actuators import Actuator, Delivered
-from iblf_jax.sensors import Measurement, Sensor
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.control.actuators import Actuator, Delivered
+from iblf_jax.control.sensors import Measurement, Sensor
+from iblf_jax.testing._contract import (
+    Findings,
+    examine,
+    has_shape,
+    in_dtype,
+    probe,
+    same_structure,
+    shape_of,
+)
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
 
 SMALL_TORQUES = (0.1, 1e-3)

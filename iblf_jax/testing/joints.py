@@ -9,17 +9,17 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from iblf_jax.bounds import Bounds, Sinusoid
-from iblf_jax.controllers import Backstepping
+from iblf_jax.control.controllers import Backstepping
+from iblf_jax.control.observers import Printed
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
-from iblf_jax.disturbances import Sinusoids
-from iblf_jax.observers import Printed
 from iblf_jax.presets import customary_two_link, zhang_yan_2024
-from iblf_jax.references import Sinusoid as SinusoidalReference
-from iblf_jax.robots import PlanarChain
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 from iblf_jax.testing._contract import Findings
+from iblf_jax.world.bounds import Bounds, Sinusoid
+from iblf_jax.world.disturbances import Sinusoids
+from iblf_jax.world.references import Sinusoid as SinusoidalReference
+from iblf_jax.world.robots import PlanarChain
 
 T = TypeVar("T")
 

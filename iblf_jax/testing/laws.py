@@ -9,17 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.bounds import Bounds, Constant
-from iblf_jax.controllers import Command, Controller
+from iblf_jax.control.controllers import Command, Controller
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import VIOLATED, Status
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    examine,
+    has_shape,
+    in_dtype,
+    probe,
+    same_structure,
+    shape_of,
+)
 from iblf_jax.testing.bounds import check_at_the_bounds
 from iblf_jax.testing.joints import check_scenario, scenario_for
 from iblf_jax.testing.own_claims import check_claims
+from iblf_jax.world.bounds import Bounds, Constant
 
 SHORT_RUN = 0.1
 """s."""

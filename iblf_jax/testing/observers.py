@@ -8,11 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.observers import Observer
 from iblf_jax.core import checks
-from iblf_jax.observers import Observer
-from iblf_jax.robots import Robot
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    examine,
+    has_shape,
+    in_dtype,
+    probe,
+    same_structure,
+    shape_of,
+)
 from iblf_jax.testing.joints import arm_of, check_number, fitted_to, number_of_joints
+from iblf_jax.world.robots import Robot
 
 
 def check_observer(observer: Any, *, model: Any = None, n: int | None = None) -> None:

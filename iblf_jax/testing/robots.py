@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.robots import Robot, coriolis_from_mass_matrix, mass_matrix_rate
 from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
+from iblf_jax.world.robots import Robot, coriolis_from_mass_matrix, mass_matrix_rate
 
 TOLERANCE = 1e-9
 """Relative, float64: closed forms and automatic differentiation agree to rounding."""

@@ -8,14 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.bounds import Side
 from iblf_jax.core import checks
-from iblf_jax.disturbances import Disturbance
-from iblf_jax.references import Reference
-from iblf_jax.regions import Region
-from iblf_jax.robots import Robot
-from iblf_jax.testing._contract import Findings, examine, find_jump, has_shape, in_dtype, probe, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    examine,
+    find_jump,
+    has_shape,
+    in_dtype,
+    probe,
+    shape_of,
+)
 from iblf_jax.testing.joints import arm_of, check_number, fitted_to, joints_of, number_of_joints
+from iblf_jax.world.bounds import Side
+from iblf_jax.world.disturbances import Disturbance
+from iblf_jax.world.references import Reference
+from iblf_jax.world.regions import Region
+from iblf_jax.world.robots import Robot
 
 
 def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

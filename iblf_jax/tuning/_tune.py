@@ -30,8 +30,23 @@ from iblf_jax.tuning import newton
 from iblf_jax.tuning import probes as probing
 from iblf_jax.tuning.first_order import LBFGS, Adam
 from iblf_jax.tuning.newton import Newton, Pieces
-from iblf_jax.tuning.objectives import Objective, check_signals, checked, complete, for_scenario, is_complete, is_smoothed
-from iblf_jax.tuning.optimise import FIRST_MU, CountedProblem, Loop, fingerprint, load_checkpoint, save_checkpoint
+from iblf_jax.tuning.objectives import (
+    Objective,
+    check_signals,
+    checked,
+    complete,
+    for_scenario,
+    is_complete,
+    is_smoothed,
+)
+from iblf_jax.tuning.optimise import (
+    FIRST_MU,
+    CountedProblem,
+    Loop,
+    fingerprint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from iblf_jax.tuning.parameters import Box, Tunable, in_units, layout, names_of, values_at
 from iblf_jax.tuning.probes import Probes
 from iblf_jax.tuning.problem import (

@@ -1,0 +1,1 @@
+"""What acts on a robot: barriers, control laws, disturbance observers, sensors and actuators."""

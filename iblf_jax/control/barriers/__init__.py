@@ -1,0 +1,44 @@
+"""Barriers: V1, its slope and the virtual velocity of each.  The contract is `Barrier` in `_base.py`.
+
+A barrier or a law of your own stays finite at the wall by `guarded_error`, and says so by `guard_is_active`.
+"""
+
+from iblf_jax.control.barriers._base import Barrier as Barrier
+from iblf_jax.control.barriers._base import GuardedError as GuardedError
+from iblf_jax.control.barriers._base import guard_is_active as guard_is_active
+from iblf_jax.control.barriers._base import guarded_error as guarded_error
+from iblf_jax.control.barriers.integral import Integral as Integral
+from iblf_jax.control.barriers.log import Log as Log
+from iblf_jax.control.barriers.mapping import Mapping as Mapping
+from iblf_jax.control.barriers.prescribed_performance import (
+    PrescribedPerformance as PrescribedPerformance,
+)
+from iblf_jax.control.barriers.quadratic import Quadratic as Quadratic
+from iblf_jax.control.barriers.state import State as State
+from iblf_jax.control.barriers.tan import Tan as Tan
+
+MEMBERS = {
+    "integral": Integral,
+    "log": Log,
+    "tan": Tan,
+    "state": State,
+    "prescribed_performance": PrescribedPerformance,
+    "mapping": Mapping,
+    "quadratic": Quadratic,
+}
+"""Every barrier by the name that a scenario file gives it."""
+
+__all__ = [
+    "MEMBERS",
+    "Barrier",
+    "GuardedError",
+    "Integral",
+    "Log",
+    "Mapping",
+    "PrescribedPerformance",
+    "Quadratic",
+    "State",
+    "Tan",
+    "guard_is_active",
+    "guarded_error",
+]

@@ -1,0 +1,76 @@
+"""The asymmetric time-varying logarithmic barrier, the comparison in the paper's figures."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.barriers._base import (
+    GUARD,
+    check_guard,
+    guarded_error,
+    paper_virtual_velocity,
+)
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component, static
+from iblf_jax.world.bounds import Tube
+
+
+@component
+class Log:
+    """V1 = 1/(2p) ln 1/(1 - xi^(2p)), with a whole exponent p >= 1.
+
+        s = e1^(2p-1) / (k^(2p) - e1^(2p)),   alpha = q_d' - (k1 + kappa) e1
+
+    The slope has a kink at e1 = 0 where k_u and k_l differ: second derivatives of a run leave out what the kink adds.
+
+    Args:
+      p: exponent, a whole number >= 1; 1 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+
+    Source: K. P. Tee, B. Ren, S. S. Ge, Automatica 47 (2011) 2511-2516.
+    """
+
+    p: int = static(default=1)
+    guard: float = static(default=GUARD)
+    uses_o: ClassVar[bool] = True
+    value_unit: ClassVar[str] = "1"
+
+    def check(self) -> None:
+        """Raises ValueError unless p is a whole number >= 1 and the guard in (0, 1)."""
+        check_guard("Log", self.guard)
+        checks.positive_integer("Log.p", self.p)
+
+    def value(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """V1, (n,) [1]."""
+        e, beyond, k, _ = guarded_error(tube, q, self.guard)
+        return -jnp.log1p(-((e / k) ** (2 * self.p))) / (2 * self.p) + self._slope(e, k) * beyond
+
+    def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
+        """s, (n,) [1/rad]."""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return self._slope(e, k)
+
+    def _slope(self, e, k):
+        # In xi, so that a large p does not underflow k^(2p).
+        x = e / k
+        return x ** (2 * self.p - 1) / (k * (1.0 - x ** (2 * self.p)))
+
+    def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
+        """k^2 - e1^2 for p = 1, (n,) [rad^2]; None for p > 1, whose slope vanishes as e1^(2p - 1)."""
+        e, _, k, _ = guarded_error(tube, q, self.guard)
+        return k**2 - e**2 if self.p == 1 else None
+
+    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+        """alpha, (n,) [rad/s]."""
+        return paper_virtual_velocity(tube, q, k1, o)
+
+    def decay_rate(self, k1: jax.Array) -> jax.Array:
+        """2 p k1: V1' <= -k1 xi^(2p)/(1 - xi^(2p)) <= -2 p k1 V1 at e2 = 0, (n,) [1/s]."""
+        return 2.0 * self.p * k1
+
+    def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
+        """|xi| <= (1 - exp(-2 p V))^(1/(2p)), (n,) [1]."""
+        return jnp.broadcast_to((-jnp.expm1(-2.0 * self.p * V)) ** (1.0 / (2 * self.p)), tube.q_d.shape)

@@ -1,0 +1,58 @@
+"""Tracking laws.  The contract is `Controller` in `_base.py`; `systems.py` has the paper's systems by name."""
+
+from iblf_jax.control.controllers._base import Command as Command
+from iblf_jax.control.controllers._base import Controller as Controller
+from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
+from iblf_jax.control.controllers._base import Setting as Setting
+from iblf_jax.control.controllers._base import State as State
+from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
+from iblf_jax.control.controllers.backstepping import Backstepping as Backstepping
+from iblf_jax.control.controllers.computed_torque import ComputedTorque as ComputedTorque
+from iblf_jax.control.controllers.dynamic_surface import DynamicSurface as DynamicSurface
+from iblf_jax.control.controllers.full_state import FullState as FullState
+from iblf_jax.control.controllers.pd_gravity import PDGravity as PDGravity
+from iblf_jax.control.controllers.reference_governor import ReferenceGovernor as ReferenceGovernor
+from iblf_jax.control.controllers.safety_filter import SafetyFilter as SafetyFilter
+from iblf_jax.control.controllers.saturated import Saturated as Saturated
+from iblf_jax.control.controllers.saturated import within_effort as within_effort
+from iblf_jax.control.controllers.surface_barrier import SurfaceBarrier as SurfaceBarrier
+from iblf_jax.control.controllers.systems import KEEPERS as KEEPERS
+from iblf_jax.control.controllers.systems import LAWS as LAWS
+from iblf_jax.control.controllers.systems import law_by_name as law_by_name
+
+MEMBERS = {
+    "backstepping": Backstepping,
+    "full_state": FullState,
+    "dynamic_surface": DynamicSurface,
+    "adaptive_rbf": AdaptiveRBF,
+    "surface_barrier": SurfaceBarrier,
+    "computed_torque": ComputedTorque,
+    "pd_gravity": PDGravity,
+    "saturated": Saturated,
+    "safety_filter": SafetyFilter,
+    "reference_governor": ReferenceGovernor,
+}
+"""Every law by the name that a scenario file gives it."""
+
+__all__ = [
+    "KEEPERS",
+    "LAWS",
+    "MEMBERS",
+    "AdaptiveRBF",
+    "Backstepping",
+    "Command",
+    "ComputedTorque",
+    "Controller",
+    "DynamicSurface",
+    "FullState",
+    "LyapunovLaw",
+    "PDGravity",
+    "ReferenceGovernor",
+    "SafetyFilter",
+    "Saturated",
+    "Setting",
+    "State",
+    "SurfaceBarrier",
+    "law_by_name",
+    "within_effort",
+]

@@ -1,0 +1,118 @@
+"""Adaptive radial-basis network with a barrier: no model, no observer, weights that are part of the loop's state.
+
+What the backstepping law takes from the model, M0 alpha' + C0 alpha + G0 - f, a network of Gaussians learns while it runs:
+
+    W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),   z = Z over its spans
+    W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
+
+The sigma-modification bounds the weights whatever happens: as |S| <= sqrt(nodes), the column of joint i obeys
+|W_hat_i| <= sqrt(nodes) sup|e2_i| / sigma.  The literature puts the centres on a lattice, which in the 4n dimensions of Z has
+nodes^(4n) points; here they are a fixed number of points of a Sobol sequence in the box [-1, 1]^(4n).
+
+ASSUMPTION: the source's own node count, centres and gains could not be found; all numbers here are this package's.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.barriers import Barrier, Log
+from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
+from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_o, fit_weight, weight_unit
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+
+
+@component
+class AdaptiveRBF:
+    """tau = -w s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
+
+    s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes, n) [N m].
+
+    Args:
+      k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
+      K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0.
+      o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not given.
+      Gamma: rate of adaptation of each joint's weights, () or (n,) [N m/rad], > 0; 20 if not given.
+      sigma: leak that bounds the weights, () or (n,) [rad/(N m s)], > 0; what it forgets stays as an error; 0.005 if not given.
+      middle: position at the centre of the nodes' box, () or (n,) [rad]; 0.5 if not given.
+      span_q: half the box in q, () or (n,) [rad], > 0; 0.5 if not given.
+      span_dq: half the box in q' and alpha, () or (n,) [rad/s], > 0; 1 if not given.
+      span_ddq: half the box in alpha', () or (n,) [rad/s^2], > 0; 3 if not given.
+      width: width of the Gaussians in half boxes, () [1], > 0; 2 if not given.
+      barrier: any `Barrier`; `Log()` if not given.
+      nodes: number of Gaussians, a whole number; 64 if not given.
+      weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
+        rad^2), > 0; 1, the paper's, if not given.
+
+    Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068; numbers as said at the head of this module.
+    """
+
+    k1: Leaf = leaf("1/s", sign="positive")
+    K2: Leaf = leaf("N m s/rad", sign="positive")
+    o: Leaf = leaf("1/s^2", sign="positive", default=None)
+    Gamma: Leaf = leaf("N m/rad", sign="positive", default=20.0)
+    sigma: Leaf = leaf("rad/(N m s)", sign="positive", default=0.005)
+    middle: Leaf = leaf("rad", default=0.5)
+    span_q: Leaf = leaf("rad", sign="positive", default=0.5)
+    span_dq: Leaf = leaf("rad/s", sign="positive", default=1.0)
+    span_ddq: Leaf = leaf("rad/s^2", sign="positive", default=3.0)
+    width: Leaf = leaf("1", sign="positive", shape="scalar", default=2.0)
+    barrier: Barrier = Log()
+    nodes: int = static(default=64)
+    weight: Leaf = leaf("N m rad", sign="positive", default=None)
+    gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
+    unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    uses_observer: ClassVar[bool] = False
+
+    def check(self) -> None:
+        """Raises ValueError for a bad barrier or number of nodes; completes `o` and `weight`."""
+        checks.positive_integer("AdaptiveRBF.nodes", self.nodes)
+        checks.conforms("AdaptiveRBF.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Log().", CLAIMS)
+        fit_o(self)
+        fit_weight(self)
+
+    def leaf_units(self) -> dict[str, str]:
+        """The unit of the weight, which depends on the barrier."""
+        return {"weight": weight_unit(self.barrier)}
+
+    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> jax.Array:
+        """W_hat(0) = 0, (nodes, n) [N m]."""
+        return jnp.zeros((self.nodes, q.size), q.dtype)
+
+    def basis(self, q: jax.Array, dq: jax.Array, alpha: jax.Array, dalpha: jax.Array) -> jax.Array:
+        """S(Z), (nodes,) [1]."""
+        z = jnp.concatenate([(q - self.middle) / self.span_q, dq / self.span_dq, alpha / self.span_dq, dalpha / self.span_ddq])
+        offset = z - jnp.asarray(sobol_centres(self.nodes, z.size), z.dtype)
+        return jnp.exp(-jnp.sum(offset**2, axis=1) / self.width**2)
+
+    def command(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: jax.Array
+    ) -> tuple[Command, jax.Array]:
+        """The torque, what belongs to it, and W_hat'."""
+        alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
+        tube, e2 = setting.tube(t), dq - alpha
+        S = self.basis(q, dq, alpha, dalpha)
+        learned = jnp.sum(S[:, None] * state, axis=0)
+        tau = learned - self.K2 * e2 - self.weight * self.barrier.slope(tube, q)
+        guard_active = guard_is_active(tube, q, self.barrier.guard)
+        value = self.weight * self.barrier.value(tube, q)
+        command = Command(tau, alpha, value, guard_active, jnp.zeros_like(guard_active))
+        return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)
+
+
+@functools.lru_cache(maxsize=16)
+def sobol_centres(nodes: int, dimensions: int) -> np.ndarray:
+    """The first `nodes` points of the unscrambled Sobol sequence, centred in their cells, in [-1, 1]^dimensions."""
+    from scipy.stats import qmc
+
+    order = math.ceil(math.log2(nodes))
+    points = qmc.Sobol(dimensions, scramble=False).random_base2(order)[:nodes]
+    return 2.0 * (points + 0.5 / 2**order) - 1.0

@@ -1,0 +1,100 @@
+"""Actuator limits around any law; the paper leaves them to future work.
+
+The loop gives observer and plant the torque that was applied, so an observer that is told the truth estimates f and not the cut.
+While the torque is cut, no law's claims hold; outside, they do again.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.controllers._base import (
+    Command,
+    Controller,
+    Setting,
+    State,
+    switching_functions,
+)
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.world.robots import Robot
+
+EDGES = ("hard", "smooth")
+SHARPNESS = 8
+"""Even exponent of the smooth limit: at half the limit it takes off 0.05 %, at the limit 8 %."""
+
+
+@component
+class Saturated:
+    """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8) (smooth, for gradients).
+
+    Paths reach through: "controller.K2" is the wrapped law's K2.
+
+    Args:
+      law: the law whose torque is limited, any `Controller`.
+      limit: largest torque of each joint, () or (n,) [N m], > 0.
+      edge: "hard" or "smooth"; "hard" if not given.
+
+    Source: none; the construction is common.
+    """
+
+    law: Controller
+    limit: Leaf = leaf("N m", sign="positive")
+    edge: str = static(default="hard")
+    wraps: ClassVar[str] = "law"
+
+    def check(self) -> None:
+        """Raises ValueError for something that is not a law, or an unknown edge."""
+        checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
+        checks.one_of("Saturated.edge", self.edge, EDGES)
+
+    def advice(self) -> list[str]:
+        """The wrapped law's."""
+        return getattr(self.law, "advice", list)()
+
+    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
+        """The wrapped law's state."""
+        return self.law.init(q, dq, setting)
+
+    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+        """Where the wrapped law's command jumps."""
+        return switching_functions(self.law, t, q, dq, setting, state)
+
+    def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
+        """The wrapped law's command with its torque limited; `saturated` says where it asked for more than the limit."""
+        command, rate = self.law.command(t, q, dq, f_hat, setting, state)
+        asked = command.tau
+        tau = jnp.clip(asked, -self.limit, self.limit) if self.edge == "hard" else self.limit * _smooth_clip(asked / self.limit)
+        return command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)), rate
+
+
+UNLIMITED = 1e6
+"""N m; the limit of a joint without one among others that have theirs: beyond any actuator."""
+
+
+def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Controller:
+    """A law within the largest torques of a robot: `Saturated` at its `effort`.
+
+    Args:
+      law: any.
+      robot: such as `iblf_jax.robots.Arm`; the law is returned as it is if the robot has no `effort`, or an infinite one on every joint.
+      edge: as `Saturated.edge`.
+
+    Raises:
+      ValueError: as `Saturated`.
+    """
+    effort = getattr(robot, "effort", jnp.inf)
+    if not checks.is_concrete(effort):
+        return Saturated(law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge)
+    finite = np.isfinite(effort)
+    return Saturated(law=law, limit=np.where(finite, effort, UNLIMITED), edge=edge) if finite.any() else law
+
+
+def _smooth_clip(x: jax.Array) -> jax.Array:
+    """X / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives too."""
+    m = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), 1.0))
+    return (x / m) / ((1.0 / m) ** SHARPNESS + (x / m) ** SHARPNESS) ** (1.0 / SHARPNESS)

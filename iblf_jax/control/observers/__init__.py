@@ -1,0 +1,13 @@
+"""Disturbance observers.  The contract is `Observer` in `_base.py`."""
+
+from iblf_jax.control.observers._base import Observer as Observer
+from iblf_jax.control.observers._base import State as State
+from iblf_jax.control.observers.extended_state import ExtendedState as ExtendedState
+from iblf_jax.control.observers.momentum import Momentum as Momentum
+from iblf_jax.control.observers.none import NoObserver as NoObserver
+from iblf_jax.control.observers.printed import Printed as Printed
+
+MEMBERS = {"none": NoObserver, "printed": Printed, "momentum": Momentum, "extended_state": ExtendedState}
+"""Every observer by the name that a scenario file gives it."""
+
+__all__ = ["MEMBERS", "ExtendedState", "Momentum", "NoObserver", "Observer", "Printed", "State"]

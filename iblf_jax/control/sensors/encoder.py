@@ -1,0 +1,75 @@
+"""Joint encoders: positions in counts, with an offset and noise, and a velocity that follows from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.sensors._base import Measurement, State, Velocity
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf
+
+
+@component
+class Encoder:
+    """y = step round((q + offset + noise w) / step),   step = 2 pi / counts,   w standard normal.
+
+    The derivative of y by q is taken as 1, that of what is read before it is rounded: that of the rounding is 0 almost everywhere.
+
+    Args:
+      velocity: how a velocity follows, any of `iblf_jax.sensors.VELOCITIES`.
+      counts: in a turn, () or (n,) [1], > 0; not rounded if not given.
+      offset: what a joint reads where it is 0, () or (n,) [rad]; 0 if not given.
+      noise: standard deviation, () or (n,) [rad], >= 0; none if not given.
+
+    Source: none; the construction is common.
+    """
+
+    velocity: Velocity
+    counts: Leaf = leaf("1", sign="positive", default=None)
+    offset: Leaf = leaf("rad", default=0.0)
+    noise: Leaf = leaf("rad", sign="nonnegative", default=None)
+
+    def check(self) -> None:
+        """Raises ValueError for a velocity that is none."""
+        checks.conforms("Encoder.velocity", self.velocity, Velocity, "iblf_jax.sensors.VELOCITIES has them.")
+
+    @property
+    def draws(self) -> int:
+        """One for the position if it has noise, and the velocity's."""
+        return (self.noise is not None) + self.velocity.draws
+
+    def advice(self, period: jax.Array) -> list[str]:
+        """The velocity's warnings."""
+        return getattr(self.velocity, "advice", lambda period: [])(period)
+
+    @property
+    def unrounded(self) -> Encoder:
+        """The same without counts."""
+        return dataclasses.replace(self, counts=None)
+
+    @property
+    def resolution(self) -> jax.Array | float:
+        """What a count is, () or (n,) [rad]; 0 if not rounded."""
+        return 0.0 if self.counts is None else 2.0 * math.pi / self.counts
+
+    def _read(self, q: jax.Array) -> jax.Array:
+        """The counts that a position is read as, in [rad]."""
+        if self.counts is None:
+            return q
+        step = self.resolution
+        return q + jax.lax.stop_gradient(step * jnp.round(q / step) - q)
+
+    def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
+        """The velocity's, for the position that is read without noise."""
+        return self.velocity.init(self._read(q + self.offset), dq, period)
+
+    def measure(self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State) -> tuple[Measurement, State]:
+        """The position in counts, and the velocity."""
+        noisy = q + self.offset if self.noise is None else q + self.offset + self.noise * normal[0]
+        y = self._read(noisy)
+        v, state = self.velocity.estimate(y, dq, normal[int(self.noise is not None) :], period, state)
+        return Measurement(y, v), state

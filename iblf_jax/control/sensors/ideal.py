@@ -1,0 +1,25 @@
+"""The sensor that tells the truth."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from iblf_jax.control.sensors._base import Measurement
+from iblf_jax.core.pytree import component
+
+
+@component
+class Ideal:
+    """Q and q' as they are.  Source: none; the baseline."""
+
+    draws: ClassVar[int] = 0
+
+    def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> tuple[()]:
+        """No state."""
+        return ()
+
+    def measure(self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]) -> tuple[Measurement, tuple[()]]:
+        """The truth."""
+        return Measurement(q, dq), ()

@@ -1,0 +1,153 @@
+"""A jaxpr taken apart into scalars: every array becomes a NumPy array of node numbers.
+
+So what only moves numbers about (reshape, slice, gather) is done here and now on the node numbers, and what computes becomes one
+node a number.  Nested functions are inlined, short scans unrolled; a primitive that has no rule raises `UnsupportedError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend import core
+
+from iblf_jax.kernels.functions import apply
+from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, constants
+from iblf_jax.kernels.rules import RULES
+
+INLINED = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr",
+}  # fmt: skip
+
+READ_AGAIN = 50
+"""Equations up to which an inner function is read again at each call: that is as quick as to remember it."""
+
+
+def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Ids]) -> list[Ids]:
+    """The outputs of a jaxpr, given its constants and inputs as node numbers."""
+    known: dict[Any, Ids] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
+
+    def read(atom):
+        return constants(b, atom.val) if isinstance(atom, core.Literal) else known[atom]
+
+    live = _live(jaxpr)
+    uses = {id(eqn): tuple(v in live for v in eqn.outvars) for eqn in jaxpr.eqns}
+    calls: dict[int, list] = {}
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "jit":
+            calls.setdefault(id(eqn.params["jaxpr"]), []).append(uses[id(eqn)])
+
+    for eqn in jaxpr.eqns:
+        if not any(uses[id(eqn)]):
+            continue
+        name = eqn.primitive.name
+        operands = [read(v) for v in eqn.invars]
+        results: Sequence[Ids | None]
+        if name == "jit" and len(eqn.params["jaxpr"].eqns) > READ_AGAIN:
+            results = apply(b, eqn.params["jaxpr"], operands, uses[id(eqn)], calls[id(eqn.params["jaxpr"])], closed)
+        elif name in INLINED:
+            results = closed(b, eqn.params[INLINED[name]], operands)
+        elif name in CONTROL:
+            results = CONTROL[name](b, eqn, operands, uses[id(eqn)])
+        elif name in RULES:
+            for v in eqn.outvars:
+                _check_float(b, v.aval.dtype, eqn)
+            out = RULES[name](b, eqn, *operands)
+            results = list(out) if isinstance(out, (list, tuple)) else [out]
+        else:
+            raise UnsupportedError(f"the primitive {name!r} is not lowered")
+        for v, ids in zip(eqn.outvars, results, strict=True):
+            if ids is None:
+                continue
+            if ids.shape != v.aval.shape:
+                raise UnsupportedError(f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}")
+            known[v] = ids
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _live(jaxpr: Any) -> set:
+    """The variables that the outputs need."""
+    live = {v for v in jaxpr.outvars if isinstance(v, core.Var)}
+    for eqn in reversed(jaxpr.eqns):
+        if any(v in live for v in eqn.outvars):
+            live.update(v for v in eqn.invars if isinstance(v, core.Var))
+    return live
+
+
+def _check_float(b: Builder, dtype, eqn) -> None:
+    """Refuses floats of another type than the program's (constants, which are rounded once, aside)."""
+    if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
+        raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
+
+
+def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
+    """The outputs of a closed or plain inner jaxpr."""
+    inner = getattr(function, "jaxpr", function)
+    consts = [constants(b, c) for c in getattr(function, "consts", ())]
+    return interpret(b, inner, consts, operands)
+
+
+def _parts(params: dict[str, Any]) -> tuple[int, int]:
+    """How many operands of a scan are constants, and how many its carry."""
+    if "num_consts" in params:  # before jax 0.11
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
+def _scan(b: Builder, eqn, operands, used):
+    params = eqn.params
+    length, (n_const, n_carry) = params["length"], _parts(params)
+    if length > b.limits.scan:
+        raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})")
+    const, carry, xs = operands[:n_const], operands[n_const : n_const + n_carry], operands[n_const + n_carry :]
+    stacked: list[list[Ids]] = []
+    for i in reversed(range(length)) if params["reverse"] else range(length):
+        out = closed(b, params["jaxpr"], [*const, *carry, *(x[i] for x in xs)])
+        carry = out[:n_carry]
+        stacked.append(out[n_carry:])
+    if params["reverse"]:
+        stacked.reverse()
+    ys = [np.stack(column) for column in zip(*stacked, strict=True)]
+    if not stacked:
+        ys = [np.zeros(v.aval.shape, np.int64) for v in eqn.outvars[n_carry:]]
+    return [*carry, *ys]
+
+
+def _cond(b: Builder, eqn, operands, used):
+    index, *rest = operands
+    branches = eqn.params["branches"]
+    which = int(index)
+    value = b.value(which)
+    if value is not None:
+        return closed(b, branches[min(max(int(value), 0), len(branches) - 1)], rest)
+    results = _last(b, branches, which, rest, used)
+    for i in reversed(range(len(branches) - 1)):
+        is_flag = b.nodes[which].kind == "b"
+        condition = b.emit("not", which, kind="b") if is_flag else b.emit("le", which, b.constant(i, "i"), kind="b")
+        others = closed(b, branches[i], rest)
+        results = [None if no is None else choose(b, condition, yes, no) for yes, no in zip(others, results, strict=True)]
+    return results
+
+
+def _last(b: Builder, branches: Sequence[Any], which: int, operands: Sequence[Ids], used: tuple[bool, ...]) -> list[Ids | None]:
+    """The used results of the last branch, which may be computed where it is taken alone if all runs take it together."""
+    if not b.is_shared(which):
+        return list(closed(b, branches[-1], operands))
+    taken = which if b.nodes[which].kind == "b" else b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
+    return apply(b, branches[-1], operands, used, [used], closed, taken)
+
+
+def _while(b: Builder, eqn, operands, used):
+    raise UnsupportedError("a while loop inside a step has no fixed length")
+
+
+def choose(b: Builder, condition: int, yes: Ids, no: Ids) -> Ids:
+    """`yes` where one scalar condition holds, else `no`, entry by entry."""
+    flat = [b.emit("select", condition, int(x), int(y), kind=b.nodes[int(x)].kind) for x, y in zip(yes.ravel(), no.ravel(), strict=True)]
+    return np.asarray(flat, np.int64).reshape(yes.shape)
+
+
+CONTROL = {"scan": _scan, "cond": _cond, "while": _while}

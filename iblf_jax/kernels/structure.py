@@ -1,0 +1,203 @@
+"""Rules for the primitives that only move numbers about: they run here and now, on node numbers.
+
+An index that is known only in the run (the piece of a spline at time t) becomes a choice among the entries that it can mean, or a
+lookup where all of these are constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, constants
+
+
+def _reshape(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
+    return x.reshape(eqn.outvars[0].aval.shape)
+
+
+def _broadcast_in_dim(b: Builder, eqn, x: Ids, *_: Ids) -> Ids:
+    shape, dimensions = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    spread = [1] * len(shape)
+    for axis, place in enumerate(dimensions):
+        spread[place] = x.shape[axis]
+    return np.broadcast_to(x.reshape(spread), shape)
+
+
+def _transpose(b: Builder, eqn, x: Ids) -> Ids:
+    return np.transpose(x, eqn.params["permutation"])
+
+
+def _slice(b: Builder, eqn, x: Ids) -> Ids:
+    p = eqn.params
+    strides = p["strides"] or (1,) * x.ndim
+    return x[tuple(slice(lo, hi, s) for lo, hi, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
+
+
+def _concatenate(b: Builder, eqn, *operands: Ids) -> Ids:
+    return np.concatenate(operands, axis=eqn.params["dimension"])
+
+
+def _stack(b: Builder, eqn, *operands: Ids) -> Ids:
+    return np.stack(operands, axis=eqn.params.get("axis", eqn.params.get("dimension", 0)))
+
+
+def _unstack(b: Builder, eqn, x: Ids):
+    return list(np.moveaxis(x, eqn.params["axis"], 0))
+
+
+def _split(b: Builder, eqn, x: Ids):
+    return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"])
+
+
+def _rev(b: Builder, eqn, x: Ids) -> Ids:
+    return np.flip(x, eqn.params["dimensions"])
+
+
+def _pad(b: Builder, eqn, x: Ids, filler: Ids) -> Ids:
+    for axis, (low, high, interior) in enumerate(eqn.params["padding_config"]):
+        size = x.shape[axis] + max(x.shape[axis] - 1, 0) * interior
+        shape = list(x.shape)
+        shape[axis] = size + max(low, 0) + max(high, 0)
+        padded = np.full(shape, int(filler))
+        where = [slice(None)] * x.ndim
+        where[axis] = slice(max(low, 0), max(low, 0) + size, interior + 1)
+        padded[tuple(where)] = x
+        where[axis] = slice(max(-low, 0), shape[axis] - max(-high, 0))
+        x = padded[tuple(where)]
+    return x
+
+
+def _iota(b: Builder, eqn, *_: Ids) -> Ids:
+    shape, axis = eqn.params["shape"], eqn.params["dimension"]
+    line = np.arange(shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(shape))])
+    return constants(b, np.broadcast_to(line, shape).astype(eqn.outvars[0].aval.dtype))
+
+
+def _now(eqn, *operands):
+    """The primitive itself, run on node numbers."""
+    with jax.ensure_compile_time_eval():
+        return np.asarray(eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params), np.int64)
+
+
+def _chosen(b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None) -> Ids:
+    """`at(values of the index)`, of entries of x; where the run alone knows an index, a choice among its values 0 ... longest axis - 1."""
+    known, size = known or {}, max(x.shape, default=1)
+    flat = [known.get(i, b.value(i)) for i in index.ravel().tolist()]
+    unknown = [i for i, v in zip(index.ravel().tolist(), flat, strict=True) if v is None]
+    if not unknown:
+        return at(np.asarray(flat, np.int32).reshape(index.shape))
+    choices = size ** len({*unknown, *known})
+    if choices > (b.limits.table if choices == size and _is_table(b, x.ravel().tolist()) else b.limits.choices):
+        raise UnsupportedError(f"indices that only the run knows choose among {choices} entries, which is too many")
+    node = unknown[0]
+    cases = [_chosen(b, x, index, at, known | {node: v}) for v in range(size)]
+    columns = np.stack([case.ravel() for case in cases], axis=1)
+    if columns.size > b.limits.tables:
+        raise UnsupportedError(f"an index that only the run knows chooses among {columns.size} numbers, which is too many")
+    return np.asarray([_one_of(b, column, node) for column in columns.tolist()], np.int64).reshape(cases[0].shape)
+
+
+def _is_table(b: Builder, entries: list[int]) -> bool:
+    return all(b.value(i) is not None and b.nodes[i].kind == "f" for i in entries)
+
+
+def _one_of(b: Builder, entries: list[int], index: int) -> int:
+    """The entry at an index of the run: looked up where all are constants."""
+    if len(set(entries)) == 1:
+        return entries[0]
+    if _is_table(b, entries):
+        return b.lookup(tuple(b.value(i) for i in entries), index)
+    if len(entries) > b.limits.choices:
+        raise UnsupportedError(f"an index that only the run knows chooses among {len(entries)} entries, which is too many")
+    result = entries[-1]
+    for v, entry in reversed(list(enumerate(entries[:-1]))):
+        result = b.emit("select", b.emit("le", index, b.constant(v, "i"), kind="b"), entry, result, kind=b.nodes[entry].kind)
+    return result
+
+
+def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
+    """Entries of x, the nearest one for an index outside; a gather that fills what lies outside is refused."""
+    filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
+    if filled and not _is_inside(b, eqn, x, index):
+        raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")
+
+    def at(values):
+        params = dict(eqn.params, fill_value=None, mode=jax.lax.GatherScatterMode.CLIP)
+        with jax.ensure_compile_time_eval():
+            return np.asarray(eqn.primitive.bind(jax.numpy.asarray(x, np.int32), jax.numpy.asarray(values), **params), np.int64)
+
+    rows = list(np.ndindex(index.shape[:-1]))
+    if len(rows) == 1 or all(b.value(i) is not None for i in index.ravel().tolist()):
+        return _chosen(b, x, index, at)
+    # One place after the other, so that each is chosen by its own index alone.
+    result = np.empty(eqn.outvars[0].aval.shape, np.int64)
+    offsets = eqn.params["dimension_numbers"].offset_dims
+    axes = [a for a in range(result.ndim) if a not in offsets]
+    for row in rows:
+        here = np.full(index.shape, b.constant(0, "i"))
+        here[row] = index[row]
+        one = np.moveaxis(_chosen(b, x, here, at), axes, range(len(axes)))[row]
+        np.moveaxis(result, axes, range(len(axes)))[row] = one
+    return result
+
+
+def _is_inside(b: Builder, eqn, x: Ids, index: Ids) -> bool:
+    """Whether all places of a gather are known and inside."""
+    axes, sizes = eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
+    rows = [[b.value(i) for i in row] for row in index.reshape(-1, len(axes)).tolist()]
+    return all(v is not None and 0 <= v <= x.shape[a] - sizes[a] for row in rows for a, v in zip(axes, row, strict=True))
+
+
+def _dynamic_slice(b: Builder, eqn, x: Ids, *starts: Ids) -> Ids:
+    def at(values):
+        corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, eqn.params["slice_sizes"], strict=True)]
+        return x[tuple(slice(c, c + s) for c, s in zip(corner, eqn.params["slice_sizes"], strict=True))]
+
+    return _chosen(b, x, np.asarray(starts), at)
+
+
+def _dynamic_update_slice(b: Builder, eqn, x: Ids, new: Ids, *starts: Ids) -> Ids:
+    def at(values):
+        corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, new.shape, strict=True)]
+        result = x.copy()
+        result[tuple(slice(c, c + s) for c, s in zip(corner, new.shape, strict=True))] = new
+        return result
+
+    return _chosen(b, x, np.asarray(starts), at)
+
+
+def _scatter(op: str | None) -> Callable:
+    """Scatter at known places: which update lands where is found by scattering their numbers."""
+
+    def rule(b: Builder, eqn, x: Ids, index: Ids, new: Ids) -> Ids:
+        values = [b.value(i) for i in index.ravel().tolist()]
+        if any(v is None for v in values):
+            raise UnsupportedError(f"{eqn.primitive.name} at an index that only the run knows")
+        places = np.asarray(values, np.int32).reshape(index.shape)
+        with jax.ensure_compile_time_eval():
+            numbers = jax.numpy.arange(new.size, dtype=np.int32).reshape(new.shape)
+            params = {k: eqn.params[k] for k in eqn.params if k not in ("update_jaxpr", "update_consts")}
+            landed = jax.lax.scatter(jax.numpy.full(x.shape, -1, np.int32), places, numbers, **params)
+        source = np.asarray(landed)
+        if np.sum(source >= 0) != new.size:
+            raise UnsupportedError(f"{eqn.primitive.name} with repeated or outlying places")
+        result, flat = x.copy().ravel(), new.ravel()
+        for place, which in enumerate(source.ravel().tolist()):
+            if which >= 0:
+                old, update = int(result[place]), int(flat[which])
+                result[place] = update if op is None else b.emit(op, old, update, kind=b.nodes[old].kind)
+        return result.reshape(x.shape)
+
+    return rule
+
+
+STRUCTURE: dict[str, Callable] = {
+    "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "broadcast_in_dim": _broadcast_in_dim, "transpose": _transpose,
+    "slice": _slice, "concatenate": _concatenate, "stack": _stack, "split": _split, "rev": _rev, "pad": _pad, "iota": _iota,
+    "unstack": _unstack,  # since jax 0.11
+    "gather": _gather, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "scatter": _scatter(None),
+    "scatter-add": _scatter("add"), "scatter_add": _scatter("add"), "scatter_mul": _scatter("mul"), "scatter-mul": _scatter("mul"),
+}  # fmt: skip

@@ -1,0 +1,1 @@
+"""What a controller acts on: robots, references, bounds, regions and disturbances."""

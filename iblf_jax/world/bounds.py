@@ -1,0 +1,285 @@
+"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference; bounds on their velocities alike.
+
+Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the reference.  The law works with
+the errors' bounds
+
+    k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,                    (paper, below Assumption 2)
+
+and with their rates, all taken here, once, by automatic differentiation: `tube_at` returns them as a `Tube`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world.references import Reference
+from iblf_jax.world.robots import Robot
+
+
+class Side(Protocol):
+    """What the package asks of one side of the bounds.
+
+    One that is switched at some times also has `jump_times()`, the times at which it or its rate jumps, (m,) [s], as disturbances have:
+    steps of a run are divided there.
+    """
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for bounds that follow it.
+
+        As a bound on q' it is given q_d' and is in rad/s.
+        """
+        ...
+
+
+@component
+class Constant:
+    """The bound is `value`, for all time.
+
+    Args:
+      value: the bound, () or (n,) [rad].
+    """
+
+    value: Leaf = leaf("rad")
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound, (n,) [rad]."""
+        return jnp.broadcast_to(self.value, q_d.shape)
+
+
+@component
+class Sinusoid:
+    """The bound is offset + amplitude sin(frequency t + phase).
+
+    Args:
+      offset: middle of its motion, () or (n,) [rad].
+      amplitude: half of its range, () or (n,) [rad].
+      frequency: angular frequency, () or (n,) [rad/s]; 1 if not given.
+      phase: phase at t = 0, () or (n,) [rad]; 0 if not given.
+
+    Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
+    """
+
+    offset: Leaf = leaf("rad")
+    amplitude: Leaf = leaf("rad")
+    frequency: Leaf = leaf("rad/s", default=1.0)
+    phase: Leaf = leaf("rad", default=0.0)
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound, (n,) [rad]."""
+        return jnp.broadcast_to(self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q_d.shape)
+
+
+@component
+class Funnel:
+    """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
+
+    `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a lower one.
+
+    Args:
+      initial: distance from the reference at t = 0, () or (n,) [rad].
+      final: distance that it shrinks to, () or (n,) [rad].
+      rate: how fast it shrinks, () or (n,) [1/s], >= 0.
+
+    Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
+    """
+
+    initial: Leaf = leaf("rad")
+    final: Leaf = leaf("rad")
+    rate: Leaf = leaf("1/s", sign="nonnegative")
+
+    def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
+        """The bound, (n,) [rad]."""
+        return q_d + (self.initial - self.final) * jnp.exp(-self.rate * t) + self.final
+
+
+@component
+class Bounds:
+    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`.
+
+    On positions in rad; on velocities (`Scenario.velocity_bounds`) in rad/s.
+
+    Args:
+      lower: the lower side, any `Side`.
+      upper: the upper side, any `Side`.
+    """
+
+    lower: Side
+    upper: Side
+
+    def check(self) -> None:
+        """Raises ValueError for a side that is not one."""
+        for name in ("lower", "upper"):
+            checks.conforms(f"Bounds.{name}", getattr(self, name), Side, "A constant bound is iblf_jax.bounds.Constant(value).")
+
+
+def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
+    """One number, or one a joint, from a user's argument."""
+    array = checks.as_floats(name, value)
+    checks.check_values(name, array, sign)
+    if array.shape not in ((), (n,)):
+        raise checks.fail(name, value, f"one number, or {n} (one a joint)")
+    return array
+
+
+def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = None) -> Bounds:
+    """Constant bounds at a robot's joint limits.
+
+        lower + margin < q < upper - margin
+
+    Args:
+      robot: one with `limits`, such as `iblf_jax.robots.Arm`.
+      margin: distance that is kept from the limits [rad].
+      unlimited: bounds of joints without limits, -unlimited and unlimited [rad].
+
+    Raises:
+      ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a margin that leaves nothing.
+    """
+    if not hasattr(robot, "limits"):
+        raise checks.fail("robot", type(robot).__name__, "a robot with joint limits, such as an Arm", "Give bounds of your own.")
+    kept, far = (
+        _distance("margin", margin, robot.n, None),
+        0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive"),
+    )
+    sides = []
+    for side, sign in zip(robot.limits, (1.0, -1.0), strict=True):
+        if checks.is_concrete(side) and not np.all(np.isfinite(side)) and unlimited is None:
+            raise checks.fail("robot.limits", side, "limits on every joint", "Say what to use where there are none: unlimited=6.3.")
+        sides.append(jnp.where(jnp.isfinite(side), side + sign * kept, -sign * far))
+    lower, upper = sides
+    if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
+        raise checks.fail(
+            "margin",
+            margin,
+            "a margin that leaves room between the limits",
+            f"The narrowest range is {float(np.min(np.diff(robot.limits, axis=0))):g} rad.",
+        )
+    return Bounds(lower=Constant(lower), upper=Constant(upper))
+
+
+def from_speed_limits(robot: Robot, *, share: float = 1.0, unlimited: float | None = None) -> Bounds:
+    """Constant bounds on the velocities at a share of a robot's largest joint speeds, for `Scenario.velocity_bounds`.
+
+        -share speed < q' < share speed
+
+    Args:
+      robot: one with `speed`, such as `iblf_jax.robots.Arm`.
+      share: of the largest speeds, > 0 [1].
+      unlimited: largest speed of joints that have none [rad/s].
+
+    Raises:
+      ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a share that is not positive.
+    """
+    if not hasattr(robot, "speed"):
+        raise checks.fail("robot", type(robot).__name__, "a robot with speed limits, such as an Arm", "Give velocity bounds of your own.")
+    share = checks.positive_number("share", share, "1")
+    far = 0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive")
+    if checks.is_concrete(robot.speed) and not np.all(np.isfinite(robot.speed)) and unlimited is None:
+        remedy = "Say what to use where there is none: unlimited=3.0."
+        raise checks.fail("robot.speed", robot.speed, "a limit on every joint", remedy)
+    most = share * jnp.where(jnp.isfinite(robot.speed), robot.speed, far)
+    return Bounds(lower=Constant(-most), upper=Constant(most))
+
+
+class Tube(NamedTuple):
+    """Reference, bounds and their rates at one time; everything that a barrier needs to know of the world."""
+
+    q_d: jax.Array
+    """Reference, (n,) [rad]."""
+    dq_d: jax.Array
+    """Its velocity, (n,) [rad/s]."""
+    lower: jax.Array
+    """k_lc, (n,) [rad]."""
+    upper: jax.Array
+    """k_uc, (n,) [rad]."""
+    dlower: jax.Array
+    """Rate of k_lc, (n,) [rad/s]."""
+    dupper: jax.Array
+    """Rate of k_uc, (n,) [rad/s]."""
+    ddq_d: jax.Array | None = None
+    """Its acceleration, (n,) [rad/s^2], for laws that feed it forward; None in a tube that barriers take alpha from."""
+
+    @property
+    def k_l(self) -> jax.Array:
+        """k_l = q_d - k_lc, (n,) [rad]."""
+        return positive_width(self.q_d - self.lower)
+
+    @property
+    def k_u(self) -> jax.Array:
+        """k_u = k_uc - q_d, (n,) [rad]."""
+        return positive_width(self.upper - self.q_d)
+
+    @property
+    def dk_l(self) -> jax.Array:
+        """Rate of k_l, (n,) [rad/s]."""
+        return self.dq_d - self.dlower
+
+    @property
+    def dk_u(self) -> jax.Array:
+        """Rate of k_u, (n,) [rad/s]."""
+        return self.dupper - self.dq_d
+
+    def xi(self, q: jax.Array) -> jax.Array:
+        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].                     (2.4), (2.5)"""
+        e1 = q - self.q_d
+        return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
+
+
+NARROWEST = 1e-6
+"""rad.  A reference that comes nearer to its bound than this is called infeasible; widths are held above it so that a run
+with a bad reference gives large numbers and a flag instead of NaN."""
+
+
+def positive_width(k: jax.Array) -> jax.Array:
+    """`k` where it is wider than NARROWEST, else NARROWEST."""
+    return jnp.maximum(checks.as_floats("k", k), NARROWEST)
+
+
+def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration: bool = True) -> Tube:
+    """Reference, bounds and their rates at time t, the rates by jvp.
+
+        q_d, q_d', q_d",   k_lc, k_uc and their rates
+
+    Args:
+      reference, bounds: the components.
+      t: time, () [s].
+      acceleration: whether q_d" is wanted; False where the tube is itself differentiated in time, so that a reference need not have a
+        third derivative.
+
+    Returns:
+      `Tube`; its ddq_d costs nothing where it is not used, as what is not used is not compiled.
+
+    Raises:
+      ValueError: something that is no reference, no bounds or no time.
+    """
+    checks.offers("reference", reference, ("position",), "a reference, as iblf_jax.references.Reference")
+    checks.offers("bounds", bounds, ("lower", "upper"), "bounds, as iblf_jax.bounds.Bounds(lower=..., upper=...)")
+    t = checks.as_floats("t", t)
+    checks.shape_is("t", t, ())
+    acceleration = checks.flag("acceleration", acceleration)
+
+    def values(t):
+        q_d = reference.position(t)
+        return q_d, bounds.lower.at(t, q_d), bounds.upper.at(t, q_d)
+
+    def velocity(t):
+        return jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
+
+    (q_d, lower, upper), (dq_d, dlower, dupper) = jax.jvp(values, (t,), (jnp.ones_like(t),))
+    ddq_d = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1] if acceleration else None
+    return Tube(q_d, dq_d, lower, upper, dlower, dupper, ddq_d)
+
+
+def speed_limits_at(reference: Reference, bounds: Bounds, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The bounds v_l, v_u on the velocities at time t [s], (n,) each [rad/s]; sides that follow something follow q_d'."""
+    dq_d = jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
+    return bounds.lower.at(t, dq_d), bounds.upper.at(t, dq_d)
+
+
+MEMBERS = {"constant": Constant, "sinusoid": Sinusoid, "funnel": Funnel}
+"""Every side by the name that a scenario file gives it."""

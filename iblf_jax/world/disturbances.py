@@ -1,0 +1,238 @@
+"""Disturbances: the generalised torque that acts on the plant and that the law does not know.
+
+    M q" + C q' + G = tau + (disturbance)                                        for the simulated plant
+
+What the observer should estimate is the lumped uncertain term of (2.1),
+
+    f = M0 q" + C0 q' + G0 - tau,
+
+evaluated along the run with the *model*.  It equals the disturbance here when the plant is the model; if the plant has other
+masses, a payload or friction, f holds those as well.  f must be differentiable (Assumption 1), so a disturbance that
+jumps says when: `jump_times`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec
+from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.time import joined, jump_times_of
+from iblf_jax.world.robots import Robot
+
+
+class Disturbance(Protocol):
+    """What the package asks of a disturbance."""
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """Generalised torque on the plant, (n,) [N m], at time t [s] and state q [rad], dq [rad/s]."""
+        ...
+
+    def jump_times(self) -> jax.Array:
+        """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is.
+
+        Steps of a run are divided there, so a torque that jumps and does not say so costs accuracy.  How many there are is fixed; the
+        times are computed from leaves with jnp, may differ between runs, and have derivatives.
+        """
+        ...
+
+
+def _never() -> jax.Array:
+    return jnp.zeros((0,))
+
+
+@component
+class Nothing:
+    """No disturbance."""
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """Zero, (n,) [N m]."""
+        return jnp.zeros_like(q)
+
+    def jump_times(self) -> jax.Array:
+        """None."""
+        return _never()
+
+
+@component
+class ModelShaped:
+    """The paper's uncertain term, shaped by the model's own matrices.                                      (4.3)
+
+        f = M0(q) a(t) + C0(q, q') b(t)
+        a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase),   b likewise
+
+    `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.
+
+    Args:
+      acceleration_amplitude: amplitude of a, () or (n,) [rad/s^2].
+      acceleration_frequency: angular frequency of a, () or (n,) [rad/s].
+      acceleration_phase: phase of a at t = 0, () or (n,) [rad].
+      velocity_amplitude: amplitude of b, () or (n,) [rad/s].
+      velocity_frequency: angular frequency of b, () or (n,) [rad/s].
+      velocity_phase: phase of b at t = 0, () or (n,) [rad].
+      phase: shift of all of it, () [rad]; 0 if not given.
+
+    Source: Zhang & Yan 2024, (4.3).
+    """
+
+    acceleration_amplitude: Leaf = leaf("rad/s^2")
+    acceleration_frequency: Leaf = leaf("rad/s")
+    acceleration_phase: Leaf = leaf("rad")
+    velocity_amplitude: Leaf = leaf("rad/s")
+    velocity_frequency: Leaf = leaf("rad/s")
+    velocity_phase: Leaf = leaf("rad")
+    phase: Leaf = leaf("rad", shape="scalar", default=0.0)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """f(t, q, q'), (n,) [N m]."""
+        a = self.acceleration_amplitude * jnp.sin(self.acceleration_frequency * t + self.acceleration_phase + self.phase)
+        b = self.velocity_amplitude * jnp.sin(self.velocity_frequency * t + self.velocity_phase + self.phase)
+        return matvec(model.mass_matrix(q), a) + model.coriolis(q, dq, b)
+
+    def jump_times(self) -> jax.Array:
+        """None: it is smooth."""
+        return _never()
+
+
+@component
+class Sinusoids:
+    """Joint torques offset + amplitude sin(frequency t + phase).
+
+    Args:
+      amplitude: amplitude of the torque, () or (n,) [N m].
+      frequency: angular frequency, () or (n,) [rad/s].
+      phase: phase at t = 0, () or (n,) [rad]; 0 if not given.
+      offset: mean torque, () or (n,) [N m]; 0 if not given.
+    """
+
+    amplitude: Leaf = leaf("N m")
+    frequency: Leaf = leaf("rad/s")
+    phase: Leaf = leaf("rad", default=0.0)
+    offset: Leaf = leaf("N m", default=0.0)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """(n,) [N m]."""
+        return jnp.broadcast_to(self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q.shape)
+
+    def jump_times(self) -> jax.Array:
+        """None: it is smooth."""
+        return _never()
+
+
+@component
+class Step:
+    """Joint torques that appear at one time: `size` from `time` on.
+
+    Args:
+      size: the torques, () or (n,) [N m].
+      time: when they appear, () [s].
+    """
+
+    size: Leaf = leaf("N m")
+    time: Leaf = leaf("s", shape="scalar")
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """(n,) [N m]."""
+        return jnp.where(t >= self.time, jnp.broadcast_to(self.size, q.shape), jnp.zeros_like(q))
+
+    def jump_times(self) -> jax.Array:
+        """`time`."""
+        return jnp.atleast_1d(self.time)
+
+
+@component
+class TipForce:
+    """A force that acts on the tip, +J(q)^T F(t) with F = offset + amplitude sin(frequency t + phase).
+
+    (The paper's f_ext in (2.1) is the force that the tip exerts, hence its minus sign: F = -f_ext.)
+
+    Args:
+      amplitude: one number a coordinate of the tip, () or (2,) for a planar arm, (3,) in space [N].
+      frequency: angular frequency, of the same shape or () [rad/s]; 0 if not given.
+      phase: phase at t = 0, of the same shape or () [rad]; 0 if not given.
+      offset: mean force, of the same shape or () [N]; 0 if not given.
+    """
+
+    amplitude: Leaf = leaf("N", shape="any")
+    frequency: Leaf = leaf("rad/s", shape="any", default=0.0)
+    phase: Leaf = leaf("rad", shape="any", default=0.0)
+    offset: Leaf = leaf("N", shape="any", default=0.0)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """J(q)^T F(t), (n,) [N m]."""
+        J = plant.jacobian(q)
+        force = self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
+        return matvec(J.T, jnp.broadcast_to(force, (J.shape[0],)))
+
+    def jump_times(self) -> jax.Array:
+        """None: it is smooth."""
+        return _never()
+
+
+@component
+class Friction:
+    """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' / width)).
+
+    Args:
+      viscous: torque per speed, () or (n,) [N m s/rad], >= 0; 0 if not given.
+      coulomb: torque at speeds well above the width, () or (n,) [N m], >= 0; 0 if not given.
+      width: velocity over which the Coulomb part changes sign, () or (n,) [rad/s], > 0; smaller is sharper and stiffer; 0.05 if not given.
+    """
+
+    viscous: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
+    coulomb: Leaf = leaf("N m", sign="nonnegative", default=0.0)
+    width: Leaf = leaf("rad/s", sign="positive", default=0.05)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """(n,) [N m]."""
+        return -(self.viscous * dq + self.coulomb * jnp.tanh(dq / self.width))
+
+    def jump_times(self) -> jax.Array:
+        """None: the Coulomb part is smoothed."""
+        return _never()
+
+
+@component
+class Sum:
+    """Several disturbances at once: `Sum((Friction(0.1), Step(1.0, 5.0)))`.
+
+    Args:
+      parts: any disturbances, a tuple or a list.
+    """
+
+    parts: tuple[Disturbance, ...]
+
+    def check(self) -> None:
+        """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""
+        if not isinstance(self.parts, tuple | list):
+            raise checks.fail("Sum.parts", self.parts, "a tuple of disturbances", "Put one part into brackets, Sum((part,)).")
+        object.__setattr__(self, "parts", tuple(self.parts))
+        for i, part in enumerate(self.parts):
+            checks.conforms(f"Sum.parts[{i}]", part, Disturbance)
+
+    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+        """The sum over the parts, (n,) [N m]."""
+        total = jnp.zeros_like(q)
+        for part in self.parts:
+            total = total + part.torque(t, q, dq, plant, model)
+        return total
+
+    def jump_times(self) -> jax.Array:
+        """The parts' jump times together, (m,) [s]."""
+        return joined([jump_times_of(f"Sum.parts[{i}]", part) for i, part in enumerate(self.parts)])
+
+
+MEMBERS = {
+    "nothing": Nothing,
+    "model_shaped": ModelShaped,
+    "sinusoids": Sinusoids,
+    "step": Step,
+    "tip_force": TipForce,
+    "friction": Friction,
+    "sum": Sum,
+}
+"""Every disturbance by the name that a scenario file gives it."""

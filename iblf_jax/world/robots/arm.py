@@ -1,0 +1,346 @@
+"""A serial chain of rigid links in space, with revolute and prismatic joints: real arms (`iblf_jax.robots.load`).
+
+Each joint i has a frame, placed in the frame of the link before it (of the base, for the first) by `position` and `rotation`, and an axis
+in that frame; link i moves with it.  In the world's frame (that of the base), with S_i = (z_i, p_i x z_i) for a revolute and (0, z_i)
+for a prismatic joint, and I_i the inertia of link i about the world's origin:
+
+    J_i = [S_1 ... S_i 0 ... 0],   M = sum_i J_i^T I_i J_i + diag(armature)
+    M_ij = S_i . (I_j + ... + I_n) S_j  for i <= j                                    composite bodies
+    U = - g . sum_i m_i c_i
+    C = sum_i J_i^T (I_i J_i' + B(I_i, V_i) J_i),   V_i = J_i v
+    B(I, V) u = 1/2 (V x* (I u) - I (V x u) + u x* (I V))
+
+x and x* are the rates of a motion and of a wrench that are carried along (`spatial.along`).  B + B^T = I', so M' - 2 C is
+skew-symmetric; C is the one of the Christoffel symbols (Echeandia & Wensing 2021).  All links are computed at once; only the positions
+of the frames go from link to link.
+
+Friction in the joints acts on the plant (`friction_torque`); the law's M0, C0, G0 hold none, so it is part of f in (2.1).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.world.robots import spatial
+from iblf_jax.world.robots.payload import Payload
+
+KINDS = ("revolute", "prismatic")
+"""What a joint can be; one without limits is revolute with infinite ones."""
+
+
+class Limits(NamedTuple):
+    """Ranges of the joints, (n,) each [rad or m]; infinite where a joint has none."""
+
+    lower: jax.Array
+    upper: jax.Array
+
+
+class Pose(NamedTuple):
+    """Where a frame is."""
+
+    position: jax.Array
+    """(3,) [m]."""
+    rotation: jax.Array
+    """(3, 3); its columns are the frame's axes."""
+
+
+traced_once = partial(jax.jit, inline=True)
+"""For what is asked of an arm alone too: operation by operation it would be hundreds of programs, each compiled by itself."""
+
+
+class Frames(NamedTuple):
+    """The links' frames in the world, and what their joints allow."""
+
+    placement: jax.Array
+    """[R, p] of each, (n, 3, 4)."""
+    allowed: jax.Array
+    """S, the links' motion per unit of joint speed, (n, 2, 3)."""
+
+
+@component
+class Arm:
+    """Serial arm in space with n revolute or prismatic joints; all its parameters are leaves, one row a link.
+
+    "plant.link[forearm].mass" and "plant.joint[elbow].damping" address one link or joint by its name or number.
+
+    Args:
+      mass: mass of each link, (n,) [kg], >= 0.
+      centre: centres of mass in the links' frames, (n, 3) [m].
+      inertia: about the centres, along the links' axes, (n, 6): xx, yy, zz, xy, xz, yz [kg m^2].
+      position: origin of each joint's frame in the frame of the link before, (n, 3) [m].
+      rotation: orientation of each joint's frame there, quaternions (w, x, y, z), (4,) or (n, 4) [1]; their length does not matter;
+        the identity if not given.
+      axis: axes of the joints in their frames, (3,) or (n, 3) [1]; their length does not matter; z if not given.
+      armature: inertia of the rotors seen from the joints, added to the diagonal of M, () or (n,) [kg m^2], >= 0; 0 if not given.
+      damping: viscous friction of each joint, () or (n,) [N m s/rad], >= 0; 0 if not given.
+      friction: Coulomb friction of each joint, () or (n,) [N m], >= 0; 0 if not given.
+      friction_width: speed over which the Coulomb friction changes its sign, () or (n,) [rad/s], > 0; smaller is sharper and stiffer; 0.05
+        if not given.
+      tip_position: origin of the tip's frame in the frame of the last link, (3,) [m]; the same origin if not given.
+      tip_rotation: orientation of the tip's frame there, a quaternion (w, x, y, z), (4,) [1]; the identity if not given.
+      g: acceleration of gravity in the base's frame, (3,) [m/s^2]: it says how the arm is mounted; (0, 0, -9.81) if not given.
+      payload: point mass at the tip, () [kg], >= 0; 0 if not given.
+      lower: lower ends of the joints' ranges, () or (n,) [rad]; of the dynamics nothing depends on them; -infinite if not given.
+      upper: upper ends of the joints' ranges, () or (n,) [rad]; infinite if not given.
+      effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; of the dynamics nothing depends on them; infinite if not
+        given.
+      speed: largest speeds of the joints, () or (n,) [rad/s], > 0; of the dynamics nothing depends on them; infinite if not given.
+      carried: a load with an extent of its own, which may be picked up at a time, a `Payload`; nothing if not given.
+      kinds: "revolute" or "prismatic", one a joint, (n,); all revolute if not given.
+      links: names of the links, from the first that moves, (n,); link1 ... if not given.
+      joints: names of the joints, (n,); joint1 ... if not given.
+      repaired: what `load(..., repair=True)` changed, a line a link or joint; nothing if not given.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms, 2008; Echeandia & Wensing 2021 for C; see the head of this module.
+    """
+
+    mass: Leaf = leaf("kg", sign="nonnegative")
+    centre: Leaf = leaf("m", shape="any")
+    inertia: Leaf = leaf("kg m^2", shape="any")
+    position: Leaf = leaf("m", shape="any")
+    rotation: Leaf = leaf("1", shape="any", default=(1.0, 0.0, 0.0, 0.0))
+    axis: Leaf = leaf("1", shape="any", default=(0.0, 0.0, 1.0))
+    armature: Leaf = leaf("kg m^2", sign="nonnegative", default=0.0)
+    damping: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
+    friction: Leaf = leaf("N m", sign="nonnegative", default=0.0)
+    friction_width: Leaf = leaf("rad/s", sign="positive", default=0.05)
+    tip_position: Leaf = leaf("m", shape="any", default=(0.0, 0.0, 0.0))
+    tip_rotation: Leaf = leaf("1", shape="any", default=(1.0, 0.0, 0.0, 0.0))
+    g: Leaf = leaf("m/s^2", shape="any", default=(0.0, 0.0, -9.81))
+    payload: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
+    lower: Leaf = leaf("rad", sign="limit", default=-np.inf)
+    upper: Leaf = leaf("rad", sign="limit", default=np.inf)
+    effort: Leaf = leaf("N m", sign="positive limit", default=np.inf)
+    speed: Leaf = leaf("rad/s", sign="positive limit", default=np.inf)
+    carried: Payload = None  # type: ignore[assignment]
+    kinds: tuple[str, ...] = static(default=())
+    links: tuple[str, ...] = static(default=())
+    joints: tuple[str, ...] = static(default=())
+    repaired: tuple[str, ...] = static(default=())
+
+    geometry_fields: ClassVar[tuple[str, ...]] = ("centre", "inertia", "position", "rotation", "axis", "tip_position", "tip_rotation", "g")
+    """Fields of which it may be compiled in which numbers are 0, 1 or -1, and which are equal (`engine.mechanism`)."""
+    rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
+        "link": ("links", ("mass", "centre", "inertia")),
+        "joint": (
+            "joints",
+            ("position", "rotation", "axis", "armature", "damping", "friction", "friction_width", "lower", "upper", "effort", "speed"),
+        ),
+    }
+    """What a path may call by name: word -> (the field that holds the names, the fields with one row a name)."""
+
+    def check(self) -> None:
+        """Gives every field one row a link, and names; raises ValueError if the fields do not fit together."""
+        if jnp.ndim(self.mass) != 1 or not len(self.mass):
+            raise checks.fail("Arm.mass", self.mass, "one number a link, (n,)")
+        n = self.mass.shape[0]
+        for name, width in (("centre", 3), ("inertia", 6), ("position", 3), ("rotation", 4), ("axis", 3)):
+            value = getattr(self, name)
+            if value.shape == (width,) and name in ("rotation", "axis"):
+                object.__setattr__(self, name, jnp.broadcast_to(value, (n, width)))
+            else:
+                checks.shape_is(f"Arm.{name}", value, (n, width))
+        for name in ("armature", "damping", "friction", "friction_width", "lower", "upper", "effort", "speed"):
+            value = getattr(self, name)
+            if value.ndim == 0:
+                object.__setattr__(self, name, jnp.broadcast_to(value, (n,)))
+            else:
+                checks.shape_is(f"Arm.{name}", value, (n,))
+        for name, width in (("tip_position", 3), ("tip_rotation", 4), ("g", 3)):
+            checks.shape_is(f"Arm.{name}", getattr(self, name), (width,))
+        for name in ("rotation", "axis", "tip_rotation"):
+            value = getattr(self, name)
+            if checks.is_concrete(value) and not np.all(np.linalg.norm(np.asarray(value), axis=-1) > 1e-6):
+                raise checks.fail(f"Arm.{name}", value, "directions of a length above 0")
+        if checks.is_concrete((self.lower, self.upper)) and not np.all(np.asarray(self.lower) < np.asarray(self.upper)):
+            raise checks.fail("Arm.lower", self.lower, f"ranges below Arm.upper, {np.asarray(self.upper)}")
+        if self.carried is None:
+            object.__setattr__(self, "carried", Payload())
+        elif not isinstance(self.carried, Payload):
+            raise checks.fail("Arm.carried", self.carried, "a Payload", "Such as Payload(mass=1.5, centre=[0, 0, 0.1]).")
+        self._check_names(n)
+
+    def _check_names(self, n: int) -> None:
+        for name, default in (("kinds", ("revolute",) * n), ("links", _numbered("link", n)), ("joints", _numbered("joint", n))):
+            given = getattr(self, name)
+            if isinstance(given, tuple) and not given:
+                object.__setattr__(self, name, default)
+            elif not isinstance(given, tuple) or len(given) != n or not all(isinstance(x, str) and x for x in given):
+                raise checks.fail(f"Arm.{name}", given, f"{n} words, one a link")
+            elif name != "kinds" and len(set(given)) < n:
+                raise checks.fail(f"Arm.{name}", given, "names that differ")
+        for i, kind in enumerate(self.kinds):
+            checks.one_of(f"Arm.kinds[{i}]", kind, KINDS)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.kinds)
+
+    @property
+    def limits(self) -> Limits:
+        """The joints' ranges, (n,) each [rad or m]; infinite where a joint has none."""
+        return Limits(self.lower, self.upper)
+
+    def at(self, t: jax.Array) -> Arm:
+        """The arm as it is at time t [s]: with what it carries then."""
+        if self.carried.start is None:
+            return self
+        now = copy.copy(self)
+        object.__setattr__(now, "carried", self.carried.at(t))
+        return now
+
+    def jump_times(self) -> jax.Array:
+        """When the arm picks up its load, and when all of the load hangs on it, (2,) [s]; (0,) where it does not pick one up."""
+        return self.carried.jump_times()
+
+    # ------------------------------------------------------------------------------------------------------- where things are
+
+    @traced_once
+    def _frames(self, q: jax.Array) -> Frames:
+        """Frames of the links and directions of the joints at q."""
+        turns = np.array([kind == "revolute" for kind in self.kinds])
+        a, fixed = spatial.unit(self.axis), spatial.rotation(self.rotation)
+        axis = spatial.apply(fixed, a)
+        along = axis[:, :, None] * a[:, None, :]
+        angle = q if turns.all() else jnp.where(turns, q, jnp.zeros_like(q))
+        sine, cosine = jnp.sin(angle)[:, None, None], jnp.cos(angle)[:, None, None]
+        turned = along + cosine * (fixed - along) + sine * spatial.cross(fixed, a[:, None, :])
+        shifted = self.position
+        if not turns.all():
+            shifted = shifted + jnp.where(turns, jnp.zeros_like(q), q)[:, None] * axis
+        H = spatial.chained(spatial.placement(turned, shifted))
+        z = spatial.apply(H[:, :, :3], a)
+        w, v = z, spatial.cross(H[:, :, 3], z)
+        if not turns.all():
+            w, v = jnp.where(turns[:, None], w, jnp.zeros_like(z)), jnp.where(turns[:, None], v, z)
+        return Frames(H, jnp.stack([w, v], axis=1))
+
+    @traced_once
+    def _bodies(self, frames: Frames) -> tuple[jax.Array, jax.Array]:
+        """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the last with all that the tip carries."""
+        P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
+        tip = jnp.concatenate([self._tip_placement(), jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
+        corner = jnp.asarray(np.diag([0.0, 0.0, 0.0, 1.0]), P.dtype) * self.payload
+        held = spatial.product(spatial.product(tip, self.carried.moments() + corner), tip.T)
+        P = jnp.concatenate([P[:-1], P[-1:] + held])
+        return spatial.moved(frames.placement, P), P[:, 3, 3:]
+
+    @traced_once
+    def _tip_placement(self) -> jax.Array:
+        """[R, p] of the tip in the last link's frame, (3, 4)."""
+        return spatial.placement(spatial.rotation(self.tip_rotation), self.tip_position)
+
+    @traced_once
+    def pose(self, q: jax.Array) -> Pose:
+        """Position and orientation of the tip's frame in the base's."""
+        H = spatial.joined(self._frames(q).placement[-1], self._tip_placement())
+        return Pose(H[:, 3], H[:, :3])
+
+    def tip(self, q: jax.Array) -> jax.Array:
+        """Position of the tip, (3,) [m]."""
+        return self.pose(q).position
+
+    @traced_once
+    def skeleton(self, q: jax.Array) -> jax.Array:
+        """Origins of the joints' frames, then the tip, (n + 1, 3) [m]."""
+        return jnp.concatenate([self._frames(q).placement[:, :, 3], self.tip(q)[None]])
+
+    def jacobian(self, q: jax.Array) -> jax.Array:
+        """D tip / dq, (3, n) [m/rad]: the tip's velocity per unit of joint speed."""
+        return self.twist_jacobian(q)[:3]
+
+    def twist_jacobian(self, q: jax.Array) -> jax.Array:
+        """The tip's velocity (first three rows) and angular velocity (last three) per unit of joint speed, (6, n)."""
+        w, v = jnp.unstack(self._frames(q).allowed, axis=1)
+        return jnp.concatenate([(v + spatial.cross(w, self.tip(q)[None])).T, w.T])
+
+    # ---------------------------------------------------------------------------------------------------------------- dynamics
+
+    @traced_once
+    def mass_matrix(self, q: jax.Array) -> jax.Array:
+        """M(q), (n, n) [kg m^2]."""
+        frames = self._frames(q)
+        composite = spatial.inertia(*map(_outward, self._bodies(frames)))
+        S = frames.allowed
+        upper = jnp.sum(S[:, None] * spatial.momentum(composite, S), axis=(-1, -2))
+        above, diagonal = np.triu(np.ones((self.n, self.n), bool)), np.eye(self.n, dtype=bool)
+        return jnp.where(above, upper, upper.T) + jnp.where(diagonal, self.armature, jnp.zeros_like(upper))
+
+    def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
+        """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
+        frames = self._frames(q)
+        S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
+        V = _moving(S, v)
+        carried = _moving(spatial.along(V, S), u)
+        if u is v:  # the usual case: V x V = 0
+            forces = spatial.momentum(bodies, carried) + spatial.along_wrench(V, spatial.momentum(bodies, V))
+        else:
+            U = _moving(S, u)
+            L = spatial.momentum(bodies, jnp.stack([carried - 0.5 * spatial.along(V, U), U, V]))
+            forces = L[0] + 0.5 * jnp.sum(spatial.along_wrench(jnp.stack([V, U]), L[1:]), axis=0)
+        return _felt(S, forces)
+
+    @traced_once
+    def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the momentum of all beyond it."""
+        frames = self._frames(q)
+        S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
+        V = _moving(S, v)
+        return _felt(spatial.along(V, S), spatial.momentum(bodies, V))
+
+    @traced_once
+    def potential(self, q: jax.Array) -> jax.Array:
+        """U(q) = - g . sum_i m_i c_i, () [J]; zero with all mass at the base's origin."""
+        return -jnp.sum(self.g * self._bodies(self._frames(q))[0][:, :, 3])
+
+    @traced_once
+    def gravity(self, q: jax.Array) -> jax.Array:
+        """G(q), (n,) [N m]."""
+        frames = self._frames(q)
+        upper, mass = self._bodies(frames)
+        weight = jnp.stack([spatial.cross(upper[:, :, 3], self.g), mass * self.g], axis=1)
+        return -_felt(frames.allowed, weight)
+
+    def friction_torque(self, dq: jax.Array) -> jax.Array:
+        """-(damping q' + friction tanh(q' / friction_width)), (n,) [N m]: what the joints themselves put against the motion."""
+        return -(self.damping * dq + self.friction * jnp.tanh(dq / self.friction_width))
+
+
+def _numbered(word: str, n: int) -> tuple[str, ...]:
+    return tuple(f"{word}{i + 1}" for i in range(n))
+
+
+def _inward(rows: jax.Array) -> jax.Array:
+    """Row i: the sum of the rows up to i, (n, ...): what a link has from the joints before it."""
+    return _summed(rows, np.tril)
+
+
+def _outward(rows: jax.Array) -> jax.Array:
+    """Row i: the sum of the rows from i on, (n, ...): what a joint bears of the links beyond it."""
+    return _summed(rows, np.triu)
+
+
+def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
+    n = rows.shape[0]
+    chosen = triangle(np.ones((n, n), bool)).reshape((n, n) + (1,) * (rows.ndim - 1))
+    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1)
+
+
+def _moving(S: jax.Array, speeds: jax.Array) -> jax.Array:
+    """J_i u, the motion of every link when the joints move at `speeds`, (n, 2, 3)."""
+    return _inward(S * speeds[:, None, None])
+
+
+def _felt(S: jax.Array, forces: jax.Array) -> jax.Array:
+    """sum_i J_i^T F_i, (n,): what the joints feel of wrenches on the links."""
+    return jnp.sum(S * _outward(forces), axis=(-1, -2))

@@ -1,0 +1,212 @@
+"""Robots from files: a serial arm picked out of a URDF or MJCF.
+
+The file is read and checked by `description`, `urdf` and `mjcf`; the `mujoco` package (extra `robots`) makes a tree of bodies of what is
+left.  From the tree a chain is picked, from `base` to `tip`: its joints move, every other joint is locked, and each body is welded to the
+link of the chain that carries it.  The arm's world is the frame of the base.
+"""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.core import checks, notices
+from iblf_jax.world.robots import description, mjcf, urdf
+from iblf_jax.world.robots.arm import Arm
+from iblf_jax.world.robots.description import Shown
+from iblf_jax.world.robots.links import quaternion
+from iblf_jax.world.robots.repair import Fault, Repairs
+from iblf_jax.world.robots.tree import Tree
+
+
+def load(
+    path: str | os.PathLike,
+    base: str | None = None,
+    tip: str | None = None,
+    *,
+    locked: Mapping[str, float] | None = None,
+    gravity: Any = None,
+    repair: bool = False,
+) -> Arm:
+    """The serial arm of a URDF or MJCF file.
+
+    Fixed joints are fused; joints that are not between base and tip are locked, and their links' masses and inertias stay, with the link
+    that carries them.  A mesh is opened only where a body of an MJCF takes its weight from it.  What is wrong
+    with links that the chain does not carry, and with joints that do not move in it, does not matter; nor do moments of inertia that are
+    off by rounding, 1e-6 of them or m (1 um)^2.
+
+    With `repair` the rest is mended where a rule says how, with the least change, and listed: with J = V diag(...) V^T an inertia about
+    the centre of mass m,
+
+        S = 1/2 tr(J) 1 - J = V diag(s) V^T,   S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
+
+    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link, where a link that moves would resist its
+    joint with nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and
+    refused else.  A range that is none, and a torque or speed below 0, become no limits; friction below 0 becomes 0; a spring is left
+    out, and so is MuJoCo's compensation of a body's gravity; a joint of the chain that is tied to another (a mimic, a coupling) moves by
+    itself.
+
+    Args:
+      path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.
+      base: name of the link (body) that is held still, and whose frame is the arm's world; the root if not given.
+      tip: name of the link (body, or site of an MJCF) whose frame is the tip; the end of the chain if there is only one.
+      locked: joint name -> position [rad or m] for joints that are not to move; a joint between base and tip may be among them.  Others
+        that are left out are locked at 0 (an MJCF's at `ref`).
+      gravity: (3,) [m/s^2] in the file's world; the file's own, (0, 0, -9.81) if it has none.
+      repair: whether to mend what can be mended; a warning and the arm's `repaired` then say what changed, a line a link or joint.
+
+    Returns:
+      An Arm, with the names of links and joints, limits, damping, friction, armature, efforts and speeds of the file; its `limits`,
+      `effort` and `speed` are infinite where the file has none (an MJCF has no speeds).
+
+    Raises:
+      ValueError: what is wrong with the file or the chain; the message names the element and the remedy.
+      ImportError: the extra `robots` is not installed.
+
+    Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
+    """
+    base, tip = (None if x is None else checks.word(what, x, "the name of a link") for what, x in (("base", base), ("tip", tip)))
+    locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
+    repairs = Repairs(checks.flag("repair", repair))
+    root = description.read(path)
+    picked = _Request(base, tip, dict(locked), gravity, repairs)
+    reader = _from_urdf if root.tag == "robot" else _from_mjcf
+    try:
+        arm = reader(root, path, picked)
+    except ValueError as error:
+        raise description.of_file(path, error) from error
+    if arm.repaired:
+        notices.warn(f"{path}: repaired: " + "; ".join(arm.repaired) + ".")
+    return arm
+
+
+class _Request(NamedTuple):
+    """What the caller wants of a file."""
+
+    base: str | None
+    tip: str | None
+    locked: dict[str, float]
+    gravity: Any
+    repairs: Repairs
+
+
+def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+    """The arm of a URDF whose root element has been read."""
+    file = urdf.checked(root)
+    tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
+    chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
+    return chain.following(file, request.repairs).arm(request.gravity, {}, request.repairs, file.speeds)
+
+
+def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+    """The arm of an MJCF whose root element has been read."""
+    model = mjcf.checked(root, Path(path).parent)
+    tree = Tree.compiled(model.text, str(path), "world", model.taken_out)
+    chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
+    return chain.arm(request.gravity, model.tendons, request.repairs, {})
+
+
+class _Chain(NamedTuple):
+    """What was picked of a tree."""
+
+    tree: Tree
+    base: int
+    tip: int
+    at_tip: tuple[np.ndarray, np.ndarray]
+    """Position and orientation of the tip in the frame of its body."""
+    joints: tuple[int, ...]
+    """Joints that move, from the base on."""
+    held: dict[int, float]
+    """Joints that do not, and where they are."""
+
+    @staticmethod
+    def picked(tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], repairs: Repairs) -> _Chain:
+        """The chain from base to tip."""
+        first = 0 if base is None else tree.body(base, "base")
+        held = {tree.joint(name): locked_position(name, value) for name, value in locked.items()}
+        last, at_tip = tree.frame(tip) if tip is not None else (tree.only_tip(first, held), (np.zeros(3), np.eye(3)))
+        way = tree.way(first, last)
+        if way is None:
+            raise checks.fail("tip", tip, f"a link beyond the base {tree.bodies[first]!r}", "Another base or another tip.")
+        joints = tuple(j for b in way for j in tree.joints_of(b) if j not in held)
+        if not joints:
+            expected = "a chain with a joint that moves"
+            raise checks.fail("tip", tree.bodies[last], expected, f"Between it and {tree.bodies[first]!r} there is none.")
+        for j in joints:
+            tree.check_joint(j, repairs)
+        return _Chain(tree, first, last, at_tip, joints, held)
+
+    def following(self, file: urdf.Urdf, repairs: Repairs) -> _Chain:
+        """The chain with the mimics that are not in it locked where their joints take them, and what is wrong with its joints met."""
+        tree, held = self.tree, dict(self.held)
+        moving = {tree.joint_names[j] for j in self.joints}
+        for name in file.mimics:
+            if name not in moving and tree.joint(name) not in held:
+                held[tree.joint(name)] = self._mimicked(name, file.mimics)
+        for j in (*self.joints, *(j for j, position in held.items() if position)):
+            for fault in (file.axes.get(tree.joint_names[j]), *(file.motions[tree.joint_names[j]] if j in self.joints else ())):
+                if fault:
+                    repairs.meet(fault)
+        for name, mimic in file.mimics.items():
+            if name in moving or mimic.master in moving:
+                coupled = name if name in moving else mimic.master
+                remedy = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
+                error = checks.fail(f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", remedy)
+                repairs.meet(
+                    Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself" if name in moving else "one that is locked")
+                )
+        way = tree.way(0, self.tip) or []
+        for b in range(1, tree.model.nbody):
+            carried = any(j in self.joints for c in tree.way(0, b) or () for j in tree.joints_of(c))
+            if tree.bodies[b] in file.places and (carried or b in way):
+                repairs.meet(file.places[tree.bodies[b]])
+        return self._replace(held=held)
+
+    def _mimicked(self, name: str, mimics: dict[str, urdf.Mimic]) -> float:
+        """Where a joint is that follows others, of which the last is locked."""
+        factor, offset, seen = 1.0, 0.0, {name}
+        at = {self.tree.joint_names[j]: position for j, position in self.held.items()}
+        while name in mimics and name not in at:
+            mimic = mimics[name]
+            offset, factor, name = offset + factor * mimic.offset, factor * mimic.multiplier, mimic.master
+            if name in seen:
+                raise checks.fail(f"joint {name!r}: mimic", Shown("a ring of mimics"), "a joint that leads")
+            seen.add(name)
+        return offset + factor * at.get(name, 0.0)
+
+    def arm(self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs, speeds: Mapping[str, float]) -> Arm:
+        """The Arm, all bodies welded to the links that carry them."""
+        tree = self.tree
+        g = np.asarray(tree.gravity if gravity is None else checks.as_floats("gravity", gravity), float)
+        checks.shape_is("gravity", g, (3,))
+        _, upright = tree.pose(self.base, self.held)
+        joints = tree.of_joints(self.joints)
+        links = tree.welded(self.base, self.joints, self.held, repairs)
+        tree.check_closed(links, self.joints, tendons, repairs)
+        links = links.repaired(joints, repairs)
+        p, R = links.frames[self.tip]
+        tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
+        return Arm(
+            **links.parameters(),
+            **joints,
+            tip_position=tip_p,
+            tip_rotation=quaternion(tip_R),
+            g=upright.T @ g,
+            speed=np.array([speeds.get(name, np.inf) for name in joints["joints"]]),
+            links=links.names,
+            repaired=tuple(repairs.lines),
+        )
+
+
+def locked_position(name: str, value: Any) -> float:
+    """Where a joint is locked [rad or m], checked."""
+    number = checks.as_floats(f"locked[{name!r}]", value)
+    checks.check_values(f"locked[{name!r}]", number, None)
+    if number.shape != ():
+        raise checks.fail(f"locked[{name!r}]", value, "one number")
+    return float(number)

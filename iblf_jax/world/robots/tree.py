@@ -1,0 +1,313 @@
+"""The tree of bodies that `mujoco` makes of a file, and what is read from it.
+
+Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.world.robots.description import Shown
+from iblf_jax.world.robots.links import Links, Pose
+from iblf_jax.world.robots.mjcf import Tendons
+from iblf_jax.world.robots.repair import Fault, Repairs, Weight, second_moments
+
+FREE, BALL, SLIDE, HINGE = range(4)
+CONNECT, WELD, COUPLED = range(3)
+JOINT, FIXED, NO_BIAS = 0, 0, 0
+"""The library's numbers for kinds of joints, of constraints, and of an actuator's transmission, gain and bias."""
+
+
+def mujoco_package() -> Any:
+    """The package, where it is installed."""
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ImportError('This needs the mujoco package: pip install mujoco, or ".[robots]" in a clone.') from error
+    return mujoco
+
+
+class Tree:
+    """A compiled model, by names."""
+
+    def __init__(self, model: Any, mujoco: Any, root: str, weights: dict[int, Weight]):
+        self.model = model
+        self.weights = weights
+        """Body -> what it weighs in its inertial frame, where that is not the model's number."""
+        names = lambda kind, count: [mujoco.mj_id2name(model, kind, i) for i in range(count)]  # noqa: E731
+        objects = mujoco.mjtObj
+        self.bodies = [name or f"body{i}" for i, name in enumerate(names(objects.mjOBJ_BODY, model.nbody))]
+        self.bodies[0] = root
+        self.joint_names = [
+            name or f"{self.bodies[model.jnt_bodyid[j]]}_joint" for j, name in enumerate(names(objects.mjOBJ_JOINT, model.njnt))
+        ]
+        self.sites = names(objects.mjOBJ_SITE, model.nsite)
+        self.equalities = names(objects.mjOBJ_EQUALITY, model.neq)
+        self.site_type = objects.mjOBJ_SITE
+        weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        self.gravity = np.zeros(3) if weightless else np.array(model.opt.gravity)
+
+    @staticmethod
+    def compiled(text: str, path: str, root: str, taken_out: Callable[[Any], list[tuple[Any, Weight]]]) -> Tree:
+        """The tree of a checked description.
+
+        Args:
+          text: the description.
+          path: its file, for messages.
+          root: name of the body that the library calls the world.
+          taken_out: from the library's specification, before it is compiled, bodies whose weights are not the library's business.
+
+        Raises:
+          ValueError: what the library does not accept, in its words.
+          ImportError: it is not installed.
+        """
+        mujoco = mujoco_package()
+        try:
+            spec = mujoco.MjSpec.from_string(text)
+            spec.compiler.fusestatic = False
+            weights = taken_out(spec)
+            model = spec.compile()
+        except ValueError as error:
+            words = " ".join(str(error).split())
+            raise ValueError(f"{path}: {words}") from None
+        return Tree(model, mujoco, root, {body.id: weight for body, weight in weights})
+
+    # ---------------------------------------------------------------------------------------------------------------- by name
+
+    def body(self, name: str, what: str) -> int:
+        """The body of a name."""
+        if name in self.bodies:
+            return self.bodies.index(name)
+        raise unknown(what, name, "the name of a link", self.bodies)
+
+    def joint(self, name: str) -> int:
+        """The joint of a name."""
+        if name in self.joint_names:
+            return self.joint_names.index(name)
+        raise unknown("locked", name, "names of joints", self.joint_names)
+
+    def frame(self, name: str) -> tuple[int, Pose]:
+        """The body of a body or site, and its pose in the body's frame."""
+        if name in self.sites and name not in self.bodies:
+            i = self.sites.index(name)
+            return int(self.model.site_bodyid[i]), (np.array(self.model.site_pos[i]), matrix(self.model.site_quat[i]))
+        if name in self.bodies:
+            return self.bodies.index(name), (np.zeros(3), np.eye(3))
+        raise unknown("tip", name, "the name of a link or site", [*self.bodies, *filter(None, self.sites)])
+
+    # ---------------------------------------------------------------------------------------------------------------- structure
+
+    def joints_of(self, body: int) -> range:
+        """The joints that move a body against its parent, in their order."""
+        start = int(self.model.body_jntadr[body])
+        return range(start, start + int(self.model.body_jntnum[body]))
+
+    def way(self, first: int, last: int) -> list[int] | None:
+        """The bodies after `first` up to `last`; None if `last` does not hang on it."""
+        way = []
+        while last != first:
+            if last == 0:
+                return None
+            way.append(last)
+            last = int(self.model.body_parentid[last])
+        return way[::-1]
+
+    def only_tip(self, first: int, held: dict[int, float]) -> int:
+        """The body at the end of the only chain that moves, beyond `first`.
+
+        The end is the last body there if the links do not branch behind the last joint, else the link that this joint moves.
+        """
+        m = self.model
+        beyond = [b for b in range(m.nbody) if b == first or self.way(first, b) is not None]
+        moved = [b for b in beyond if b != first and any(j not in held for j in self.joints_of(b))]
+        ends = [b for b in moved if not any(b != c and self.way(b, c) is not None for c in moved)]
+        if len(ends) != 1:
+            found = ", ".join(repr(self.bodies[b]) for b in ends[:8]) or "none"
+            expected = "the name of a link: the chain must have one end"
+            raise checks.fail("tip", None, expected, f"Chains beyond {self.bodies[first]!r} end at: {found}.")
+        parents = {int(m.body_parentid[b]) for b in beyond if b}
+        leaves = [b for b in beyond if b not in parents and (b == ends[0] or self.way(ends[0], b) is not None)]
+        return leaves[0] if len(leaves) == 1 else ends[0]
+
+    def check_joint(self, j: int, repairs: Repairs) -> None:
+        """Meets what an Arm's joint cannot have."""
+        m, name = self.model, self.joint_names[j]
+        if m.jnt_type[j] not in (HINGE, SLIDE):
+            kind = "free" if m.jnt_type[j] == FREE else "ball"
+            remedy = "Take a base beyond it." if kind == "free" else "Write it as three hinges."
+            raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), "a hinge or slide between base and tip", remedy)
+        stiffness = float(m.jnt_stiffness[j])
+        if stiffness:
+            where = f"joint {name!r}: stiffness"
+            error = checks.fail(where, stiffness, "0: springs are not modelled", "Remove it.")
+            repairs.meet(Fault(where, str(stiffness), error, "0: the spring is left out"))
+
+    # ----------------------------------------------------------------------------------------------------------------- geometry
+
+    def placed(self, body: int) -> Pose:
+        """Pose of a body in its parent's frame, its joints at their reference."""
+        return np.array(self.model.body_pos[body]), matrix(self.model.body_quat[body])
+
+    def _held(self, pose: Pose, j: int, held: dict[int, float]) -> Pose:
+        """`pose` of a body after its joint j, which is locked."""
+        m = self.model
+        if m.jnt_type[j] not in (HINGE, SLIDE):
+            return pose
+        reference = float(m.qpos0[m.jnt_qposadr[j]])
+        move, axis = held.get(j, reference) - reference, np.array(m.jnt_axis[j])
+        if m.jnt_type[j] == SLIDE:
+            return joined(pose, (axis * move, np.eye(3)))
+        anchor, R = np.array(m.jnt_pos[j]), turn(axis, move)
+        return joined(pose, (anchor - R @ anchor, R))
+
+    def pose(self, body: int, held: dict[int, float]) -> Pose:
+        """Pose of a body in the world, every joint locked."""
+        pose: Pose = (np.zeros(3), np.eye(3))
+        for b in self.way(0, body) or ():
+            pose = joined(pose, self.placed(b))
+            for j in self.joints_of(b):
+                pose = self._held(pose, j, held)
+        return pose
+
+    def welded(self, base: int, joints: tuple[int, ...], held: dict[int, float], repairs: Repairs) -> Links:
+        """The links that `joints` move, and each body beyond the base with the link that carries it."""
+        m, origin = self.model, (np.zeros(3), np.eye(3))
+        names, position, rotation, between = [], [], [], []
+        frames: dict[int, Pose] = {base: origin}
+        carrier: dict[int, int] = {base: -1}
+        for b in range(m.nbody):
+            parent = int(m.body_parentid[b])
+            if b == base or parent not in frames or (b == 0):
+                continue
+            link, pose = carrier[parent], joined(frames[parent], self.placed(b))
+            own = [j for j in self.joints_of(b) if j in joints]
+            for j in self.joints_of(b):
+                if j not in joints:
+                    pose = self._held(pose, j, held)
+                    continue
+                anchor, axis, reference = np.array(m.jnt_pos[j]), np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
+                p, R = joined(pose, (anchor, np.eye(3)))
+                hinge = m.jnt_type[j] == HINGE
+                position.append(p if hinge else p - R @ axis * reference)
+                rotation.append(R @ turn(axis, -reference) if hinge else R)
+                between.append(j != own[-1])
+                names.append(self.bodies[b] if j == own[-1] else f"{self.bodies[b]}:{self.joint_names[j]}")
+                link, pose = len(names) - 1, (-anchor, np.eye(3))
+            frames[b], carrier[b] = pose, link
+        moments = np.zeros((len(names), 4, 4))
+        for b, link in carrier.items():
+            if link >= 0:
+                moments[link] += self._moments(b, frames[b], repairs)
+        return Links(tuple(names), np.array(position), np.array(rotation), moments, tuple(between), frames, carrier)
+
+    def _moments(self, body: int, pose: Pose, repairs: Repairs) -> np.ndarray:
+        """Pseudo-inertia of one body in the frame in which its pose is given."""
+        m = self.model
+        p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
+        own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
+        mass, inertia, *_ = own.repaired(repairs)
+        compensated = float(m.body_gravcomp[body])
+        if compensated and mass:
+            where, expected = f"body {self.bodies[body]!r}: gravcomp", "0: compensation of gravity is not modelled, it is the law's to do"
+            error = checks.fail(where, compensated, expected, "Remove it.")
+            repairs.meet(Fault(where, str(compensated), error, "0: gravity acts on it"))
+        second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
+        return np.block([[second, mass * p[:, None]], [mass * p[None, :], np.array([[mass]])]])
+
+    def of_joints(self, joints: tuple[int, ...]) -> dict[str, Any]:
+        """The fields of an Arm that its joints have."""
+        m, at = self.model, list(joints)
+        dofs = m.jnt_dofadr[at]
+        limited, driven = m.jnt_limited[at].astype(bool), m.jnt_actfrclimited[at].astype(bool)
+        effort = np.where(driven, np.min(np.abs(m.jnt_actfrcrange[at]), axis=1), np.inf)
+        effort = np.minimum(effort, [self._actuators(j) for j in joints])
+        return {
+            "axis": np.array(m.jnt_axis[at]),
+            "armature": np.array(m.dof_armature[dofs]),
+            "damping": np.array(m.dof_damping[dofs]),
+            "friction": np.array(m.dof_frictionloss[dofs]),
+            "lower": np.where(limited, m.jnt_range[at, 0], -np.inf),
+            "upper": np.where(limited, m.jnt_range[at, 1], np.inf),
+            "effort": np.where(effort > 0, effort, np.inf),
+            "kinds": tuple("revolute" if m.jnt_type[j] == HINGE else "prismatic" for j in joints),
+            "joints": tuple(self.joint_names[j] for j in joints),
+        }
+
+    def _actuators(self, j: int) -> float:
+        """The largest torque (force) that the actuators of a joint give together; infinite if one has no limit or there are none."""
+        m, total = self.model, 0.0
+        on_it = [a for a in range(m.nu) if m.actuator_trntype[a] == JOINT and m.actuator_trnid[a, 0] == j]
+        for a in on_it:
+            limit = float(np.min(np.abs(m.actuator_forcerange[a]))) if m.actuator_forcelimited[a] else np.inf
+            if m.actuator_ctrllimited[a] and m.actuator_gaintype[a] == FIXED and m.actuator_biastype[a] == NO_BIAS:
+                limit = min(limit, float(np.min(np.abs(m.actuator_ctrlrange[a])) * abs(m.actuator_gainprm[a, 0])))
+            total += limit * abs(float(m.actuator_gear[a, 0]))
+        return total if on_it else np.inf
+
+    def check_closed(self, links: Links, joints: tuple[int, ...], tendons: Tendons, repairs: Repairs) -> None:
+        """Meets constraints that tie bodies of different links together, or a joint of the chain to another.
+
+        Args:
+          links, joints: the chain.
+          tendons: constraints on tendons, label -> (joints, sites).
+          repairs: meets a coupled joint; a closed chain is refused.
+        """
+        m = self.model
+        for e in range(m.neq):
+            first, second = int(m.eq_obj1id[e]), int(m.eq_obj2id[e])
+            if not m.eq_active0[e]:
+                continue
+            where = f"equality {self.equalities[e] or f'number {e}'!r}"
+            if m.eq_type[e] == COUPLED:
+                self._meet_coupling(where, {first, second} & set(joints), repairs)
+            if m.eq_type[e] in (CONNECT, WELD):
+                bodies = [int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x for x in (first, second)]
+                self._meet_tie(where, bodies, links, repairs)
+        for where, (named, sites) in tendons.items():
+            self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
+            self._meet_tie(where, [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites], links, repairs)
+
+    def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
+        for j in sorted(coupled):
+            name = self.joint_names[j]
+            remedy = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
+            error = checks.fail(where, Shown(f"joint {name!r} tied to another"), "joints that move by themselves", remedy)
+            repairs.meet(Fault(f"joint {name!r}", f"one tied to another by {where}", error, "one that moves by itself"))
+
+    def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
+        """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its links closes the chain."""
+        if len({links.carrier.get(b, -1) for b in bodies}) > 1:
+            tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
+            remedy = "A closed chain has no serial one: cut it open, or lock its joints."
+            to = "no tie: a motion-capture body is no link" if any(self.model.body_mocapid[b] >= 0 for b in bodies) else ""
+            repairs.meet(Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", remedy), to))
+
+
+def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
+    """An error with the names that are near, or all of them."""
+    near = difflib.get_close_matches(str(name), known, n=3) or known[:12]
+    return checks.fail(what, name, expected, f"There are {', '.join(map(repr, near))}{' ...' if len(known) > 12 else ''}.")
+
+
+def matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a quaternion (w, x, y, z) of length one."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+
+
+def turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation about a unit axis."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(angle * axis).as_matrix()
+
+
+def joined(outer: Pose, inner: Pose) -> Pose:
+    """The pose of what is at `inner` in a frame at `outer`."""
+    return outer[0] + outer[1] @ inner[0], outer[1] @ inner[1]

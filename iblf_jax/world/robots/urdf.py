@@ -1,0 +1,285 @@
+"""The check of a URDF, element by element, and the part of it that says how links move and what they weigh.
+
+The copy that goes on holds links and joints; each number has been looked at.  What links weigh, what is wrong with a link or joint, and
+mimic joints go apart: whether they matter is known when the chain is.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.world.robots.description import FARTHEST, MOST_BODIES, Shown, floats, label
+from iblf_jax.world.robots.repair import Fault, Weight, judged
+
+MOVING = ("revolute", "continuous", "prismatic")
+INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+ZERO = [0.0, 0.0, 0.0]
+
+
+class Mimic(NamedTuple):
+    """A joint that follows another: q = multiplier * q_master + offset."""
+
+    master: str
+    multiplier: float
+    offset: float
+
+    @property
+    def shown(self) -> str:
+        """How it is called in messages."""
+        return f"a mimic of {self.master!r} in the chain"
+
+
+class Urdf(NamedTuple):
+    """What a URDF holds, checked."""
+
+    text: str
+    """The copy."""
+    root: str
+    """Name of the link that no joint moves."""
+    mimics: dict[str, Mimic]
+    weights: dict[str, Weight]
+    """Link -> what it weighs, about the centre that the copy has and along the link's axes."""
+    places: dict[str, Fault]
+    """Link -> what is wrong with where it is: matters for each link that hangs on the base."""
+    axes: dict[str, Fault]
+    """Joint -> what is wrong with its kind or axis: matters where it moves, or is locked away from 0."""
+    motions: dict[str, list[Fault]]
+    """Joint -> what is wrong with its range, torque, speed or friction: matters where it moves."""
+    speeds: dict[str, float]
+    """Joint -> its largest speed, which the library does not keep; none for one without."""
+
+    def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
+        """The library's bodies with their weights: it gets none of them, as it would refuse what may not matter."""
+        return [(body, self.weights[body.name]) for body in spec.bodies if body.name in self.weights]
+
+
+def checked(robot: ET.Element) -> Urdf:
+    """The copy of a URDF.
+
+    Raises:
+      ValueError: what is wrong, with the name of the link or joint.
+    """
+    links = _by_name(robot, "link")
+    joints = _by_name(robot, "joint")
+    if not links:
+        raise checks.fail("robot", Shown("no <link>"), "a URDF with links and joints")
+    if len(links) > MOST_BODIES:
+        raise checks.fail("robot", Shown(f"{len(links)} links"), f"at most {MOST_BODIES}")
+    parent_of = {_end(joint, "child", links): (_end(joint, "parent", links), name) for name, joint in reversed(joints.items())}
+    _is_tree(links, joints, parent_of)
+    root = next(name for name in links if name not in parent_of)
+    found = Urdf("", root, {}, {}, {}, {}, {}, {})
+    copy = ET.Element("robot", name="robot")
+    for name, link in links.items():
+        found.weights[name], centre = _weight(link)
+        inertial = ET.SubElement(ET.SubElement(copy, "link", name=name), "inertial")
+        ET.SubElement(inertial, "origin", xyz=_words(centre))
+        ET.SubElement(inertial, "mass", value="1")
+        ET.SubElement(inertial, "inertia", dict(zip(INERTIA, "111000", strict=True)))
+    for joint in joints.values():
+        copy.append(_joint(joint, found))
+    for name, mimic in found.mimics.items():
+        if mimic.master not in joints:
+            error = checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
+            found.motions[name].append(Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself"))
+    return found._replace(text=ET.tostring(copy, encoding="unicode"))
+
+
+def _by_name(robot: ET.Element, tag: str) -> dict[str, ET.Element]:
+    found: dict[str, ET.Element] = {}
+    for element in robot.findall(tag):
+        name = element.get("name", "")
+        if not name.strip():
+            raise checks.fail(f"<{tag}>", Shown("one without a name"), "a name for each")
+        if name in found:
+            raise checks.fail(f"{tag} {name!r}", Shown("two of this name"), "names that differ")
+        found[name] = element
+    return found
+
+
+def _end(joint: ET.Element, which: str, links: dict[str, ET.Element]) -> str:
+    ends = joint.findall(which)
+    if len(ends) != 1 or ends[0].get("link") not in links:
+        got = ends[0].get("link") if len(ends) == 1 else Shown(f"{len(ends)} of them")
+        raise checks.fail(f"{label(joint)}: {which}", got, "the name of one link of this file")
+    return str(ends[0].get("link"))
+
+
+def _is_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element], parent_of: dict[str, tuple[str, str]]) -> None:
+    """Raises where a link has two parents, or none of the links is the root of all."""
+    seen: dict[str, str] = {}
+    for name, joint in joints.items():
+        child = _end(joint, "child", links)
+        if child in seen:
+            remedy = "A closed chain has no serial one: cut it open at a joint."
+            raise checks.fail(f"link {child!r}", Shown(f"two parents, by joints {seen[child]!r} and {name!r}"), "one parent", remedy)
+        seen[child] = name
+    roots = [name for name in links if name not in parent_of]
+    if len(roots) > 1:
+        raise checks.fail(
+            "robot", Shown(f"links without a parent: {', '.join(map(repr, roots[:5]))}"), "one root", "Connect them by joints."
+        )
+    reached = set(roots)
+    children: dict[str, list[str]] = {}
+    for child, (parent, _) in parent_of.items():
+        children.setdefault(parent, []).append(child)
+    frontier = list(roots)
+    while frontier:
+        below = [child for parent in frontier for child in children.get(parent, ())]
+        reached.update(below)
+        frontier = below
+    if len(reached) < len(links):
+        lost = next(name for name in links if name not in reached)
+        raise checks.fail(
+            f"link {lost!r}", Shown("a ring of joints"), "links that hang on one root", "A closed chain: cut it open at a joint."
+        )
+
+
+def _one(parent: ET.Element, tag: str) -> ET.Element | None:
+    found = parent.findall(tag)
+    if len(found) > 1:
+        raise checks.fail(f"{label(parent)}: <{tag}>", Shown(f"{len(found)} of them"), "one at most")
+    return found[0] if found else None
+
+
+def _origin(parent: ET.Element, where: str) -> tuple[list[float], list[float]]:
+    """Position and roll, pitch, yaw of an element's <origin>."""
+    origin = _one(parent, "origin")
+    xyz, rpy = (
+        floats(f"{where}: origin {name}", origin.get(name, "0 0 0") if origin is not None else "0 0 0", 3) for name in ("xyz", "rpy")
+    )
+    return xyz, rpy
+
+
+def _weight(link: ET.Element) -> tuple[Weight, list[float]]:
+    """What a link weighs, and its centre."""
+    where = label(link)
+    try:
+        inertial = _one(link, "inertial")
+        return (Weight(), ZERO) if inertial is None else _inertial(where, inertial)
+    except ValueError as error:
+        return Weight(fault=Fault(where, "", error)), ZERO
+
+
+def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
+    from scipy.spatial.transform import Rotation
+
+    mass, inertia = _one(inertial, "mass"), _one(inertial, "inertia")
+    if mass is None:
+        raise checks.fail(f"{where}: inertial", Shown("no <mass>"), "a mass [kg]")
+    (kg,) = floats(f"{where}: mass", mass.get("value", ""), 1)
+    centre, rpy = _origin(inertial, f"{where}: inertial")
+    if inertia is None:
+        if kg <= 0:
+            return judged(where, kg, np.zeros((3, 3))), centre
+        error = checks.fail(f"{where}: inertial", Shown("no <inertia>"), "an inertia [kg m^2]")
+        return Weight(kg, fault=Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")), centre
+    numbers = (floats(f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1)[0] for name in INERTIA)
+    xx, yy, zz, xy, xz, yz = numbers
+    R = Rotation.from_euler("xyz", rpy).as_matrix()  # about fixed axes, one after the other
+    return judged(where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T), centre
+
+
+def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
+    """The copy of a joint, with something harmless in the place of what is wrong with it."""
+    where, name, kind = label(joint), str(joint.get("name")), joint.get("type", "")
+    parent, child = (str(joint.findall(which)[0].get("link")) for which in ("parent", "child"))
+    copy = ET.Element("joint", name=name, type="fixed" if kind == "fixed" else "prismatic" if kind == "prismatic" else "continuous")
+    xyz, rpy = ZERO, ZERO
+    try:
+        xyz, rpy = _origin(joint, where)
+    except ValueError as error:
+        found.places[child] = Fault(where, "", error)
+    ET.SubElement(copy, "origin", xyz=_words(xyz), rpy=_words(rpy))
+    ET.SubElement(copy, "parent", link=parent)
+    ET.SubElement(copy, "child", link=child)
+    if kind == "fixed":
+        return copy
+    axis = [1.0, 0.0, 0.0]
+    try:
+        axis = _axis(joint, where, kind)
+    except ValueError as error:
+        found.axes[name] = Fault(where, "", error)
+    ET.SubElement(copy, "axis", xyz=_words(axis))
+    faults = found.motions[name] = []
+    for read in (_limit, _dynamics):
+        try:
+            faults += read(joint, where, copy, found)
+        except ValueError as error:
+            faults.append(Fault(where, "", error))
+    try:
+        _mimic(joint, where, found)
+    except ValueError as error:
+        faults.append(Fault(where, "", error))
+    return copy
+
+
+def _words(numbers: list[float]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
+    if kind not in MOVING:
+        remedy = "Floating and planar joints are not part of a serial arm." if kind in ("floating", "planar") else ""
+        raise checks.fail(f"{where}: type", kind, "revolute, continuous, prismatic or fixed", remedy)
+    axis = _one(joint, "axis")
+    direction = floats(f"{where}: axis", axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3)
+    if not np.linalg.norm(direction) > 1e-6:
+        raise checks.fail(f"{where}: axis", direction, "a direction")
+    return direction
+
+
+def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list[Fault]:
+    """Range and largest torque of a joint, into the copy, and its largest speed; what cannot be, and is left out there."""
+    limit, endless, faults = _one(joint, "limit"), joint.get("type") == "continuous", []
+    if limit is None:
+        if endless:
+            return []
+        remedy = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
+        error = checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", remedy)
+        return [Fault(f"{where}: limit", "nothing", error, "no limits")]
+    names = ("effort", "velocity") if endless else ("lower", "upper", "effort", "velocity")
+    values = {name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0] for name in names}
+    if not endless and not values["lower"] < values["upper"]:
+        got = (values.pop("lower"), values.pop("upper"))
+        faults.append(Fault(f"{where}: limit", str(got), checks.fail(f"{where}: limit", got, "lower < upper"), "no limits"))
+    if values["effort"] < 0:
+        torque = values.pop("effort")
+        faults.append(Fault(f"{where}: effort", str(torque), checks.fail(f"{where}: effort", torque, "a number >= 0"), "no limit"))
+    speed = values.pop("velocity")
+    if speed > 0:
+        found.speeds[str(joint.get("name"))] = speed
+    elif speed < 0:
+        faults.append(Fault(f"{where}: velocity", str(speed), checks.fail(f"{where}: velocity", speed, "a number >= 0"), "no limit"))
+    if "lower" in values and copy.get("type") == "continuous":
+        copy.set("type", "revolute")
+    ET.SubElement(copy, "limit", {name: repr(value) for name, value in values.items()})
+    return faults
+
+
+def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[Fault]:
+    """Damping and friction of a joint, into the copy."""
+    dynamics, faults = _one(joint, "dynamics"), []
+    if dynamics is None:
+        return []
+    found = {name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1, most=FARTHEST)[0] for name in ("damping", "friction")}
+    for name, value in found.items():
+        if value < 0:
+            error = checks.fail(f"{where}: {name}", value, "a number >= 0")
+            faults.append(Fault(f"{where}: {name}", str(value), error, "0"))
+    ET.SubElement(copy, "dynamics", {name: repr(max(value, 0.0)) for name, value in found.items()})
+    return faults
+
+
+def _mimic(joint: ET.Element, where: str, found: Urdf) -> None:
+    mimic = _one(joint, "mimic")
+    if mimic is None:
+        return
+    (multiplier,), (offset,) = (
+        floats(f"{where}: mimic {name}", mimic.get(name, default), 1) for name, default in (("multiplier", "1"), ("offset", "0"))
+    )
+    found.mimics[str(joint.get("name"))] = Mimic(mimic.get("joint", ""), multiplier, offset)
