@@ -1,7 +1,7 @@
 """How the benchmarks measure: compile and run apart, results blocked on, one table, one JSON file.
 
-Machines are shared and noisy, so rows are compared within one run of a benchmark: every timed thing is repeated in turn
-(`interleaved`) and the smallest time of each is kept.
+Machines are shared and noisy, so rows are compared within one run of a benchmark: every timed thing
+is repeated in turn (`interleaved`) and the smallest time of each is kept.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ def once(call: Callable[[], Any]) -> float:
 
 
 def in_turn(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, tuple[float, float]]:
-    """The smallest wall and processor seconds of each call, taken in turn so that a slow moment of the machine meets all of them."""
+    """The smallest wall and processor seconds of each call, taken in turn so that a slow moment of
+    the machine meets all of them.
+    """
     best = dict.fromkeys(calls, (float("inf"), float("inf")))
     for _ in range(repeats):
         for name, call in calls.items():
@@ -42,7 +44,9 @@ def interleaved(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[st
 
 
 def compile_seconds(function: Callable, *args: Any) -> tuple[float, Callable]:
-    """Seconds to trace and compile `jax.jit(function)` for these arguments, and the compiled function."""
+    """Seconds to trace and compile `jax.jit(function)` for these arguments, and the compiled
+    function.
+    """
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     return time.perf_counter() - start, compiled
@@ -54,7 +58,11 @@ def machine() -> dict[str, str]:
 
     from iblf_jax.core.cache import processor
 
-    models = {line.partition(":")[2].strip() for line in processor().splitlines() if line.startswith("model name")}
+    models = {
+        line.partition(":")[2].strip()
+        for line in processor().splitlines()
+        if line.startswith("model name")
+    }
     return {
         "date": time.strftime("%Y-%m-%d"),
         "processor": ", ".join(models) or platform.processor() or platform.machine(),
@@ -65,16 +73,24 @@ def machine() -> dict[str, str]:
     }
 
 
-def report(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], json_path: str | None) -> None:
+def report(
+    title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], json_path: str | None
+) -> None:
     """Prints one table and, if asked, writes it as JSON."""
     shown = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row] for row in rows]
     widths = [max(len(line[i]) for line in [list(columns), *shown]) for i in range(len(columns))]
     print(title)
     for line in [list(columns), *shown]:
-        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+        print(
+            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        )
     if json_path:
         table = [dict(zip(columns, row, strict=True)) for row in rows]
-        words = [word for word in sys.argv[1:] if word not in ("--json", json_path, f"--json={json_path}")]
+        words = [
+            word
+            for word in sys.argv[1:]
+            if word not in ("--json", json_path, f"--json={json_path}")
+        ]
         command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])
         found = {"title": title, "command": command, "machine": machine(), "rows": table}
         Path(json_path).write_text(json.dumps(found, indent=1) + "\n")

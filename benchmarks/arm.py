@@ -1,11 +1,15 @@
-"""An arm of seven joints beside what a user would take instead: steps per second of many runs, RK4 at 1 ms, in one run of the benchmark.
+"""An arm of seven joints beside what a user would take instead: steps per second of many runs, RK4
+at 1 ms, in one run of the benchmark.
 
     python benchmarks/arm.py [--quick] [--json FILE] [--runs 4096] [--steps 200]
 
-Rows: `native` on the closed loop of `presets.iiwa14` (with its load), the state alone and with the standard metrics; the same loop in
-C++ on Pinocchio (`peers/arm_loop.cc`; needs the wheel `pin`, and Eigen); MuJoCo's own `rollout` and MJX on the bare plant, which is less
-than half of the work.  `of the limit` is the part of what the operations of the step would take at two vector instructions a cycle on
-every core (`ij.explain`).  `q differs` is from this package's run, after as many steps.  A row that needs what is not there is left out.
+Rows: `native` on the closed loop of `presets.iiwa14` (with its load), the state alone and with the
+  standard metrics; the same loop in
+C++ on Pinocchio (`peers/arm_loop.cc`; needs the wheel `pin`, and Eigen); MuJoCo's own `rollout` and
+MJX on the bare plant, which is less than half of the work.  `of the limit` is the part of what the
+operations of the step would take at two vector instructions a cycle on every core (`ij.explain`).
+`q differs` is from this package's run, after as many steps.  A row that needs what is not there is
+left out.
 """
 
 from __future__ import annotations
@@ -43,22 +47,39 @@ SIDES = (("reference", ""), ("bounds", "lower"), ("bounds", "upper"))
 
 def starts(scenario, runs: int) -> np.ndarray:
     """One a run, near the scenario's."""
-    return np.asarray(scenario.initial.q) + 0.01 * np.random.default_rng(0).standard_normal((runs, scenario.n))
+    return np.asarray(scenario.initial.q) + 0.01 * np.random.default_rng(0).standard_normal(
+        (runs, scenario.n)
+    )
 
 
 def native(dtype: str, metrics, runs: int, steps: int, method: str) -> tuple[float, float, float]:
     """Seconds to compile, and wall and processor seconds of a batch."""
     scenario = canonical(ij.astype(ij.presets.iiwa14(), dtype))
-    folds, run = as_folds(metrics, dtype, scenario), Run(steps, method, mechanism=mechanism_of(scenario))
+    folds, run = (
+        as_folds(metrics, dtype, scenario),
+        Run(steps, method, mechanism=mechanism_of(scenario)),
+    )
     values, dt = {"initial.q": jnp.asarray(starts(scenario, runs), dtype)}, jnp.asarray(DT, dtype)
-    seconds, call = compile_seconds(lambda v, dt: run_batch(scenario, v, folds, dt, run, backend="native"), values, dt)
+    seconds, call = compile_seconds(
+        lambda v, dt: run_batch(scenario, v, folds, dt, run, backend="native"), values, dt
+    )
     return seconds, *measured(lambda: call(values, dt), 3)
 
 
 def links(robot) -> np.ndarray:
     """Rows of `peers/arm_loop.cc`, one a link."""
-    rotation = Rotation.from_quat(np.asarray(robot.rotation), scalar_first=True).as_matrix().reshape(-1, 9)
-    parts = (robot.mass[:, None], robot.centre, robot.inertia, rotation, robot.position, robot.axis, robot.armature[:, None])
+    rotation = (
+        Rotation.from_quat(np.asarray(robot.rotation), scalar_first=True).as_matrix().reshape(-1, 9)
+    )
+    parts = (
+        robot.mass[:, None],
+        robot.centre,
+        robot.inertia,
+        rotation,
+        robot.position,
+        robot.axis,
+        robot.armature[:, None],
+    )
     return np.ascontiguousarray(np.concatenate([np.asarray(x, float) for x in parts], axis=1))
 
 
@@ -67,36 +88,80 @@ def pinocchio_flags() -> list[str] | None:
     if importlib.util.find_spec("pinocchio") is None:
         return None
     prefix = Path(importlib.util.find_spec("pinocchio").origin).parents[4]
-    found = subprocess.run(["pkg-config", "--cflags", "eigen3"], capture_output=True, text=True, check=False)
+    found = subprocess.run(
+        ["pkg-config", "--cflags", "eigen3"], capture_output=True, text=True, check=False
+    )
     eigen = found.stdout.split() if found.returncode == 0 else ["-I/usr/include/eigen3"]
     # Boost's lists hold twenty types unless they are told; Pinocchio has more joints.
     boost = ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
-    return [*boost, *eigen, f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib", "-lpinocchio_default"]
+    return [
+        *boost,
+        *eigen,
+        f"-I{prefix}/include",
+        f"-L{prefix}/lib",
+        f"-Wl,-rpath,{prefix}/lib",
+        "-lpinocchio_default",
+    ]
 
 
 def with_pinocchio(runs: int, steps: int) -> tuple[float, float, float, float]:
-    """Seconds of a batch (compiling is not counted), and how far its positions are from this package's."""
+    """Seconds of a batch (compiling is not counted), and how far its positions are from this
+    package's.
+    """
     scenario = canonical(ij.presets.iiwa14())
     n, law = scenario.n, scenario.controller.law
-    tube = [getattr(scenario, part) if not side else getattr(getattr(scenario, part), side) for part, side in SIDES]
-    waves = [getattr(wave, name) for wave in (*tube, scenario.disturbance) for name in ("offset", "amplitude", "frequency", "phase")]
+    tube = [
+        getattr(scenario, part) if not side else getattr(getattr(scenario, part), side)
+        for part, side in SIDES
+    ]
+    waves = [
+        getattr(wave, name)
+        for wave in (*tube, scenario.disturbance)
+        for name in ("offset", "amplitude", "frequency", "phase")
+    ]
     rows = [law.k1, law.K2, law.o, scenario.observer.kf, scenario.controller.limit, *waves]
-    rows = np.ascontiguousarray(np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in rows]))
-    tip = np.concatenate([np.asarray(scenario.plant.tip_position, float), np.asarray(scenario.plant.g, float)])
+    rows = np.ascontiguousarray(
+        np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in rows])
+    )
+    tip = np.concatenate(
+        [np.asarray(scenario.plant.tip_position, float), np.asarray(scenario.plant.g, float)]
+    )
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "arm_loop.so"
         text = Path(__file__).parent / "peers" / "arm_loop.cc"
-        options = ["-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-w", "-fPIC", "-shared", "-pthread"]
-        subprocess.run([*toolchain.compiler(), *options, str(text), *pinocchio_flags(), "-o", str(library)], check=True)
+        options = [
+            "-std=c++17",
+            "-O3",
+            "-march=native",
+            "-DNDEBUG",
+            "-w",
+            "-fPIC",
+            "-shared",
+            "-pthread",
+        ]
+        subprocess.run(
+            [*toolchain.compiler(), *options, str(text), *pinocchio_flags(), "-o", str(library)],
+            check=True,
+        )
         loop = ctypes.CDLL(str(library)).arm_loop
 
     def run() -> np.ndarray:
         states = np.zeros((runs, 3 * n))
         states[:, :n] = starts(scenario, runs)
-        arrays = [x.ctypes.data_as(ctypes.c_void_p) for x in (links(scenario.plant), tip, rows, states)]
+        arrays = [
+            x.ctypes.data_as(ctypes.c_void_p) for x in (links(scenario.plant), tip, rows, states)
+        ]
         counts = [ctypes.c_long(x) for x in (runs, steps)]
         load = ctypes.c_double(float(scenario.plant.payload))
-        loop(ctypes.c_int(n), *arrays[:2], load, *arrays[2:], *counts, ctypes.c_double(DT), ctypes.c_long(toolchain.threads()))
+        loop(
+            ctypes.c_int(n),
+            *arrays[:2],
+            load,
+            *arrays[2:],
+            *counts,
+            ctypes.c_double(DT),
+            ctypes.c_long(toolchain.threads()),
+        )
         return states
 
     wall, used = measured(run, 3)
@@ -110,11 +175,20 @@ def mjcf(robot) -> str:
     head, tail = "", ""
     words = lambda x: " ".join(f"{float(y):.17g}" for y in np.ravel(x))  # noqa: E731
     for i in range(robot.n):
-        inertial = f'<inertial pos="{words(robot.centre[i])}" mass="{words(robot.mass[i])}" fullinertia="{words(robot.inertia[i])}"/>'
-        head += f'<body pos="{words(robot.position[i])}" quat="{words(robot.rotation[i])}"><joint axis="{words(robot.axis[i])}"/>{inertial}'
+        inertial = (
+            f'<inertial pos="{words(robot.centre[i])}" mass="{words(robot.mass[i])}"'
+            f' fullinertia="{words(robot.inertia[i])}"/>'
+        )
+        head += (
+            f'<body pos="{words(robot.position[i])}" quat="{words(robot.rotation[i])}"><joint'
+            f' axis="{words(robot.axis[i])}"/>{inertial}'
+        )
         tail += "</body>"
     small = 'diaginertia="1e-9 1e-9 1e-9"'
-    load = f'<body pos="{words(robot.tip_position)}"><inertial pos="0 0 0" mass="{words(robot.payload)}" {small}/></body>'
+    load = (
+        f'<body pos="{words(robot.tip_position)}"><inertial pos="0 0 0"'
+        f' mass="{words(robot.payload)}" {small}/></body>'
+    )
     option = f'<option integrator="RK4" timestep="{DT}" gravity="{words(robot.g)}"/>'
     return f"<mujoco>{option}<worldbody>{head}{load}{tail}</worldbody></mujoco>"
 
@@ -153,7 +227,9 @@ def with_mjx(runs: int, steps: int) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--json")
     parser.add_argument("--runs", type=int, default=4096)
@@ -166,23 +242,48 @@ def main() -> None:
     def add(name: str, dtype: str, made: int, found: tuple, limit: float = math.nan) -> None:
         seconds, wall, used, *rest = found
         rows.append(
-            [name, dtype, runs, made, seconds, runs * made / wall, runs * made / used, runs * made / wall / limit, *(rest or [math.nan])]
+            [
+                name,
+                dtype,
+                runs,
+                made,
+                seconds,
+                runs * made / wall,
+                runs * made / used,
+                runs * made / wall / limit,
+                *(rest or [math.nan]),
+            ]
         )
         print(f"{name} {dtype}: {runs * made / wall:.3g} steps/s", file=sys.stderr, flush=True)
 
     kinds = (("native, state alone", ()), ("native, standard metrics", None))
     wanted = [(dtype, *kind) for dtype in ("float64", "float32") for kind in kinds]
     for dtype, name, metrics in wanted[:1] if options.quick else wanted:
-        limit = ij.explain(ij.astype(ij.presets.iiwa14(), dtype), method=method, metrics=metrics).limit
+        limit = ij.explain(
+            ij.astype(ij.presets.iiwa14(), dtype), method=method, metrics=metrics
+        ).limit
         add(name, dtype, steps, native(dtype, metrics, runs, steps, method), limit)
     if not options.quick and pinocchio_flags():
         add("Pinocchio in C++", "float64", steps, with_pinocchio(runs, steps))
     if importlib.util.find_spec("mujoco"):
         add("MuJoCo rollout, plant alone", "float64", steps, with_mujoco(runs, steps))
     if not options.quick and importlib.util.find_spec("mujoco.mjx"):
-        few, short = min(runs, 64), max(steps // 20, 1)  # on a CPU it is made for neither many runs nor many steps
+        few, short = (
+            min(runs, 64),
+            max(steps // 20, 1),
+        )  # on a CPU it is made for neither many runs nor many steps
         add("MJX, plant alone", "float32", short, with_mjx(few, short), runs=few)
-    columns = ["row", "type", "runs", "steps", "compile s", "steps/s", "steps/s a core", "of the limit", "q differs [rad]"]
+    columns = [
+        "row",
+        "type",
+        "runs",
+        "steps",
+        "compile s",
+        "steps/s",
+        "steps/s a core",
+        "of the limit",
+        "q differs [rad]",
+    ]
     report(f"iiwa14, {method} at 1 ms", columns, rows, options.json)
 
 

@@ -1,12 +1,15 @@
-"""What keeps constraints, at equal effort: barrier laws, full state, dynamic surface, governor, safety filter, and nonlinear MPC.
+"""What keeps constraints, at equal effort: barrier laws, full state, dynamic surface, governor,
+safety filter, and nonlinear MPC.
 
     python benchmarks/constraints.py [--quick] [--json FILE] [--runs 400] [--mpc-runs 20]
 
-The paper's arm, reference, bounds and disturbance, with bounds on the velocities, and a wall for the tip that the reference crosses.  Each
-law's gains are scaled by the factor at which its RMS torque above gravity is the integral barrier's (`ij.compare`), where there is one;
-then many runs from starts within +-0.03 rad.  The MPC (`peers/mpc.py`; needs CasADi, and is left out without it) has a cost of its own, and
-its runs are the first of the others'.  `left` is the share of the runs that left it, `least` the smallest margin of all runs;
-rmse (worst joint) and effort above gravity are medians; `us a step` is the processor time of one control step: of a period of 1 ms with the
+The paper's arm, reference, bounds and disturbance, with bounds on the velocities, and a wall for
+the tip that the reference crosses.  Each law's gains are scaled by the factor at which its RMS
+torque above gravity is the integral barrier's (`ij.compare`), where there is one; then many runs
+from starts within +-0.03 rad.  The MPC (`peers/mpc.py`; needs CasADi, and is left out without it)
+has a cost of its own, and its runs are the first of the others'.  `left` is the share of the runs
+that left it, `least` the smallest margin of all runs; rmse (worst joint) and effort above gravity
+are medians; `us a step` is the processor time of one control step: of a period of 1 ms with the
 plant's motion, or of one MPC of 20 ms.
 """
 
@@ -33,12 +36,34 @@ from iblf_jax.core.linalg import solve_spd
 from iblf_jax.engine.simulate import simulate_unchecked
 from iblf_jax.simulation.scenario import canonical
 
-LAWS = ("integral", "log", "tan", "backstepping", "dynamic_surface", "full_state", "reference_governor", "safety_filter")
+LAWS = (
+    "integral",
+    "log",
+    "tan",
+    "backstepping",
+    "dynamic_surface",
+    "full_state",
+    "reference_governor",
+    "safety_filter",
+)
 WALL, DT, PERIOD = 0.52, 1e-3, 1e-3
 """m, s, s."""
-COLUMNS = ["law", "factor", "left q", "left q'", "left wall", "least q [rad]", "least q' [rad/s]", "least wall [m]"]
+COLUMNS = [
+    "law",
+    "factor",
+    "left q",
+    "left q'",
+    "left wall",
+    "least q [rad]",
+    "least q' [rad/s]",
+    "least wall [m]",
+]
 COLUMNS += ["rmse [rad]", "effort [N m]", "us a step"]
-MARGINS = {"margin": ij.Status.BOUND_VIOLATED, "velocity_margin": ij.Status.VELOCITY_VIOLATED, "region_margin": ij.Status.REGION_VIOLATED}
+MARGINS = {
+    "margin": ij.Status.BOUND_VIOLATED,
+    "velocity_margin": ij.Status.VELOCITY_VIOLATED,
+    "region_margin": ij.Status.REGION_VIOLATED,
+}
 """Metric -> the flag of runs in which it is not positive."""
 
 
@@ -46,7 +71,9 @@ def scenario() -> ij.Scenario:
     """What is to be kept."""
     speeds = bounds.Bounds(lower=bounds.Constant([-1.0, -0.6]), upper=bounds.Constant([0.6, 0.5]))
     wall = regions.HalfSpace(normal=[-1.0, 0.0], offset=-WALL)
-    return ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,))
+    return ij.with_parts(
+        ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,)
+    )
 
 
 def step_seconds(one: ij.Scenario) -> float:
@@ -75,7 +102,9 @@ def law_rows(base: ij.Scenario, laws, duration: float, runs: int) -> tuple[list,
     starts = {"initial.q": ij.offset(ij.uniform(-0.03, 0.03))}
     for name in laws:
         one = found.equal_effort.get(name, found.rollouts[name]).scenario
-        study = ij.monte_carlo(one, starts, runs=runs, duration=duration, dt=DT, metrics=folds, progress=False, seed=1)
+        study = ij.monte_carlo(
+            one, starts, runs=runs, duration=duration, dt=DT, metrics=folds, progress=False, seed=1
+        )
         left = [float(np.mean(study.status & int(flag) != 0)) for flag in MARGINS.values()]
         least = [float(np.min(study.metrics[margin])) for margin in MARGINS]
         rmse = float(np.median(np.max(study.metrics.rmse, axis=1)))
@@ -94,7 +123,9 @@ def mpc_row(base: ij.Scenario, starts: np.ndarray, duration: float) -> list:
 
     def acceleration(t, q, dq, tau):
         pushed = tau + base.disturbance.torque(t, q, dq, plant, plant)
-        return solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
+        return solve_spd(
+            plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q)
+        )
 
     def rate(t, x, tau):
         q, dq, eta = x
@@ -114,12 +145,21 @@ def mpc_row(base: ij.Scenario, starts: np.ndarray, duration: float) -> list:
             k2 = rate(now + h / 2, moved(x, k1, h / 2), tau)
             k3 = rate(now + h / 2, moved(x, k2, h / 2), tau)
             k4 = rate(now + h, moved(x, k3, h), tau)
-            after = jax.tree.map(lambda x, a, b, c, d: x + h / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4)
+            after = jax.tree.map(
+                lambda x, a, b, c, d: x + h / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4
+            )
             q, dq, tube = x[0], x[1], base.setting.tube(now)
             slow, fast = base.setting.speed_limits(now)
-            margin = [jnp.min(jnp.minimum(q - tube.lower, tube.upper - q)), jnp.min(jnp.minimum(dq - slow, fast - dq))]
+            margin = [
+                jnp.min(jnp.minimum(q - tube.lower, tube.upper - q)),
+                jnp.min(jnp.minimum(dq - slow, fast - dq)),
+            ]
             margin.append(regions.margins(base.regions, plant, q)[0])
-            return after, (jnp.stack(margin), (q - tube.q_d) ** 2, jnp.sum((tau - plant.gravity(q)) ** 2))
+            return after, (
+                jnp.stack(margin),
+                (q - tube.q_d) ** 2,
+                jnp.sum((tau - plant.gravity(q)) ** 2),
+            )
 
         return jax.lax.scan(step, x, jnp.arange(round(PERIOD / DT), dtype=h.dtype))
 
@@ -135,7 +175,11 @@ def mpc_row(base: ij.Scenario, starts: np.ndarray, duration: float) -> list:
     least, rmse, effort, seconds, solved = [], [], [], 0.0, 0
     for start in starts:
         law, told = Mpc(plant, WALL), []
-        x = (jnp.asarray(start), jnp.zeros(2), base.observer.init(jnp.asarray(start), jnp.zeros(2), plant))
+        x = (
+            jnp.asarray(start),
+            jnp.zeros(2),
+            base.observer.init(jnp.asarray(start), jnp.zeros(2), plant),
+        )
         for k in range(round(duration / PERIOD)):
             t = jnp.asarray(k * PERIOD)
             known = [np.asarray(y) for y in (x[0], x[1], estimate(t, x), *ahead(t))]
@@ -144,16 +188,27 @@ def mpc_row(base: ij.Scenario, starts: np.ndarray, duration: float) -> list:
             seconds, solved = seconds + time.process_time() - began, solved + 1
             x, now = held(t, x, jnp.asarray(tau))
             told.append(now)
-        margin, error, square = (np.concatenate([np.asarray(one[i]) for one in told]) for i in range(3))
+        margin, error, square = (
+            np.concatenate([np.asarray(one[i]) for one in told]) for i in range(3)
+        )
         least.append(margin.min(axis=0))
         rmse.append(np.sqrt(error.mean(axis=0)).max())
         effort.append(np.sqrt(square.mean()))
     left, worst = np.mean(np.array(least) <= 0, axis=0), np.min(least, axis=0)
-    return ["MPC (CasADi)", "its own", *left.tolist(), *worst.tolist(), *map(float, map(np.median, (rmse, effort))), 1e6 * seconds / solved]
+    return [
+        "MPC (CasADi)",
+        "its own",
+        *left.tolist(),
+        *worst.tolist(),
+        *map(float, map(np.median, (rmse, effort))),
+        1e6 * seconds / solved,
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="0.2 s of motion, four laws, few runs")
     parser.add_argument("--runs", type=int, default=400, help="runs a law")
     parser.add_argument("--mpc-runs", type=int, default=20, help="runs of the MPC")
@@ -167,7 +222,12 @@ def main() -> None:
         rows, starts = law_rows(base, laws, duration, runs)
     if importlib.util.find_spec("casadi"):
         rows.append(mpc_row(base, starts[:peers], duration))
-    report(f"Constraints at equal effort: {runs} runs of {duration:g} s a law, {peers} of the MPC", COLUMNS, rows, args.json)
+    report(
+        f"Constraints at equal effort: {runs} runs of {duration:g} s a law, {peers} of the MPC",
+        COLUMNS,
+        rows,
+        args.json,
+    )
 
 
 if __name__ == "__main__":

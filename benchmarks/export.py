@@ -1,9 +1,12 @@
-"""Time of one call of exported laws: `iblf_law_step` over the samples of a simulated run, in cycles of the processor's time stamp counter.
+"""Time of one call of exported laws: `iblf_law_step` over the samples of a simulated run, in cycles
+of the processor's time stamp counter.
 
     python benchmarks/export.py [--quick] [--json FILE]
 
-Rows: laws of the presets, double and float, built by the system's C compiler with -O2.  `cycles` is the median; 999 calls of a thousand
-take less than `99.9 %`, which other programs of the machine make long.  `x JAX`: how much longer the same sample takes as a jitted one.
+Rows: laws of the presets, double and float, built by the system's C compiler with -O2.  `cycles` is
+  the median; 999 calls of a thousand
+take less than `99.9 %`, which other programs of the machine make long.  `x JAX`: how much longer
+the same sample takes as a jitted one.
 """
 
 from __future__ import annotations
@@ -87,7 +90,9 @@ def in_jax(scenario) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="the paper's law alone, as double")
     parser.add_argument("--json", help="also write the table to this file")
     args = parser.parse_args()
@@ -102,14 +107,54 @@ def main() -> None:
                 made = ij.export(scenario, folder, dtype=dtype)
                 (Path(folder) / "driver.c").write_text(DRIVER)
                 begin = time.perf_counter()
-                command = [*c_compiler(), "-std=gnu99", "-O2", "iblf_law.c", "driver.c", "-lm", "-o", "driver"]
+                command = [
+                    *c_compiler(),
+                    "-std=gnu99",
+                    "-O2",
+                    "iblf_law.c",
+                    "driver.c",
+                    "-lm",
+                    "-o",
+                    "driver",
+                ]
                 subprocess.run(command, cwd=folder, check=True)
                 built = time.perf_counter() - begin
-                best = np.min([[float(x) for x in subprocess.check_output(["./driver"], cwd=folder).split()] for _ in range(3)], axis=0)
+                best = np.min(
+                    [
+                        [
+                            float(x)
+                            for x in subprocess.check_output(["./driver"], cwd=folder).split()
+                        ]
+                        for _ in range(3)
+                    ],
+                    axis=0,
+                )
                 size = sum(made.operations.values())
                 median, late, rate = best
-                rows.append([name, dtype, size, made.sizes["state"], built, median, late, 1e6 * median / rate, jitted / (median / rate)])
-    columns = ["law", "type", "operations", "state bytes", "compile s", "cycles", "99.9 %", "us", "x JAX"]
+                rows.append(
+                    [
+                        name,
+                        dtype,
+                        size,
+                        made.sizes["state"],
+                        built,
+                        median,
+                        late,
+                        1e6 * median / rate,
+                        jitted / (median / rate),
+                    ]
+                )
+    columns = [
+        "law",
+        "type",
+        "operations",
+        "state bytes",
+        "compile s",
+        "cycles",
+        "99.9 %",
+        "us",
+        "x JAX",
+    ]
     report("One call of an exported law", columns, rows, args.json)
 
 

@@ -1,10 +1,14 @@
-"""The gpu backend on a GPU: one kernel a rollout against XLA on the same device and against this machine's processor, side by side.
+"""The gpu backend on a GPU: one kernel a rollout against XLA on the same device and against this
+machine's processor, side by side.
 
-    python benchmarks/gpu.py [--quick] [--json FILE] [--dtype float32|float64] [--batches 4096,65536,1048576] [--chain]
+    python benchmarks/gpu.py [--quick] [--json FILE] [--dtype float32|float64] [--batches
+    4096,65536,1048576] [--chain]
 
-On a GPU it first holds the kernel to the reference (largest difference, statuses), then prints the rows of the GPU (`gpu`, `xla`,
-textbook `jit(vmap(scan))`) and, from a process of its own, those of the processor.  `of peak` counts the instructions of the scalar program
-(`ij.explain`) against what the multiprocessors can issue at their highest clock.  Without a GPU there are the processor's rows only.
+On a GPU it first holds the kernel to the reference (largest difference, statuses), then prints the
+rows of the GPU (`gpu`, `xla`, textbook `jit(vmap(scan))`) and, from a process of its own, those of
+the processor.  `of peak` counts the instructions of the scalar program (`ij.explain`) against what
+the multiprocessors can issue at their highest clock.  Without a GPU there are the processor's rows
+only.
 """
 
 from __future__ import annotations
@@ -36,15 +40,28 @@ LANES = {
     "float32": {"8.0": 64, "7.0": 64, "7.5": 64},
     "float64": {"7.0": 32, "8.0": 32, "9.0": 64, "10.0": 64},
 }
-"""Instructions that a multiprocessor issues a cycle, by compute capability; else 128 and 2 (CUDA C++ Programming Guide, arithmetic
-throughput)."""
-COLUMNS = ["loop", "device", "type", "runs", "row", "steps", "compile s", "steps/s", "x textbook", "of peak"]
+"""Instructions that a multiprocessor issues a cycle, by compute capability; else 128 and 2 (CUDA
+C++ Programming Guide, arithmetic throughput)."""
+COLUMNS = [
+    "loop",
+    "device",
+    "type",
+    "runs",
+    "row",
+    "steps",
+    "compile s",
+    "steps/s",
+    "x textbook",
+    "of peak",
+]
 RATES = {"textbook": 1e6, "xla": 3e7, "gpu + 6 tangents": 1e9, "gpu": 5e9, "gpu, no metrics": 5e9}
 """Steps/s to expect, so that a row takes about a second; of textbook and xla on a processor."""
 LAUNCHED = {"textbook": 200, "xla": 200}
-"""Steps of the rows in which XLA launches the kernels of each step one after the other: those take as long for one run as for many."""
+"""Steps of the rows in which XLA launches the kernels of each step one after the other: those take
+as long for one run as for many."""
 QUICK = ("textbook", "native", "gpu", "gpu + 6 tangents")
-"""The rows of the quick size: each compiles for seconds, and `throughput` has the processor's others."""
+"""The rows of the quick size: each compiles for seconds, and `throughput` has the processor's
+others."""
 
 
 def on_a_gpu() -> bool:
@@ -56,7 +73,9 @@ def peak(dtype: str) -> float:
     if not on_a_gpu():
         return math.nan
     driver, clock = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
-    if driver.cuDeviceGetAttribute(ctypes.byref(clock), 13, 0):  # CU_DEVICE_ATTRIBUTE_CLOCK_RATE, in kHz
+    if driver.cuDeviceGetAttribute(
+        ctypes.byref(clock), 13, 0
+    ):  # CU_DEVICE_ATTRIBUTE_CLOCK_RATE, in kHz
         return math.nan
     device = jax.local_devices()[0]
     lanes = LANES[dtype].get(device.compute_capability, 128 if dtype == "float32" else 2)
@@ -68,10 +87,14 @@ def candidates(scenario, dtype: str, is_paper: bool, method: str) -> dict:
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
 
     def on(backend, folds=folds):
-        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend)
+        return lambda v, dt, steps: run_batch(
+            scenario, v, folds, dt, Run(steps, method), backend=backend
+        )
 
     def tangents(v, dt, steps):
-        return run_batch_jvp(scenario, v, GAINS, folds[:1], dt, Run(steps, method), backend=compiled)
+        return run_batch_jvp(
+            scenario, v, GAINS, folds[:1], dt, Run(steps, method), backend=compiled
+        )
 
     compiled = "gpu" if on_a_gpu() else "native"
     rows = {"textbook": lambda v, dt, steps: textbook(v, dt, steps=steps)} if is_paper else {}
@@ -85,21 +108,36 @@ def check(scenario, dtype: str, steps: int, method: str) -> None:
     values = draws(scenario, 300, dtype)
 
     def outcome(backend):
-        return jax.jit(lambda v: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend))(values)
+        return jax.jit(
+            lambda v: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend)
+        )(values)
 
     found, expected = outcome("gpu"), outcome("vmap")
     worst = 0.0
     for x, y in zip(jax.tree.leaves(found.metrics), jax.tree.leaves(expected.metrics), strict=True):
         finite = np.isfinite(y)
         scale = 1 + np.max(np.abs(np.asarray(y)[finite]), initial=0)
-        worst = max(worst, float(np.max(np.abs(np.asarray(x, float)[finite] - np.asarray(y, float)[finite]), initial=0)) / scale)
+        worst = max(
+            worst,
+            float(
+                np.max(
+                    np.abs(np.asarray(x, float)[finite] - np.asarray(y, float)[finite]), initial=0
+                )
+            )
+            / scale,
+        )
     same = "equal" if np.array_equal(found.status, expected.status) else "DIFFERENT"
-    print(f"gpu against the reference, {dtype}, 300 runs of {steps} steps: largest difference {worst:.2g}, statuses {same}")
+    print(
+        f"gpu against the reference, {dtype}, 300 runs of {steps} steps: largest difference"
+        f" {worst:.2g}, statuses {same}"
+    )
 
 
 def table(which: str, dtype: str, batches, quick: bool) -> list[list]:
     """The rows of this process's device."""
-    scenario = canonical(ij.astype(ij.presets.zhang_yan_2024() if which == "paper" else chain(4), dtype))
+    scenario = canonical(
+        ij.astype(ij.presets.zhang_yan_2024() if which == "paper" else chain(4), dtype)
+    )
     dt, rows, device = jnp.asarray(1e-3, dtype), [], jax.local_devices()[0].device_kind
     slots = ij.explain(scenario, varied=["plant.mass[1]"]).slots
     if on_a_gpu():
@@ -107,7 +145,9 @@ def table(which: str, dtype: str, batches, quick: bool) -> list[list]:
     for runs in batches:
         values = draws(scenario, runs, dtype)
         calls, seconds, steps_of = {}, {}, {}
-        for name, function in candidates(scenario, dtype, which == "paper", method_for(quick)).items():
+        for name, function in candidates(
+            scenario, dtype, which == "paper", method_for(quick)
+        ).items():
             if quick and name not in QUICK:
                 continue
             expected = RATES.get(name, 5e7) / runs
@@ -121,7 +161,9 @@ def table(which: str, dtype: str, batches, quick: bool) -> list[list]:
         for name, s in speed.items():
             share = s * slots / peak(dtype) if name == "gpu" else ""
             ratio = s / speed["textbook"] if "textbook" in speed else ""
-            rows.append([which, device, dtype, runs, name, steps_of[name], seconds[name], s, ratio, share])
+            rows.append(
+                [which, device, dtype, runs, name, steps_of[name], seconds[name], s, ratio, share]
+            )
     return rows
 
 
@@ -130,12 +172,19 @@ def rows_of_the_processor(arguments: list[str]) -> list[list]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rows.json"
         command = [sys.executable, __file__, *arguments, "--json", str(path)]
-        subprocess.run(command, check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            command,
+            check=True,
+            env=os.environ | {"JAX_PLATFORMS": "cpu"},
+            stdout=subprocess.DEVNULL,
+        )
         return [[row[name] for name in COLUMNS] for row in json.loads(path.read_text())["rows"]]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--json")
     parser.add_argument("--dtype", default="float32", choices=["float32", "float64"])
@@ -148,9 +197,17 @@ def main() -> None:
     for which in ["paper", "chain of 4"] if options.chain else ["paper"]:
         rows += table(which, options.dtype, batches, options.quick)
     if on_a_gpu():
-        same = ["--dtype", options.dtype, "--batches", "4096", *(["--quick"] if options.quick else [])]
+        same = [
+            "--dtype",
+            options.dtype,
+            "--batches",
+            "4096",
+            *(["--quick"] if options.quick else []),
+        ]
         rows += rows_of_the_processor(same)
-    report(f"One kernel a rollout, {method_for(options.quick)} at 1 ms", COLUMNS, rows, options.json)
+    report(
+        f"One kernel a rollout, {method_for(options.quick)} at 1 ms", COLUMNS, rows, options.json
+    )
 
 
 if __name__ == "__main__":

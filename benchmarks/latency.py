@@ -1,8 +1,10 @@
-"""Latency of one run: the paper's 20 s at 1 ms (20,000 RK4 steps, float64) against SciPy's LSODA on the same closed loop.
+"""Latency of one run: the paper's 20 s at 1 ms (20,000 RK4 steps, float64) against SciPy's LSODA on
+the same closed loop.
 
     python benchmarks/latency.py [--quick] [--json FILE]
 
-Rows: LSODA at rtol 1e-6 on the loop in NumPy, LSODA on this package's own compiled vector field, and `simulate` on its two backends.
+Rows: LSODA at rtol 1e-6 on the loop in NumPy, LSODA on this package's own compiled vector field,
+  and `simulate` on its two backends.
 `import` is the time of `import iblf_jax` above `import jax`, each in a fresh process.
 """
 
@@ -32,7 +34,9 @@ from iblf_jax.simulation.metrics import standard
 
 
 def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
-    """The paper's closed loop (integral barrier, printed reading) as one writes it in NumPy, its derivatives by hand."""
+    """The paper's closed loop (integral barrier, printed reading) as one writes it in NumPy, its
+    derivatives by hand.
+    """
     q, dq, eta = x[:2], x[2:4], x[4:]
     p1, p2, p3, p4, p5, g = 0.226625, 0.0408425, 0.0461125, 0.6475, 0.13175, 9.81
     s2, c2 = p3 * np.sin(q[1]), p3 * np.cos(q[1])
@@ -56,21 +60,32 @@ def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
     k = np.where(e1 > 0, k_u, k_l)
     f_hat = eta + 20.0 * M @ dq
     tau = C @ dq + G + M @ dalpha - f_hat - 20.0 * (dq - alpha) - 2.0 * e1 / (k**2 - e1**2)
-    f = M @ np.array([0.3 * np.sin(t), 0.3 * np.cos(t)]) + C @ np.array([0.3 * np.cos(0.5 * t), 0.3 * np.sin(0.5 * t)])
+    f = M @ np.array([0.3 * np.sin(t), 0.3 * np.cos(t)]) + C @ np.array(
+        [0.3 * np.cos(0.5 * t), 0.3 * np.sin(0.5 * t)]
+    )
     ddq = np.linalg.solve(M, tau + f - C @ dq - G)
     return np.concatenate([dq, ddq, -20.0 * (f_hat + tau - C @ dq - G)])
 
 
 def import_seconds(repeats: int) -> float:
     """Seconds of `import iblf_jax` after `import jax`, in a fresh process; the smallest of some."""
-    code = "import jax, time; t = time.perf_counter(); import iblf_jax; print(time.perf_counter() - t)"
+    code = (
+        "import jax, time; t = time.perf_counter(); import iblf_jax; print(time.perf_counter() - t)"
+    )
     command = [sys.executable, "-c", code]
-    return min(float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) for _ in range(repeats))
+    return min(
+        float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        for _ in range(repeats)
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="half a second of motion by Euler's method, one repeat")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="half a second of motion by Euler's method, one repeat"
+    )
     parser.add_argument("--json", help="also write the table to this file")
     args = parser.parse_args()
     duration, method, repeats = (0.5, "euler", 1) if args.quick else (20.0, "rk4", 5)
@@ -88,23 +103,36 @@ def main() -> None:
 
     x0, unravel = ravel_pytree(initial_state(scenario))
     field = jax.jit(lambda t, x: ravel_pytree(rate(scenario, t, unravel(x)))[0])
-    assert np.allclose(numpy_loop(0.3, np.asarray(x0) + 0.01), field(0.3, x0 + 0.01), rtol=1e-9, atol=1e-9)
-    lsoda = partial(solve_ivp, t_span=(0.0, duration), y0=np.asarray(x0), method="LSODA", rtol=1e-6, atol=1e-9)
+    assert np.allclose(
+        numpy_loop(0.3, np.asarray(x0) + 0.01), field(0.3, x0 + 0.01), rtol=1e-9, atol=1e-9
+    )
+    lsoda = partial(
+        solve_ivp, t_span=(0.0, duration), y0=np.asarray(x0), method="LSODA", rtol=1e-6, atol=1e-9
+    )
     calls = {
         "LSODA, NumPy loop": lambda: lsoda(numpy_loop).y,
         "LSODA, compiled field": lambda: lsoda(lambda t, x: np.asarray(field(t, x))).y,
     }
     for backend in compiled:
-        users = partial(ij.simulate, scenario, duration=duration, dt=1e-3, method=method, backend=backend)
+        users = partial(
+            ij.simulate, scenario, duration=duration, dt=1e-3, method=method, backend=backend
+        )
         calls[f"{backend}, user's call"] = lambda users=users: users().q
         calls[f"{backend}, compiled"] = lambda b=backend: compiled[b](scenario, folds, dt)
         users()
     best = interleaved(calls, repeats)
     reference = best["LSODA, NumPy loop"]
     rows = [[name, 1e3 * seconds, reference / seconds] for name, seconds in best.items()]
-    report(f"One run of {duration:g} s at 1 ms, {method}, float64", ["row", "ms", "times faster"], rows, args.json)
+    report(
+        f"One run of {duration:g} s at 1 ms, {method}, float64",
+        ["row", "ms", "times faster"],
+        rows,
+        args.json,
+    )
     built = ", ".join(f"{seconds:.2f} s ({backend})" for backend, seconds in compile_times.items())
-    print(f"compile {built}; import iblf_jax above import jax {import_seconds(min(repeats, 3)):.2f} s")
+    print(
+        f"compile {built}; import iblf_jax above import jax {import_seconds(min(repeats, 3)):.2f} s"
+    )
 
 
 if __name__ == "__main__":

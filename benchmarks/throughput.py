@@ -1,13 +1,18 @@
-"""Throughput of many runs at once, RK4 at 1 ms, steps per second, everything side by side in one run.
+"""Throughput of many runs at once, RK4 at 1 ms, steps per second, everything side by side in one
+run.
 
-    python benchmarks/throughput.py [--quick] [--json FILE] [--dtypes float32,float64] [--batches 1,64,4096,65536] [--loops paper,chain,arm]
+    python benchmarks/throughput.py [--quick] [--json FILE] [--dtypes float32,float64] [--batches
+    1,64,4096,65536] [--loops paper,chain,arm]
 
-Rows: SciPy LSODA and diffrax (of the same motion, in steps of 1 ms), the textbook `jit(vmap(scan))` with `jnp.linalg.solve`, this
-package's backends with the standard metrics and without, on one thread and on all, value and 6 forward sensitivities, and the limit: a
-rollout written by hand in C++ (`limit/paper_loop.cc`), which carries the state alone and is there for the paper's loop only.  The second
-loop is a planar chain of four joints; the third, a real arm of seven (`presets.iiwa14`), whose step is too long for XLA.  Last, `native`
-on 1e4, 1e5 and 1e6 runs, and on a law that is sampled beside one that is not.  `a core` is steps per second of processor time: on a shared
-machine it is the number to compare.  A row that needs a package which is not there is left out.
+Rows: SciPy LSODA and diffrax (of the same motion, in steps of 1 ms), the textbook `jit(vmap(scan))`
+  with `jnp.linalg.solve`, this
+package's backends with the standard metrics and without, on one thread and on all, value and 6
+forward sensitivities, and the limit: a rollout written by hand in C++ (`limit/paper_loop.cc`),
+  which carries the state alone and is there for the paper's loop only.  The second
+loop is a planar chain of four joints; the third, a real arm of seven (`presets.iiwa14`), whose step
+is too long for XLA.  Last, `native` on 1e4, 1e5 and 1e6 runs, and on a law that is sampled beside
+one that is not.  `a core` is steps per second of processor time: on a shared machine it is the
+number to compare.  A row that needs a package which is not there is left out.
 """
 
 from __future__ import annotations
@@ -40,7 +45,10 @@ from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 
 FOLDER = Path(__file__).parent
-GAINS = {name: np.eye(6)[:, 2 * i : 2 * i + 2] for i, name in enumerate(("controller.k1", "controller.K2", "observer.kf"))}
+GAINS = {
+    name: np.eye(6)[:, 2 * i : 2 * i + 2]
+    for i, name in enumerate(("controller.k1", "controller.K2", "observer.kf"))
+}
 
 
 def chain(n: int):
@@ -49,7 +57,9 @@ def chain(n: int):
     side = ij.bounds.Constant(np.full(n, 0.2)), ij.bounds.Constant(np.full(n, 0.9))
     return ij.Scenario(
         plant=plant,
-        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.14, frequency=1.0, phase=np.arange(n) * 1.0),
+        reference=ij.references.Sinusoid(
+            offset=0.5, amplitude=0.14, frequency=1.0, phase=np.arange(n) * 1.0
+        ),
         bounds=ij.bounds.Bounds(*side),
         controller=ij.controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
         observer=ij.observers.Momentum(kf=20.0),
@@ -65,15 +75,26 @@ def draws(scenario, runs: int, dtype):
     rng = np.random.default_rng(0)
     start = np.asarray(scenario.initial.q) + 0.01 * rng.standard_normal((runs, scenario.n))
     nominal = float(np.asarray(scenario.plant.mass)[1])
-    return {"plant.mass[1]": jnp.asarray(nominal * rng.uniform(0.7, 1.3, runs), dtype), "initial.q": jnp.asarray(start, dtype)}
+    return {
+        "plant.mass[1]": jnp.asarray(nominal * rng.uniform(0.7, 1.3, runs), dtype),
+        "initial.q": jnp.asarray(start, dtype),
+    }
 
 
 def textbook_slope(mass, t, x):
-    """The paper's loop as one writes it in JAX: arrays of two joints, derivatives by jvp, `jnp.linalg.solve`."""
+    """The paper's loop as one writes it in JAX: arrays of two joints, derivatives by jvp,
+    `jnp.linalg.solve`.
+    """
     q, dq, eta = x
 
     def lumped(m2):
-        return 0.1225 + m2 * 0.1225, m2 * 0.024025 + 0.02042125, m2 * 0.05425, 0.35 + m2 * 0.35, m2 * 0.155
+        return (
+            0.1225 + m2 * 0.1225,
+            m2 * 0.024025 + 0.02042125,
+            m2 * 0.05425,
+            0.35 + m2 * 0.35,
+            m2 * 0.155,
+        )
 
     def matrices(p, q, dq):
         c, s = p[2] * jnp.cos(q[1]), p[2] * jnp.sin(q[1])
@@ -83,7 +104,10 @@ def textbook_slope(mass, t, x):
         return M, C, jnp.array([p[3] * 9.81 * jnp.cos(q[0]) + outer, outer])
 
     def tube(t):
-        wave, swapped = 0.14 * jnp.array([jnp.sin(t), jnp.cos(t)]), 0.14 * jnp.array([jnp.cos(t), jnp.sin(t)])
+        wave, swapped = (
+            0.14 * jnp.array([jnp.sin(t), jnp.cos(t)]),
+            0.14 * jnp.array([jnp.cos(t), jnp.sin(t)]),
+        )
         return 0.5 + wave, 0.3 + wave - swapped, 0.4 - wave + swapped
 
     def alpha(t, q):
@@ -98,7 +122,9 @@ def textbook_slope(mass, t, x):
     k = jnp.where(e > 0, k_u, k_l)
     f_hat = eta + 20.0 * (M0 @ dq)
     tau = C0 @ dq + G0 + M0 @ da - f_hat - 20.0 * (dq - a) - 2.0 * e / (k**2 - e**2)
-    push = M0 @ (0.3 * jnp.array([jnp.sin(t), jnp.cos(t)])) + C0 @ (0.3 * jnp.array([jnp.cos(0.5 * t), jnp.sin(0.5 * t)]))
+    push = M0 @ (0.3 * jnp.array([jnp.sin(t), jnp.cos(t)])) + C0 @ (
+        0.3 * jnp.array([jnp.cos(0.5 * t), jnp.sin(0.5 * t)])
+    )
     ddq = jnp.linalg.solve(M, tau + push - C @ dq - G)
     return dq, ddq, -20.0 * (f_hat + tau - C0 @ dq - G0)
 
@@ -114,7 +140,12 @@ def textbook(values, dt, *, steps: int):
             k2 = textbook_slope(mass, t + dt / 2, add(x, dt / 2, k1))
             k3 = textbook_slope(mass, t + dt / 2, add(x, dt / 2, k2))
             k4 = textbook_slope(mass, t + dt, add(x, dt, k3))
-            return jax.tree.map(lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4), None
+            return (
+                jax.tree.map(
+                    lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4
+                ),
+                None,
+            )
 
         return jax.lax.scan(step, (q0, 0 * q0, 0 * q0), jnp.arange(steps, dtype=dt.dtype))[0]
 
@@ -128,7 +159,9 @@ def with_diffrax(values, dt, *, steps: int):
     def one(mass, q0):
         term = diffrax.ODETerm(lambda t, x, _: textbook_slope(mass, t, x))
         t1 = steps * dt
-        return diffrax.diffeqsolve(term, diffrax.Tsit5(), 0 * t1, t1, dt, (q0, 0 * q0, 0 * q0), max_steps=steps + 1).ys
+        return diffrax.diffeqsolve(
+            term, diffrax.Tsit5(), 0 * t1, t1, dt, (q0, 0 * q0, 0 * q0), max_steps=steps + 1
+        ).ys
 
     return jax.vmap(one)(values["plant.mass[1]"], values["initial.q"])
 
@@ -139,7 +172,14 @@ def with_scipy(steps: int) -> float:
     from scipy.integrate import solve_ivp
 
     start = time.perf_counter()
-    solve_ivp(numpy_loop, (0.0, steps * 1e-3), np.array([0.8, 0.8, 0, 0, 0, 0]), method="LSODA", rtol=1e-6, atol=1e-8)
+    solve_ivp(
+        numpy_loop,
+        (0.0, steps * 1e-3),
+        np.array([0.8, 0.8, 0, 0, 0, 0]),
+        method="LSODA",
+        rtol=1e-6,
+        atol=1e-8,
+    )
     return time.perf_counter() - start
 
 
@@ -148,8 +188,12 @@ def limit(dtype):
     try:
         text = (FOLDER / "limit" / "paper_loop.cc").read_text()
         for name in ("vector.h", "mathlib.h"):
-            text = text.replace(f'#include "{name}"', (Path(lowering.__file__).parent / "c" / name).read_text())
-        library = toolchain.loaded(toolchain.built(f"#define DOUBLE {int(dtype == 'float64')}\n" + text, ("-O3",))[0])
+            text = text.replace(
+                f'#include "{name}"', (Path(kernels.__file__).parent / "c" / name).read_text()
+            )
+        library = toolchain.loaded(
+            toolchain.built(f"#define DOUBLE {int(dtype == 'float64')}\n" + text, ("-O3",))[0]
+        )
     except toolchain.ToolchainError as error:
         print(f"no limit: {error}")
         return None
@@ -161,7 +205,12 @@ def limit(dtype):
         x[:2, : len(mass)] = q.T
         mass = np.concatenate([mass, np.full(runs - len(mass), 0.85, dtype)])
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in (mass, x)]
-        library.paper_loop(*pointers, *map(ctypes.c_long, (runs, steps)), ctypes.c_double(1e-3), ctypes.c_long(toolchain.threads()))
+        library.paper_loop(
+            *pointers,
+            *map(ctypes.c_long, (runs, steps)),
+            ctypes.c_double(1e-3),
+            ctypes.c_long(toolchain.threads()),
+        )
         return x[:, : len(q)]
 
     return run
@@ -173,7 +222,9 @@ def measured(call, repeats: int) -> tuple[float, float]:
 
 
 class Row(NamedTuple):
-    """One row of the table: `call(values, dt, steps)` is compiled, or called as it is if it is `ready`."""
+    """One row of the table: `call(values, dt, steps)` is compiled, or called as it is if it is
+    `ready`.
+    """
 
     name: str
     call: Callable
@@ -184,26 +235,45 @@ class Row(NamedTuple):
     """The batches that it is measured on; None for all."""
     ready: bool = False
     most: int = 10_000_000
-    """Runs at most: the textbook's batched LAPACK call was seen to hang with 65536 on two cores, so that it is measured on 16384."""
+    """Runs at most: the textbook's batched LAPACK call was seen to hang with 65536 on two cores, so
+    that it is measured on 16384."""
 
 
 LARGE = (4096, 65536)
-QUICK = ("textbook", "diffrax", "vmap", "xla", "native, one thread", "native, rmse + 6 tangents", "limit, one thread")
+QUICK = (
+    "textbook",
+    "diffrax",
+    "vmap",
+    "xla",
+    "native, one thread",
+    "native, rmse + 6 tangents",
+    "limit, one thread",
+)
 """The rows of the quick size: one of each kind, as each compiles for seconds."""
 
 
 def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
     """What is measured on a loop."""
-    folds, mechanism = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard()), mechanism_of(scenario)
+    folds, mechanism = (
+        jax.tree.map(lambda x: jnp.asarray(x, dtype), standard()),
+        mechanism_of(scenario),
+    )
 
     def on(backend, folds=folds):
-        return lambda v, dt, steps: run_batch(scenario, v, folds, dt, Run(steps, method, mechanism=mechanism), backend=backend)
+        return lambda v, dt, steps: run_batch(
+            scenario, v, folds, dt, Run(steps, method, mechanism=mechanism), backend=backend
+        )
 
     def sensitivities(folds):
-        return lambda v, dt, steps: run_batch_jvp(scenario, v, GAINS, folds, dt, Run(steps, method, mechanism=mechanism), backend="native")
+        return lambda v, dt, steps: run_batch_jvp(
+            scenario, v, GAINS, folds, dt, Run(steps, method, mechanism=mechanism), backend="native"
+        )
 
     if loop == "arm":
-        return [Row("vmap", on("vmap"), 2e4, batches=(1, 64)), Row("native", on("native"), 2e6, batches=(1, 64, 4096))]
+        return [
+            Row("vmap", on("vmap"), 2e4, batches=(1, 64)),
+            Row("native", on("native"), 2e6, batches=(1, 64, 4096)),
+        ]
     rows = [
         Row("vmap", on("vmap"), 2e6, batches=(1, 64, 4096)),
         Row("xla", on("xla"), 3e7),
@@ -215,7 +285,14 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
     rows.append(Row("xla, no metrics", on("xla", ()), 3e7, batches=LARGE))
     first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 1e6, most=16_384)]
     if importlib.util.find_spec("diffrax"):
-        first.append(Row("diffrax", lambda v, dt, steps: with_diffrax(v, dt, steps=steps), 3e5, batches=(4096,)))
+        first.append(
+            Row(
+                "diffrax",
+                lambda v, dt, steps: with_diffrax(v, dt, steps=steps),
+                3e5,
+                batches=(4096,),
+            )
+        )
     rows += [
         Row("native, no metrics", on("native", ()), 1e8, batches=LARGE),
         Row("native + 6 tangents", sensitivities(folds), 3e7, batches=LARGE),
@@ -225,7 +302,10 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
     by_hand = limit(dtype)
     if by_hand:
         call = lambda v, dt, steps: by_hand(v, steps)  # noqa: E731
-        rows += [Row("limit", call, 1e8, ready=True), Row("limit, one thread", call, 1e8, threads=1, batches=LARGE[1:], ready=True)]
+        rows += [
+            Row("limit", call, 1e8, ready=True),
+            Row("limit, one thread", call, 1e8, threads=1, batches=LARGE[1:], ready=True),
+        ]
     return first + rows
 
 
@@ -235,7 +315,9 @@ def steps_for(row: Row, runs: int, quick: bool) -> int:
 
 
 def method_for(quick: bool) -> str:
-    """The method of this package's rows: the quick size is there to be run, and four stages compile four times as long as one."""
+    """The method of this package's rows: the quick size is there to be run, and four stages compile
+    four times as long as one.
+    """
     return "euler" if quick else "rk4"
 
 
@@ -245,7 +327,11 @@ def timed(row: Row, values, dt, steps: int, repeats: int) -> tuple[float, float,
     if row.threads:
         os.environ["IBLF_JAX_THREADS"] = str(row.threads)
     try:
-        seconds, call = (0.0, partial(row.call, steps=steps)) if row.ready else compile_seconds(partial(row.call, steps=steps), values, dt)
+        seconds, call = (
+            (0.0, partial(row.call, steps=steps))
+            if row.ready
+            else compile_seconds(partial(row.call, steps=steps), values, dt)
+        )
         jax.block_until_ready(call(values, dt))
         return seconds, *measured(partial(call, values, dt), repeats)
     finally:
@@ -258,31 +344,57 @@ def table(dtype: str, batches, loop: str, quick: bool) -> list[list]:
     """The rows of one loop and type."""
     jax.config.update("jax_enable_x64", dtype == "float64")
     scenario = canonical(ij.astype(LOOPS[loop](), dtype))
-    dt, result, rows = jnp.asarray(1e-3, dtype), [], rows_of(scenario, dtype, loop, method_for(quick))
+    dt, result, rows = (
+        jnp.asarray(1e-3, dtype),
+        [],
+        rows_of(scenario, dtype, loop, method_for(quick)),
+    )
     for runs in batches:
         values, found = draws(scenario, runs, dtype), []
         for row in rows:
             if row.name in QUICK if quick else row.batches is None or runs in row.batches:
                 count = min(runs, row.most)
                 steps = steps_for(row, count, quick)
-                seconds, wall, cpu = timed(row, {k: x[:count] for k, x in values.items()}, dt, steps, 1 if quick else 3)
+                seconds, wall, cpu = timed(
+                    row, {k: x[:count] for k, x in values.items()}, dt, steps, 1 if quick else 3
+                )
                 found.append((row.name, steps, seconds, count * steps / wall, count * steps / cpu))
-                print(f"{loop} {dtype} {runs} {row.name}: {found[-1][3]:.3g} steps/s", file=sys.stderr, flush=True)
-        bases = [next((speed for name, *_, speed, _ in found if name == base), math.nan) for base in ("textbook", "limit")]
-        result += [[loop, dtype, runs, *line, line[3] / bases[0], line[3] / bases[1]] for line in found]
+                print(
+                    f"{loop} {dtype} {runs} {row.name}: {found[-1][3]:.3g} steps/s",
+                    file=sys.stderr,
+                    flush=True,
+                )
+        bases = [
+            next((speed for name, *_, speed, _ in found if name == base), math.nan)
+            for base in ("textbook", "limit")
+        ]
+        result += [
+            [loop, dtype, runs, *line, line[3] / bases[0], line[3] / bases[1]] for line in found
+        ]
     return result
 
 
 def flat(quick: bool) -> list[list]:
     """`native` on more and more runs, whose speed should not depend on how many there are."""
     jax.config.update("jax_enable_x64", False)
-    scenario, dt = canonical(ij.astype(ij.presets.zhang_yan_2024(), "float32")), jnp.asarray(1e-3, "float32")
-    row = next(row for row in rows_of(scenario, "float32", "chain", method_for(quick)) if row.name == "native")
+    scenario, dt = (
+        canonical(ij.astype(ij.presets.zhang_yan_2024(), "float32")),
+        jnp.asarray(1e-3, "float32"),
+    )
+    row = next(
+        row
+        for row in rows_of(scenario, "float32", "chain", method_for(quick))
+        if row.name == "native"
+    )
     result, steps = [], 20 if quick else 200
     for runs in (4,) if quick else (10_000, 100_000, 1_000_000):
-        seconds, wall, cpu = timed(row, draws(scenario, runs, "float32"), dt, steps, 1 if quick else 3)
+        seconds, wall, cpu = timed(
+            row, draws(scenario, runs, "float32"), dt, steps, 1 if quick else 3
+        )
         speeds = runs * steps / wall, runs * steps / cpu
-        result.append(["paper", "float32", runs, "native, flat", steps, seconds, *speeds, math.nan, math.nan])
+        result.append(
+            ["paper", "float32", runs, "native, flat", steps, seconds, *speeds, math.nan, math.nan]
+        )
     return result
 
 
@@ -296,34 +408,64 @@ SAMPLED = {
 
 def soft_paper():
     """The paper's loop, soft enough to be sampled every 4 ms."""
-    return ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0})
+    return ij.with_parameters(
+        ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+    )
 
 
 def sampled(quick: bool) -> list[list]:
     """`native` where the law runs at every instant, once a period, and late: all in turn."""
     result = []
-    sizes = {"paper": (soft_paper, 2048, 4000, 4), "ur5": (ij.presets.ur5, 256, 1000, 2), "arm": (ij.presets.iiwa14, 256, 1000, 2)}
+    sizes = {
+        "paper": (soft_paper, 2048, 4000, 4),
+        "ur5": (ij.presets.ur5, 256, 1000, 2),
+        "arm": (ij.presets.iiwa14, 256, 1000, 2),
+    }
     if quick:
         sizes = {"paper": (soft_paper, 2, 20, 2)}
-    for (loop, (make, runs, steps, rows)), dtype in itertools.product(sizes.items(), ("float64",) if quick else ("float64", "float32")):
+    for (loop, (make, runs, steps, rows)), dtype in itertools.product(
+        sizes.items(), ("float64",) if quick else ("float64", "float32")
+    ):
         jax.config.update("jax_enable_x64", dtype == "float64")
         dt, calls, compiled = jnp.asarray(1e-3, dtype), {}, {}
         for name in list(SAMPLED)[:rows]:
             scenario = canonical(ij.astype(ij.with_parts(make(), sampling=SAMPLED[name]), dtype))
             values = draws(scenario, runs, dtype)
-            row = next(row for row in rows_of(scenario, dtype, "chain", method_for(quick)) if row.name == "native")
+            row = next(
+                row
+                for row in rows_of(scenario, dtype, "chain", method_for(quick))
+                if row.name == "native"
+            )
             compiled[name], call = compile_seconds(partial(row.call, steps=steps), values, dt)
             calls[name] = partial(call, values, dt)
             jax.block_until_ready(calls[name]())
         for name, (wall, cpu) in in_turn(calls, 1 if quick else 7).items():
             speeds = runs * steps / wall, runs * steps / cpu
-            result.append([loop, dtype, runs, f"native, {name}", steps, compiled[name], *speeds, math.nan, math.nan])
-            print(f"{loop} {dtype} {runs} {name}: {speeds[1]:.3g} steps/s a core", file=sys.stderr, flush=True)
+            result.append(
+                [
+                    loop,
+                    dtype,
+                    runs,
+                    f"native, {name}",
+                    steps,
+                    compiled[name],
+                    *speeds,
+                    math.nan,
+                    math.nan,
+                ]
+            )
+            print(
+                f"{loop} {dtype} {runs} {name}: {speeds[1]:.3g} steps/s a core",
+                file=sys.stderr,
+                flush=True,
+            )
     return result
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--json")
     parser.add_argument("--dtypes", default="float32,float64")
@@ -334,12 +476,35 @@ def main() -> None:
     rows = []
     if not options.quick:
         jax.config.update("jax_enable_x64", True)
-        rows = [["paper", "float64", 1, "SciPy LSODA", 10_000, 0.0, *[1e4 / with_scipy(10_000)] * 2, math.nan, math.nan]]
+        rows = [
+            [
+                "paper",
+                "float64",
+                1,
+                "SciPy LSODA",
+                10_000,
+                0.0,
+                *[1e4 / with_scipy(10_000)] * 2,
+                math.nan,
+                math.nan,
+            ]
+        ]
     for loop in ["paper"] if options.quick else options.loops.split(","):
         for dtype in ["float32"] if options.quick else options.dtypes.split(","):
             rows += table(dtype, batches, loop, options.quick)
     rows += flat(options.quick) + sampled(options.quick)
-    columns = ["loop", "type", "runs", "row", "steps", "compile s", "steps/s", "steps/s a core", "x textbook", "of limit"]
+    columns = [
+        "loop",
+        "type",
+        "runs",
+        "row",
+        "steps",
+        "compile s",
+        "steps/s",
+        "steps/s a core",
+        "x textbook",
+        "of limit",
+    ]
     report(f"Throughput, {method_for(options.quick)} at 1 ms", columns, rows, options.json)
 
 

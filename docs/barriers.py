@@ -1,4 +1,6 @@
-"""Pages of the barriers: each with V1, its slope and alpha across an asymmetric tube, drawn by the barrier itself."""
+"""Pages of the barriers: each with V1, its slope and alpha across an asymmetric tube, drawn by the
+barrier itself.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def draw(barrier, path: Path) -> None:
     }
     with styled():
         figure = new_figure(9.0, 2.6)
-        for axes, (symbol, (unit, function)) in zip(figure.subplots(1, 3), functions.items(), strict=True):
+        for axes, (symbol, (unit, function)) in zip(
+            figure.subplots(1, 3), functions.items(), strict=True
+        ):
             y = np.ravel(jax.vmap(jax.jit(function))(jnp.asarray(e1)[:, None]))
             inside = np.abs(y[(e1 > 0.93 * LOWER) & (e1 < 0.93 * UPPER)]).max()
             axes.plot(e1, y)
@@ -52,10 +56,23 @@ def write(folder: Path) -> None:
     names = []
     for name, cls in ij.barriers.MEMBERS.items():
         draw(cls(), folder / f"barrier_{name}.png")
-        text = f"# {cls.__name__}\n\n{body(inspect.getdoc(cls) or '')}\n\n![V1, slope and alpha](barrier_{name}.png)\n\n"
-        told = f"Drawn for bounds at {LOWER:g} and {UPPER:g} rad, the upper one falling by 0.1 rad/s; k1 = 1 1/s, o = 0.1 1/s^2."
-        (folder / f"barrier_{name}.md").write_text(text + told + " Beyond the bounds the guard goes on along the tangent.\n")
+        text = (
+            f"# {cls.__name__}\n\n{body(inspect.getdoc(cls) or '')}\n\n![V1, slope and"
+            f" alpha](barrier_{name}.png)\n\n"
+        )
+        told = (
+            f"Drawn for bounds at {LOWER:g} and {UPPER:g} rad, the upper one falling by 0.1 rad/s;"
+            " k1 = 1 1/s, o = 0.1 1/s^2."
+        )
+        (folder / f"barrier_{name}.md").write_text(
+            text + told + " Beyond the bounds the guard goes on along the tangent.\n"
+        )
         names.append(f"barrier_{name}")
     listed = "\n".join(names)
-    words = "What a barrier is, and what the guard does at the wall, is said in `iblf_jax.barriers`. A page a member:"
-    (folder / "barriers.md").write_text(f"# Barriers\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n")
+    words = (
+        "What a barrier is, and what the guard does at the wall, is said in `iblf_jax.barriers`. A"
+        " page a member:"
+    )
+    (folder / "barriers.md").write_text(
+        f"# Barriers\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
+    )

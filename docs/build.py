@@ -1,8 +1,10 @@
 """Builds the site: `python docs/build.py`; the result is out/site/html/index.html.
 
-Pages are put together in out/site/source: what stands in this folder, the notebooks and the gallery as the tests have executed them (what
-is missing or older than its source is executed here), and pages that are made of docstrings, of the status flags, of the barriers, of
-CONTRIBUTING and of the benchmarks' results.  Any warning of Sphinx is an error, and any dead link (`links.py`).
+Pages are put together in out/site/source: what stands in this folder, the notebooks and the gallery
+  as the tests have executed them (what
+is missing or older than its source is executed here), and pages that are made of docstrings, of the
+status flags, of the barriers, of CONTRIBUTING and of the benchmarks' results.  Any warning of
+Sphinx is an error, and any dead link (`links.py`).
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
     from nbclient import NotebookClient
 
     found = nbformat.read(notebook, as_version=4)
-    NotebookClient(found, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+    NotebookClient(
+        found, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    ).execute()
     found.metadata["source_digest"] = digest(notebook)
     EXECUTED.mkdir(parents=True, exist_ok=True)
     nbformat.write(found, EXECUTED / notebook.name)
@@ -41,7 +45,9 @@ def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
 def is_executed(notebook: Path) -> bool:
     """Whether this notebook, as it is now, was executed."""
     path = EXECUTED / notebook.name
-    return path.exists() and nbformat.read(path, as_version=4).metadata.get("source_digest") == digest(notebook)
+    return path.exists() and nbformat.read(path, as_version=4).metadata.get(
+        "source_digest"
+    ) == digest(notebook)
 
 
 def assemble() -> None:
@@ -67,7 +73,9 @@ def assemble() -> None:
         shutil.copy(EXECUTED / notebook.name, SOURCE / "tutorials")
     listed = "\n".join(notebook.stem for notebook in NOTEBOOKS)
     words = "The notebooks of the repository, in order, as the tests have run them."
-    (SOURCE / "tutorials" / "index.md").write_text(f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n")
+    (SOURCE / "tutorials" / "index.md").write_text(
+        f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
+    )
 
     for script in gallery.PAGES:
         if not gallery.is_made(script):
@@ -76,7 +84,10 @@ def assemble() -> None:
     (SOURCE / "gallery" / "index.md").write_text(gallery.index())
 
     (SOURCE / "extra").mkdir()
-    laws = {law: ij.presets.zhang_yan_2024(law=law, reading="corrected") for law in ("integral", "log", "tan", "pd")}
+    laws = {
+        law: ij.presets.zhang_yan_2024(law=law, reading="corrected")
+        for law in ("integral", "log", "tan", "pd")
+    }
     ij.explore(laws).save(SOURCE / "extra" / "live_loop.html")
     reference.write(SOURCE / "reference")
     flags.write(SOURCE / "how_to")
@@ -93,12 +104,29 @@ def main() -> int:
 
     jax.config.update("jax_enable_x64", True)
     assemble()
-    command = [sys.executable, "-m", "sphinx", "-q", "-j", "auto", "-W", "--keep-going", "-b", "html", str(SOURCE), str(SITE / "html")]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-j",
+        "auto",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        str(SOURCE),
+        str(SITE / "html"),
+    ]
     code = subprocess.run(command, check=False).returncode
     wrong = links.faults(SITE / "html")
     print("\n".join(wrong))
     code = code or int(bool(wrong))
-    print(f"written to {SITE.relative_to(ROOT) / 'html' / 'index.html'}" if code == 0 else "the site was not built")
+    print(
+        f"written to {SITE.relative_to(ROOT) / 'html' / 'index.html'}"
+        if code == 0
+        else "the site was not built"
+    )
     return code
 
 

@@ -1,4 +1,6 @@
-"""Sphinx's settings; `docs/build.py` calls it on the pages that it puts together in out/site/source."""
+"""Sphinx's settings; `docs/build.py` calls it on the pages that it puts together in
+out/site/source.
+"""
 
 import iblf_jax
 

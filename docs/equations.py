@@ -7,10 +7,21 @@ from collections.abc import Iterable
 
 LETTERS = "alpha beta gamma Gamma delta Delta eta theta kappa lambda mu xi pi Phi phi rho sigma tau"
 OPERATORS = "sin cos tan exp log ln det min max sum int"
-SYMBOLS = {name: rf"\{name} " for name in f"{LETTERS} {OPERATORS}".split()} | {"eps": r"\varepsilon ", "d": r"\mathrm{d}"}
+SYMBOLS = {name: rf"\{name} " for name in f"{LETTERS} {OPERATORS}".split()} | {
+    "eps": r"\varepsilon ",
+    "d": r"\mathrm{d}",
+}
 SYMBOLS |= {name: rf"{name[0]}_{{{name[1]}}}" for name in ("kf", "kc", "Kp", "Kd")}
 ACCENTS = {"hat": r"\hat", "tilde": r"\tilde"}
-SIGNS = {"<=": r"\le ", ">=": r"\ge ", "->": r"\to ", "!=": r"\ne ", "...": r"\dots ", "+-": r"\pm ", "-+": r"\mp "}
+SIGNS = {
+    "<=": r"\le ",
+    ">=": r"\ge ",
+    "->": r"\to ",
+    "!=": r"\ne ",
+    "...": r"\dots ",
+    "+-": r"\pm ",
+    "-+": r"\mp ",
+}
 SIGNS |= {"{": r"\{", "}": r"\}", "~": r"\sim ", "*": r"\cdot ", '"': r'\text{"}', "`": ""}
 TAG = re.compile(r"\(\d\.\d+\)(?:[-,]\s*\(\d\.\d+\))*")
 TOKENS = re.compile(
@@ -23,16 +34,31 @@ TOKENS = re.compile(
 
 def block(lines: Iterable[str]) -> str:
     """Lines of a docstring as one displayed equation in Markdown."""
-    return "$$\n\\begin{array}{l}\n" + " \\\\\n".join(tex(line.strip()) for line in lines if line.strip()) + "\n\\end{array}\n$$\n"
+    return (
+        "$$\n\\begin{array}{l}\n"
+        + " \\\\\n".join(tex(line.strip()) for line in lines if line.strip())
+        + "\n\\end{array}\n$$\n"
+    )
 
 
 def tex(text: str) -> str:
-    """One line in TeX.  A name of several letters that is no symbol is a word, or a function where its argument follows."""
+    """One line in TeX.  A name of several letters that is no symbol is a word, or a function where
+    its argument follows.
+    """
     parts = list[tuple[str, str]]()
     for found in TOKENS.finditer(text):
         token = found[0]
         if found["name"]:
-            parts.append(_name(found["name"], found["index"], found["sub"][1:], found["prime"], token, text[found.end() :]))
+            parts.append(
+                _name(
+                    found["name"],
+                    found["index"],
+                    found["sub"][1:],
+                    found["prime"],
+                    token,
+                    text[found.end() :],
+                )
+            )
         elif found["tag"]:
             parts.append(("sign", rf"\quad\text{{{token}}}"))
         elif found["gap"]:
@@ -48,20 +74,26 @@ def tex(text: str) -> str:
 
 
 def _joined(parts: list[tuple[str, str]]) -> str:
-    """The parts in a row, with the spaces that TeX would leave out: about words, and a small one where two symbols are multiplied."""
+    """The parts in a row, with the spaces that TeX would leave out: about words, and a small one
+    where two symbols are multiplied.
+    """
     kinds = ["", *(kind for kind, _ in parts), ""]
     out = ""
     for before, (kind, text), after in zip(kinds, parts, kinds[2:], strict=False):
         if kind == "word":
             out += rf"\text{{{text}}}"
         elif kind == "space":
-            out += r"\ " if "word" in (before, after) else r"\," if before == after == "name" else " "
+            out += (
+                r"\ " if "word" in (before, after) else r"\," if before == after == "name" else " "
+            )
         else:
             out += text
     return out
 
 
-def _name(name: str, index: str, sub: str, prime: str, token: str, following: str) -> tuple[str, str]:
+def _name(
+    name: str, index: str, sub: str, prime: str, token: str, following: str
+) -> tuple[str, str]:
     """A symbol with its index, its subscript and its primes, or a word."""
     prime = prime.replace('"', "''")
     if name == "a" and re.match(" [a-z]{3}", following):
@@ -70,7 +102,10 @@ def _name(name: str, index: str, sub: str, prime: str, token: str, following: st
         symbol = SYMBOLS.get(name, name)
         if sub in ACCENTS:
             return "name", f"{ACCENTS[sub]}{{{symbol.strip()}}}{_lower(index)}{prime}"
-        return "name", f"{symbol}{_lower(','.join(part for part in (index, _subscript(sub)) if part))}{prime}"
+        return (
+            "name",
+            f"{symbol}{_lower(','.join(part for part in (index, _subscript(sub)) if part))}{prime}",
+        )
     if name[0] == "d" and (len(name) == 2 or name[1:] in SYMBOLS):
         kind, rest = _name(name[1:], index, sub, prime, token[1:], following)
         return kind, rf"\mathrm{{d}} {rest}"

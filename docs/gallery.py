@@ -1,11 +1,12 @@
-"""The gallery: every script of examples/gallery and examples/reproductions is run once, and becomes a page with its text, its figures and
-what it printed.
+"""The gallery: every script of examples/gallery and examples/reproductions is run once, and becomes
+a page with its text, its figures and what it printed.
 
-A script begins with its page's words, "Title: words"; a block of it begins with "# %%" and more words, which may go on in the comment
-below.  A reproduction has its scenario beside it, a file of the same name, and may have published numbers there.
+A script begins with its page's words, "Title: words"; a block of it begins with "# %%" and more
+words, which may go on in the comment below.  A reproduction has its scenario beside it, a file of
+the same name, and may have published numbers there.
 
-The tests run the scripts with `page`, which keeps what they made in `out/site/gallery`; `docs/build.py` takes it from there, and runs what
-is missing or older than its script.
+The tests run the scripts with `page`, which keeps what they made in `out/site/gallery`;
+`docs/build.py` takes it from there, and runs what is missing or older than its script.
 """
 
 from __future__ import annotations
@@ -31,9 +32,13 @@ DPI = 110
 
 
 def digest(source: Path) -> str:
-    """What a page says of the script, or of the notebook, that it was made from, and of what lies beside it under the same name."""
+    """What a page says of the script, or of the notebook, that it was made from, and of what lies
+    beside it under the same name.
+    """
     files = [source, *(source.with_suffix(suffix) for suffix in (".toml", ".csv"))]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files if file.exists())).hexdigest()[:16]
+    return hashlib.sha256(
+        b"".join(file.read_bytes() for file in files if file.exists())
+    ).hexdigest()[:16]
 
 
 def is_of(page: Path, source: Path) -> bool:
@@ -77,7 +82,14 @@ def page(script: Path) -> list[Path]:
         os.chdir(before)
     beside = script.with_suffix(".toml")
     if beside.exists():
-        lines += [f"The scenario file, `{beside.relative_to(ROOT).as_posix()}`:", "", "```toml", beside.read_text().rstrip(), "```", ""]
+        lines += [
+            f"The scenario file, `{beside.relative_to(ROOT).as_posix()}`:",
+            "",
+            "```toml",
+            beside.read_text().rstrip(),
+            "```",
+            "",
+        ]
     (MADE / f"{script.stem}.md").write_text("\n".join(lines), encoding="utf-8")
     return pictures
 
@@ -86,7 +98,9 @@ def _words(block: str) -> tuple[str, str]:
     """What a block says, its first line and the comment below it, and its code."""
     words, *rest = block.split("\n")
     said = list(itertools.takewhile(lambda line: line.startswith("#"), rest))
-    return "\n".join([words.strip(), *(line[1:].strip() for line in said)]), "\n".join(rest[len(said) :])
+    return "\n".join([words.strip(), *(line[1:].strip() for line in said)]), "\n".join(
+        rest[len(said) :]
+    )
 
 
 def _picture(value: Any, stem: str) -> Path | None:
@@ -104,11 +118,19 @@ def index() -> str:
     """The page that shows all of them, by their first picture."""
     words = "Each picture is a script of `examples/gallery`; the tests run them."
     others = (
-        "Published examples of other authors, each a scenario file of `examples/reproductions`: what is printed and what is not, what "
-        "comes out here, and what could not be reproduced."
+        "Published examples of other authors, each a scenario file of `examples/reproductions`:"
+        " what is printed and what is not, what comes out here, and what could not be reproduced."
     )
     toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(script.stem for script in PAGES) + "\n```"
-    parts = ["# Gallery", words, _cards(SCRIPTS), "(reproductions)=\n## Reproductions", others, _cards(REPRODUCTIONS), toctree]
+    parts = [
+        "# Gallery",
+        words,
+        _cards(SCRIPTS),
+        "(reproductions)=\n## Reproductions",
+        others,
+        _cards(REPRODUCTIONS),
+        toctree,
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -117,6 +139,12 @@ def _cards(scripts: list[Path]) -> str:
     cards = []
     for script in scripts:
         text = (MADE / f"{script.stem}.md").read_text()
-        title, picture = text.split("\n# ", 1)[1].split("\n", 1)[0], text.split("![", 1)[1].split("](", 1)[1].split(")", 1)[0]
-        cards.append(f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n:img-top: {picture}\n:::")
+        title, picture = (
+            text.split("\n# ", 1)[1].split("\n", 1)[0],
+            text.split("![", 1)[1].split("](", 1)[1].split(")", 1)[0],
+        )
+        cards.append(
+            f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n:img-top:"
+            f" {picture}\n:::"
+        )
     return "::::{grid} 1 2 3 3\n:gutter: 2\n\n" + "\n".join(cards) + "\n\n::::"

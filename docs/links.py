@@ -1,4 +1,6 @@
-"""Links of the built site: none is dead, and every page is three clicks from the front page at most."""
+"""Links of the built site: none is dead, and every page is three clicks from the front page at
+most.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,11 @@ class _Page(HTMLParser):
 def faults(folder: Path) -> list[str]:
     """What is wrong with the links of the pages in a folder, a line each."""
     folder = folder.resolve()
-    pages = {path: _Page(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html") if "_static" not in path.parts}
+    pages = {
+        path: _Page(path.read_text(encoding="utf-8"))
+        for path in folder.rglob("*.html")
+        if "_static" not in path.parts
+    }
     wrong, leads = list[str](), dict[Path, set[Path]]()
     for path, page in pages.items():
         leads[path] = set()
@@ -49,5 +55,7 @@ def faults(folder: Path) -> list[str]:
         here = {target for path in here for target in leads.get(path, ())} - near
         near = near | here
     return wrong + [
-        f"{path.relative_to(folder)} is more than {CLICKS} clicks away" for path in pages if path not in near and path.name not in SPHINX
+        f"{path.relative_to(folder)} is more than {CLICKS} clicks away"
+        for path in pages
+        if path not in near and path.name not in SPHINX
     ]

@@ -1,4 +1,6 @@
-"""The page of benchmarks: a table and a plot of each result that `benchmarks/*.py --json benchmarks/results/NAME.json` has written."""
+"""The page of benchmarks: a table and a plot of each result that `benchmarks/*.py --json
+benchmarks/results/NAME.json` has written.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +29,36 @@ class Plot(NamedTuple):
 PLOTS = {
     "latency": Plot(("row",), "ms", "One run alone, as a notebook calls it; less is better."),
     "throughput": Plot(
-        ("row", "type"), "steps/s a core", "Many runs of the paper's loop at once; more is better.", {"loop": "paper", "runs": 4096}
+        ("row", "type"),
+        "steps/s a core",
+        "Many runs of the paper's loop at once; more is better.",
+        {"loop": "paper", "runs": 4096},
     ),
-    "gpu": Plot(("row", "device"), "steps/s", "Many runs of the paper's loop on a GPU, and on its machine's processor; more is better."),
-    "arm": Plot(("row", "type"), "steps/s a core", "Seven joints, beside what a user would take instead; more is better."),
-    "export": Plot(("law", "type"), "cycles", "One call of a law in C, as `ij.export` writes it; less is better."),
-    "constraints": Plot(("law",), "us a step", "What keeps which constraints, and the processor time of a step; less is better."),
+    "gpu": Plot(
+        ("row", "device"),
+        "steps/s",
+        "Many runs of the paper's loop on a GPU, and on its machine's processor; more is better.",
+    ),
+    "arm": Plot(
+        ("row", "type"),
+        "steps/s a core",
+        "Seven joints, beside what a user would take instead; more is better.",
+    ),
+    "export": Plot(
+        ("law", "type"),
+        "cycles",
+        "One call of a law in C, as `ij.export` writes it; less is better.",
+    ),
+    "constraints": Plot(
+        ("law",),
+        "us a step",
+        "What keeps which constraints, and the processor time of a step; less is better.",
+    ),
     "tuning": Plot(
         ("search",),
         "rollouts to 0.5 %",
-        "Two gains under a torque limit and a margin: rollouts until 0.5 % above the best; less is better.",
+        "Two gains under a torque limit and a margin: rollouts until 0.5 % above the best; less is"
+        " better.",
     ),
 }
 
@@ -44,15 +66,19 @@ PLOTS = {
 def write(page: Path) -> None:
     """Writes the page, and its pictures beside it."""
     parts = [
-        "# Benchmarks\n\nA table is one run of a program in `benchmarks/`, made from what it wrote; `python benchmarks/NAME.py` makes it "
-        "again. Rows are compared within one run, on a machine that others use too; where it says *a core*, processor time is counted. "
-        "What was tried, and what was learnt, is in the [lab notes](lab_notes.md).\n"
+        "# Benchmarks\n\nA table is one run of a program in `benchmarks/`, made from what it wrote;"
+        " `python benchmarks/NAME.py` makes it again. Rows are compared within one run, on a"
+        " machine that others use too; where it says *a core*, processor time is counted. What was"
+        " tried, and what was learnt, is in the [lab notes](lab_notes.md).\n"
     ]
     for name, plot in PLOTS.items():
         result = json.loads((RESULTS / f"{name}.json").read_text())
         draw(plot, result["rows"], page.with_name(f"benchmark_{name}.png"))
         machine = result["machine"]
-        where = f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, jax {machine['jax']}, {machine['date']}"
+        where = (
+            f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, jax"
+            f" {machine['jax']}, {machine['date']}"
+        )
         parts.append(
             f"## {result['title']}\n\n{plot.words} `{result['command']}`; {where}.\n\n"
             f"![{result['title']}](benchmark_{name}.png)\n\n{table(result['rows'])}\n"

@@ -1,4 +1,5 @@
-"""Pages of the types that a class of a user's own returns or is given: protocols, records and type aliases.
+"""Pages of the types that a class of a user's own returns or is given: protocols, records and type
+aliases.
 
 A protocol is shown with its methods, a record with its fields; the text of a field is the string
 that follows it in the source, which `inspect` does not know.
@@ -32,14 +33,18 @@ def is_record(thing: Any) -> bool:
 
 def types_of(module: ModuleType) -> dict[str, Any]:
     """The public protocols and records of a family, protocols first."""
-    things = {name: thing for name, thing in vars(module).items() if _belongs_to(thing, name, module)}
+    things = {
+        name: thing for name, thing in vars(module).items() if _belongs_to(thing, name, module)
+    }
     protocols = {name: thing for name, thing in things.items() if is_protocol(thing)}
     records = {name: thing for name, thing in things.items() if is_record(thing)}
     return protocols | records
 
 
 def _belongs_to(thing: Any, name: str, module: ModuleType) -> bool:
-    """Whether a name of a family's module is one of its own: listed, defined there, or what its members see."""
+    """Whether a name of a family's module is one of its own: listed, defined there, or what its
+    members see.
+    """
     listed = getattr(module, "__all__", None)
     if listed is not None:
         return name in listed
@@ -50,7 +55,9 @@ def texts_of_fields(body: list[ast.stmt]) -> dict[str, str]:
     """Name of every assignment in a body -> the string that follows it, "" if none does."""
     texts = {}
     for statement, after in zip(body, [*body[1:], None], strict=True):
-        target = getattr(statement, "target", None) or next(iter(getattr(statement, "targets", [])), None)
+        target = getattr(statement, "target", None) or next(
+            iter(getattr(statement, "targets", [])), None
+        )
         if not isinstance(target, ast.Name):
             continue
         follows = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
@@ -65,7 +72,11 @@ def alias_text(module: ModuleType, name: str) -> str:
 
 def fields_of(record: type) -> dict[str, str]:
     """Name of every field of a record -> what it is."""
-    texts = {name: f"{signal.meaning} [{signal.unit}]" for name, signal in SIGNALS.items()} if record is Sample else {}
+    texts = (
+        {name: f"{signal.meaning} [{signal.unit}]" for name, signal in SIGNALS.items()}
+        if record is Sample
+        else {}
+    )
     definition = ast.parse(textwrap.dedent(inspect.getsource(record))).body[0]
     assert isinstance(definition, ast.ClassDef)
     return texts | texts_of_fields(definition.body)
@@ -83,7 +94,12 @@ def page(thing: Any, name: str, level: int, body: Callable[[str], str]) -> str:
             continue
         lines += [f"{'#' * (level + 1)} {name}.{member}", ""]
         if isinstance(value, FunctionType):
-            lines += ["```python", f"{member}({', '.join(list(inspect.signature(value).parameters)[1:])})", "```", ""]
+            lines += [
+                "```python",
+                f"{member}({', '.join(list(inspect.signature(value).parameters)[1:])})",
+                "```",
+                "",
+            ]
         lines += [body(inspect.getdoc(value) or ""), ""]
     for attribute, text in ({} if is_record(thing) else _attributes(thing)).items():
         lines += [f"- **{attribute}**: {' '.join(text.split())}", ""]

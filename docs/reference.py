@@ -17,29 +17,43 @@ SECTIONS = ("Args", "Returns", "Raises", "Source")
 PAGES: dict[str, tuple[str, str]] = {
     "runs": (
         "Scenarios and runs",
-        "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status SimulationError SimulationWarning parameters "
-        "with_parameters recommended_dt recommended_period vector_field VectorField explain component leaf Leaf static astype",
+        (
+            "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status"
+            " SimulationError SimulationWarning parameters with_parameters recommended_dt"
+            " recommended_period vector_field VectorField explain component leaf Leaf static astype"
+        ),
     ),
     "studies": (
         "Studies",
-        "monte_carlo Study sweep load_sweep StoreError sensitivity Sensitivity compare Comparison factor offset value uniform normal "
-        "log_uniform choice joint_normal",
+        (
+            "monte_carlo Study sweep load_sweep StoreError sensitivity Sensitivity compare"
+            " Comparison factor offset value uniform normal log_uniform choice joint_normal"
+        ),
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
     "tuning": (
         "Tuning",
-        "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning load_tuning objectives.Quantity objectives.Outer",
+        (
+            "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning"
+            " load_tuning objectives.Quantity objectives.Outer"
+        ),
     ),
     "identification": ("Parameters from logs", "identify Identification excitation"),
     "out": (
         "Out of Python, files and reports",
-        "export Exported explore cosimulate report load_scenario save_scenario load_rollouts save_rollouts",
+        (
+            "export Exported explore cosimulate report load_scenario save_scenario load_rollouts"
+            " save_rollouts"
+        ),
     ),
     "testing": (
         "Checkers for your own classes",
-        "testing.check_law testing.check_barrier testing.check_observer testing.check_sensor testing.check_actuator testing.check_robot "
-        "testing.check_reference testing.check_side testing.check_region testing.check_disturbance testing.check_fold "
-        "testing.check_objective testing.ContractError",
+        (
+            "testing.check_law testing.check_barrier testing.check_observer testing.check_sensor"
+            " testing.check_actuator testing.check_robot testing.check_reference testing.check_side"
+            " testing.check_region testing.check_disturbance testing.check_fold"
+            " testing.check_objective testing.ContractError"
+        ),
     ),
 }
 """Page -> its title and the names that it explains."""
@@ -66,7 +80,9 @@ def page_of(thing: Any, name: str, level: int = 2) -> str:
         return public_types.page(thing, name, level, body)
     documented_in = public_types.ALIASES.get(name)
     if documented_in is not None:
-        return "\n".join([f"{'#' * level} {name}", "", body(public_types.alias_text(documented_in, name)), ""])
+        return "\n".join(
+            [f"{'#' * level} {name}", "", body(public_types.alias_text(documented_in, name)), ""]
+        )
     doc = inspect.getdoc(thing) or ""
     lines = [f"{'#' * level} {name}", ""]
     if callable(thing):
@@ -79,13 +95,21 @@ def _signature(thing: Any) -> str:
         text = str(inspect.signature(thing))
     except (TypeError, ValueError):
         return "(...)"
-    text = re.sub(r": '([^']*)'", r": \1", re.sub(r"iblf_jax(\.\w+)+\.(\w+)", r"\2", text)).replace(" -> None", "")
+    text = re.sub(r": '([^']*)'", r": \1", re.sub(r"iblf_jax(\.\w+)+\.(\w+)", r"\2", text)).replace(
+        " -> None", ""
+    )
     text = re.sub(r"-> '([^']*)'", r"-> \1", re.sub(r"<[^>]*>", "...", text)).replace("'", '"')
-    return text if len(text) < 90 else text.replace("(", "(\n    ", 1).replace(", ", ",\n    ").replace(") ->", "\n) ->")
+    return (
+        text
+        if len(text) < 90
+        else text.replace("(", "(\n    ", 1).replace(", ", ",\n    ").replace(") ->", "\n) ->")
+    )
 
 
 def body(doc: str) -> str:
-    """A docstring in Markdown: sections as lists, what is set in as an equation, or as code where it is Python's."""
+    """A docstring in Markdown: sections as lists, what is set in as an equation, or as code where
+    it is Python's.
+    """
     out, section, set_in = list[str](), "", list[str]()
     first, _, rest = doc.partition("\n")
     if re.match(r"[\w']+ = ", first):
@@ -111,7 +135,9 @@ def body(doc: str) -> str:
 
 
 def named(name: str) -> Any:
-    """What a public name stands for; one of a module of the package's has a dot, "testing.check_law"."""
+    """What a public name stands for; one of a module of the package's has a dot,
+    "testing.check_law".
+    """
     return functools.reduce(getattr, name.split("."), ij)
 
 
@@ -128,11 +154,17 @@ def write(folder: Path) -> None:
         members = {cls.__name__: cls for cls in module.MEMBERS.values()}
         texts = [page_of(cls, name) for name, cls in members.items()]
         texts += [f"## {OWN_TYPES}\n"]
-        texts += [page_of(thing, f"{family}.{name}", 3) for name, thing in public_types.types_of(module).items()]
-        (folder / f"{family}.md").write_text(f"# {family.capitalize()}\n\n{body(inspect.getdoc(module) or '')}\n\n" + "\n".join(texts))
+        texts += [
+            page_of(thing, f"{family}.{name}", 3)
+            for name, thing in public_types.types_of(module).items()
+        ]
+        (folder / f"{family}.md").write_text(
+            f"# {family.capitalize()}\n\n{body(inspect.getdoc(module) or '')}\n\n"
+            + "\n".join(texts)
+        )
         names.append(family)
     listed = "\n".join(names)
     (folder / "index.md").write_text(
-        "# Reference\n\nEvery public name, from its docstring. [All members in one table](../members.md).\n\n"
-        f"```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
+        "# Reference\n\nEvery public name, from its docstring. [All members in one"
+        f" table](../members.md).\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
     )

@@ -1,4 +1,6 @@
-"""iblf_jax: simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots, in JAX."""
+"""iblf_jax: simulate, compare, certify and tune barrier-Lyapunov tracking controllers of
+constrained robots, in JAX.
+"""
 
 from iblf_jax import _start as _start
 
@@ -72,11 +74,15 @@ _PUBLIC_MODULES = {
 
 
 def _keep_public_import_paths() -> None:
-    """Make `import iblf_jax.robots` the same module as `iblf_jax.world.robots`, submodules included."""
+    """Make `import iblf_jax.robots` the same module as `iblf_jax.world.robots`, submodules
+    included.
+    """
     for folder, names in _PUBLIC_MODULES.items():
         for name in names:
             home = f"iblf_jax.{folder}.{name}"
-            for module in [key for key in _sys.modules if key == home or key.startswith(f"{home}.")]:
+            for module in [
+                key for key in _sys.modules if key == home or key.startswith(f"{home}.")
+            ]:
                 _sys.modules[module.replace(home, f"iblf_jax.{name}", 1)] = _sys.modules[module]
 
 
@@ -162,8 +168,8 @@ _ON_FIRST_USE = {
     "tune_file": ("iblf_jax.files.tuning", "tune_file"),
     "TuneResult": ("iblf_jax.tuning", "TuneResult"),
 }
-"""Public name -> (module, attribute or None for the module itself): imported when first used, so that `import iblf_jax` stays
-quick and brings neither matplotlib nor optax nor xarray."""
+"""Public name -> (module, attribute or None for the module itself): imported when first used, so
+that `import iblf_jax` stays quick and brings neither matplotlib nor optax nor xarray."""
 
 
 def __getattr__(name: str):
@@ -177,4 +183,8 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted(name for name in {*globals(), *_ON_FIRST_USE} if not name.startswith("_") or name == "__version__")
+    return sorted(
+        name
+        for name in {*globals(), *_ON_FIRST_USE}
+        if not name.startswith("_") or name == "__version__"
+    )

@@ -1,7 +1,8 @@
-"""The first that is imported: a command can be interrupted from here on, quietly, while all the rest is imported.
+"""The first that is imported: a command can be interrupted from here on, quietly, while all the
+rest is imported.
 
-Only a process that was started as `python -m iblf_jax` or `iblf-jax` is meant; elsewhere this changes nothing.  It imports nothing that
-takes time.
+Only a process that was started as `python -m iblf_jax` or `iblf-jax` is meant; elsewhere this
+changes nothing.  It imports nothing that takes time.
 """
 
 from __future__ import annotations
@@ -31,10 +32,16 @@ def end_process(number: int, frame: object) -> None:
 
 
 def _is_a_command() -> bool:
-    """Whether Python is about to run this package's command line; under `-m` it imports the package before it says so in sys.argv."""
+    """Whether Python is about to run this package's command line; under `-m` it imports the package
+    before it says so in sys.argv.
+    """
     if sys.argv[:1] == ["-m"]:
         return sys.orig_argv[len(sys.orig_argv) - len(sys.argv)] in ("iblf_jax", "-miblf_jax")
-    return bool(sys.argv) and os.path.basename(sys.argv[0]) in ("iblf-jax", "iblf-jax.exe", "iblf-jax-script.py")
+    return bool(sys.argv) and os.path.basename(sys.argv[0]) in (
+        "iblf-jax",
+        "iblf-jax.exe",
+        "iblf-jax-script.py",
+    )
 
 
 if _is_a_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -1,6 +1,7 @@
 """Results that show themselves: a card in a notebook, `report` a page of its own.
 
-Both are made of the same parts (`Shown`): what it is, tables, and figures, which are drawn only where they are asked for.  A result of
+Both are made of the same parts (`Shown`): what it is, tables, and figures, which are drawn only
+  where they are asked for.  A result of
 another kind than those below is shown by its text, and its figure if it has a `plot`.
 """
 
@@ -79,7 +80,16 @@ def _parts_of(scenario: Scenario) -> str:
             continue
         inner = getattr(part, getattr(type(part), "wraps", None) or "barrier", None)
         kind = type(part).__name__ + (f" ({type(inner).__name__})" if inner is not None else "")
-        rows.append((name, kind, ", ".join(f"{p.path} = {_short(p.value)}" for p in parameters(part, named=False)[:MOST_LEAVES])))
+        rows.append(
+            (
+                name,
+                kind,
+                ", ".join(
+                    f"{p.path} = {_short(p.value)}"
+                    for p in parameters(part, named=False)[:MOST_LEAVES]
+                ),
+            )
+        )
     return tables.as_html(("part", "kind", "parameters"), rows)
 
 
@@ -90,19 +100,31 @@ MOST_LEAVES = 4
 def _short(value: Any) -> str:
     if not checks.is_concrete(value):
         return "traced"
-    return np.array2string(np.asarray(value), precision=4, threshold=7, edgeitems=2, separator=", ").replace("\n", "")
+    return np.array2string(
+        np.asarray(value), precision=4, threshold=7, edgeitems=2, separator=", "
+    ).replace("\n", "")
 
 
 def _scenario(scenario: Scenario) -> Shown:
     from iblf_jax import plotting
 
     figures = (
-        {"Reference in its tube": lambda: plotting.tube(scenario)} if checks.is_concrete(scenario) and scenario.initial.q.ndim == 1 else {}
+        {"Reference in its tube": lambda: plotting.tube(scenario)}
+        if checks.is_concrete(scenario) and scenario.initial.q.ndim == 1
+        else {}
     )
     every = parameters(scenario, named=False)
-    every_leaf = tables.as_html(("path", "unit", "value"), [(p.path, p.unit, _short(p.value)) for p in every])
+    every_leaf = tables.as_html(
+        ("path", "unit", "value"), [(p.path, p.unit, _short(p.value)) for p in every]
+    )
     words = [f"{scenario.n} joints: {', '.join(joint_names(scenario.plant, scenario.n))}"]
-    return Shown("Scenario", words, {"Parts": _parts_of(scenario), "Parameters": every_leaf}, figures, scenario)
+    return Shown(
+        "Scenario",
+        words,
+        {"Parts": _parts_of(scenario), "Parameters": every_leaf},
+        figures,
+        scenario,
+    )
 
 
 def _rollout(run: Rollout) -> Shown:
@@ -110,7 +132,10 @@ def _rollout(run: Rollout) -> Shown:
 
     if not checks.is_concrete(run) or run.is_batch:
         return Shown("Run", _described(run), {}, {}, None)
-    rows = [(name, run.metrics.units.get(name, ""), *(f"{x:.4g}" for x in np.ravel(value))) for name, value in run.metrics.items()]
+    rows = [
+        (name, run.metrics.units.get(name, ""), *(f"{x:.4g}" for x in np.ravel(value)))
+        for name, value in run.metrics.items()
+    ]
     rows = [(*row, *[""] * (2 + run.n - len(row)))[: 2 + run.n] for row in rows]
     table = tables.as_html(("metric", "unit", *joint_names(run.scenario.plant, run.n)), rows)
     figures: dict[str, Callable[[], Figure]] = {
@@ -127,7 +152,13 @@ def _perturbation(drawn: Any) -> str:
     """A perturbation in words: "factor uniform, low 0.8, high 1.2"."""
     distribution = drawn.distribution
     numbers = [f"{p.path} {_short(p.value)}" for p in parameters(distribution, named=False)]
-    return ", ".join([f"{drawn.kind} {type(distribution).__name__.lower()}", *numbers, *(["shared"] if drawn.shared else [])])
+    return ", ".join(
+        [
+            f"{drawn.kind} {type(distribution).__name__.lower()}",
+            *numbers,
+            *(["shared"] if drawn.shared else []),
+        ]
+    )
 
 
 def _study(study: Study) -> Shown:
@@ -141,37 +172,79 @@ def _study(study: Study) -> Shown:
     for name in map(str, quantiles.data_vars):
         values = np.asarray(quantiles[name]).reshape(3, -1)
         worst = (np.argmin if name in SMALLER_IS_WORSE else np.argmax)(values[1])
-        rows.append((name, study.metrics.units.get(name, ""), *(f"{x:.4g}" for x in values[:, worst])))
-    of_metrics = tables.as_html(("metric, of the worst joint", "unit", "5 %", "median", "95 %"), rows)
-    drawn = tables.as_html(("path", "perturbation"), [(path, _perturbation(x)) for path, x in study.perturbations.items()])
+        rows.append(
+            (name, study.metrics.units.get(name, ""), *(f"{x:.4g}" for x in values[:, worst]))
+        )
+    of_metrics = tables.as_html(
+        ("metric, of the worst joint", "unit", "5 %", "median", "95 %"), rows
+    )
+    drawn = tables.as_html(
+        ("path", "perturbation"),
+        [(path, _perturbation(x)) for path, x in study.perturbations.items()],
+    )
     first = "margin" if "margin" in study.metrics else next(iter(study.metrics))
-    figures: dict[str, Callable[[], Figure]] = {f"Distribution of {first}": lambda: plotting.histograms(study, [first])}
+    figures: dict[str, Callable[[], Figure]] = {
+        f"Distribution of {first}": lambda: plotting.histograms(study, [first])
+    }
     if first == "margin":  # makes some of the runs again
         figures["At a glance"] = lambda: plotting.study_overview(study)
     figures["Every metric"] = lambda: plotting.histograms(study)
-    return Shown("Monte-Carlo study", _described(study), {"Metrics": of_metrics, "Perturbed": drawn}, figures, study.scenario)
+    return Shown(
+        "Monte-Carlo study",
+        _described(study),
+        {"Metrics": of_metrics, "Perturbed": drawn},
+        figures,
+        study.scenario,
+    )
 
 
 def _certificate(found: Certificate) -> Shown:
     return Shown(
-        f"Certificate: {found.verdict}", [found.subject], {"Line by line": found.table_html()}, {"Along the run": found.plot}, None
+        f"Certificate: {found.verdict}",
+        [found.subject],
+        {"Line by line": found.table_html()},
+        {"Along the run": found.plot},
+        None,
     )
 
 
 def _comparison(found: Comparison) -> Shown:
     first = next(iter(found.rollouts.values())).scenario
-    return Shown("Comparison", _described(found)[:1], found.tables_html(), {"Side by side": found.plot}, first, on_card=2)
+    return Shown(
+        "Comparison",
+        _described(found)[:1],
+        found.tables_html(),
+        {"Side by side": found.plot},
+        first,
+        on_card=2,
+    )
 
 
 def _tuning(found: TuneResult) -> Shown:
-    rows = [(path, unit_at(found.start, path), _short(get(found.start, path)), _short(value)) for path, value in found.values.items()]
+    rows = [
+        (path, unit_at(found.start, path), _short(get(found.start, path)), _short(value))
+        for path, value in found.values.items()
+    ]
     gains = tables.as_html(("tuned", "unit", "before", "after"), rows)
     words = [*str(found.report).splitlines(), f"How it was found: {_described(found)[0]}"]
-    return Shown("Tuning", words, {"Gains": gains}, {"The search, and runs before and after": found.plot}, found.scenario)
+    return Shown(
+        "Tuning",
+        words,
+        {"Gains": gains},
+        {"The search, and runs before and after": found.plot},
+        found.scenario,
+    )
 
 
 def _identification(found: Identification) -> Shown:
-    return Shown("Identification", found.words(), found.tables_html(), {"Numbers and what is left": found.plot}, found.scenario, on_card=2)
+    return Shown(
+        "Identification",
+        found.words(),
+        found.tables_html(),
+        {"Numbers and what is left": found.plot},
+        found.scenario,
+        on_card=2,
+    )
 
 
 KINDS: dict[str, Callable[[Any], Shown]] = {
@@ -192,7 +265,9 @@ def shown(result: Any) -> Shown:
     if maker is not None:
         return maker(result)
     figures = {"Figure": result.plot} if callable(getattr(result, "plot", None)) else {}
-    return Shown(type(result).__name__, _described(result), {}, figures, getattr(result, "scenario", None))
+    return Shown(
+        type(result).__name__, _described(result), {}, figures, getattr(result, "scenario", None)
+    )
 
 
 def _image(figure: Figure, dpi: int, words: str) -> str:
@@ -204,13 +279,23 @@ def _image(figure: Figure, dpi: int, words: str) -> str:
 
 
 def _lines(words: Sequence[str]) -> str:
-    return f"<pre>{html.escape(chr(10).join(words))}</pre>" if len(words) > 1 else "".join(f"<p>{html.escape(x)}</p>" for x in words)
+    return (
+        f"<pre>{html.escape(chr(10).join(words))}</pre>"
+        if len(words) > 1
+        else "".join(f"<p>{html.escape(x)}</p>" for x in words)
+    )
 
 
 def card(result: Any) -> str:
-    """What a notebook shows of a result: title, words, its first table and its first figure, as HTML."""
+    """What a notebook shows of a result: title, words, its first table and its first figure, as
+    HTML.
+    """
     parts = shown(result)
-    text = [f"<b>{html.escape(parts.title)}</b>", _lines(parts.words), *list(parts.tables.values())[: parts.on_card]]
+    text = [
+        f"<b>{html.escape(parts.title)}</b>",
+        _lines(parts.words),
+        *list(parts.tables.values())[: parts.on_card],
+    ]
     for name, draw in list(parts.figures.items())[:1]:
         text.append(_image(draw(), CARD_DPI, name))
     return f"<div>{''.join(text)}</div>"
@@ -218,10 +303,12 @@ def card(result: Any) -> str:
 
 @notices.each_warning_once
 def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
-    """Writes a result as one HTML file that needs nothing else: words, tables, figures, the scenario and the versions.
+    """Writes a result as one HTML file that needs nothing else: words, tables, figures, the
+    scenario and the versions.
 
     Args:
-      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, Identification, or any other result of this package.
+      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, Identification, or
+        any other result of this package.
       path: the file, ".html"; its folder must exist.
       title: the heading; the kind of the result if not given.
 
@@ -229,7 +316,8 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
       The path of the file.
 
     Raises:
-      ValueError: a title that is no text, a path that ends otherwise, or an object that is no result.
+      ValueError: a title that is no text, a path that ends otherwise, or an object that is no
+        result.
       OSError: the file cannot be written.
 
     Source: design of this package.
@@ -240,7 +328,12 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     if path.suffix not in (".html", ".htm"):
         raise checks.fail("path", str(path), 'a file that ends in ".html"')
     if not type(result).__module__.startswith("iblf_jax"):
-        raise checks.fail("result", result, "a result of this package", "Such as what ij.simulate or ij.tune returns.")
+        raise checks.fail(
+            "result",
+            result,
+            "a result of this package",
+            "Such as what ij.simulate or ij.tune returns.",
+        )
     path.write_text(_page(shown(result), title), encoding="utf-8")
     return path
 
@@ -250,7 +343,11 @@ def _page(parts: Shown, title: str | None) -> str:
     from iblf_jax.files.scenario import scenario_to_toml
 
     heading = html.escape(title or parts.title)
-    body = [f"<h1>{heading}</h1>", *([f"<p>{html.escape(parts.title)}</p>"] if title else []), _lines(parts.words)]
+    body = [
+        f"<h1>{heading}</h1>",
+        *([f"<p>{html.escape(parts.title)}</p>"] if title else []),
+        _lines(parts.words),
+    ]
     for name, table in parts.tables.items():
         body.append(f'<h2>{html.escape(name)}</h2><div class="wide">{table}</div>')
     for name, draw in parts.figures.items():
@@ -260,9 +357,20 @@ def _page(parts: Shown, title: str | None) -> str:
             text = scenario_to_toml(parts.scenario)
         except ValueError:  # a batch, or a class that files have no name for
             text = repr(parameters(parts.scenario, named=False))
-        body.append(f"<h2>As a file</h2><details><summary>the scenario</summary><pre>{html.escape(text)}</pre></details>")
+        body.append(
+            "<h2>As a file</h2><details><summary>the"
+            f" scenario</summary><pre>{html.escape(text)}</pre></details>"
+        )
     made = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    versions = f"iblf_jax {iblf_jax.__version__}, jax {jax.__version__}, numpy {np.__version__}, Python {platform.python_version()}"
+    versions = (
+        f"iblf_jax {iblf_jax.__version__}, jax {jax.__version__}, numpy {np.__version__}, Python"
+        f" {platform.python_version()}"
+    )
     body.append(f"<footer>{made}; {versions}</footer>")
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{heading}</title><style>{STYLE}</style>'
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>\n'
+    head = (
+        '<meta charset="utf-8"><meta name="viewport"'
+        f' content="width=device-width"><title>{heading}</title><style>{STYLE}</style>'
+    )
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>\n'
+    )

@@ -1,4 +1,5 @@
-"""Arms that several test files look at: real ones from tests/data/arms, random chains, and the same chains as MuJoCo's MJCF."""
+"""Arms that several test files look at: real ones from tests/data/arms, random chains, and the same
+chains as MuJoCo's MJCF."""
 
 from __future__ import annotations
 
@@ -22,8 +23,13 @@ def random_inertia(rng) -> np.ndarray:
 def random_arm(n: int, seed: int, prismatic: float = 0.3, **fields) -> ij.robots.Arm:
     """A chain of n links with nothing aligned, and a load at its tip."""
     rng = np.random.default_rng(seed)
-    kinds = tuple("prismatic" if x < prismatic else "revolute" for x in np.random.default_rng(n).uniform(size=n))  # compiled once for an n
-    carried = ij.robots.Payload(mass=rng.uniform(0.1, 1), centre=rng.normal(size=3) * 0.1, inertia=random_inertia(rng))
+    kinds = tuple(
+        "prismatic" if x < prismatic else "revolute"
+        for x in np.random.default_rng(n).uniform(size=n)
+    )  # compiled once for an n
+    carried = ij.robots.Payload(
+        mass=rng.uniform(0.1, 1), centre=rng.normal(size=3) * 0.1, inertia=random_inertia(rng)
+    )
     return ij.robots.Arm(
         mass=rng.uniform(0.2, 4, n),
         centre=rng.normal(size=(n, 3)) * 0.1,
@@ -45,20 +51,34 @@ def _words(values) -> str:
 
 
 def _inertial(mass, centre, inertia) -> str:
-    return f'<inertial pos="{_words(centre)}" mass="{_words(mass)}" fullinertia="{_words(inertia)}"/>'
+    return (
+        f'<inertial pos="{_words(centre)}" mass="{_words(mass)}" fullinertia="{_words(inertia)}"/>'
+    )
 
 
 def as_mjcf(arm: ij.robots.Arm) -> str:
     """The same arm, written by hand for MuJoCo, what it carries as a body of its own."""
-    carried, tip = arm.carried, f'pos="{_words(arm.tip_position)}" quat="{_words(arm.tip_rotation)}"'
-    inner = f'<site name="tip" {tip}/><body name="load" {tip}>{_inertial(carried.mass, carried.centre, carried.inertia)}</body>'
+    carried, tip = (
+        arm.carried,
+        f'pos="{_words(arm.tip_position)}" quat="{_words(arm.tip_rotation)}"',
+    )
+    inner = (
+        f'<site name="tip" {tip}/><body name="load"'
+        f" {tip}>{_inertial(carried.mass, carried.centre, carried.inertia)}</body>"
+    )
     for i in reversed(range(arm.n)):
         kind = {"revolute": "hinge", "prismatic": "slide"}[arm.kinds[i]]
-        joint = f'<joint name="{arm.joints[i]}" type="{kind}" axis="{_words(arm.axis[i])}" armature="{_words(arm.armature[i])}"/>'
+        joint = (
+            f'<joint name="{arm.joints[i]}" type="{kind}" axis="{_words(arm.axis[i])}"'
+            f' armature="{_words(arm.armature[i])}"/>'
+        )
         place = f'pos="{_words(arm.position[i])}" quat="{_words(arm.rotation[i])}"'
         inertial = _inertial(arm.mass[i], arm.centre[i], arm.inertia[i])
         inner = f'<body name="{arm.links[i]}" {place}>{joint}{inertial}{inner}</body>'
-    return f'<mujoco><compiler angle="radian"/><option gravity="{_words(arm.g)}"/><worldbody>{inner}</worldbody></mujoco>'
+    return (
+        '<mujoco><compiler angle="radian"/><option'
+        f' gravity="{_words(arm.g)}"/><worldbody>{inner}</worldbody></mujoco>'
+    )
 
 
 def without_constraints(model):

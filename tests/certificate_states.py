@@ -1,4 +1,5 @@
-"""Random states, gains and masses of the closed loop, for tests of what must hold at every state."""
+"""Random states, gains and masses of the closed loop, for tests of what must hold at every
+state."""
 
 from __future__ import annotations
 
@@ -16,20 +17,32 @@ from iblf_jax.simulation.scenario import canonical
 STATES = 4096
 
 
-def loop(reading: str = "corrected", observer: str = "momentum", barrier=None, wall: float = 1e-3) -> ij.Scenario:
+def loop(
+    reading: str = "corrected", observer: str = "momentum", barrier=None, wall: float = 1e-3
+) -> ij.Scenario:
     """The paper's loop with one law and one observer, to be varied by `random_loops`."""
     barrier = ij.barriers.Integral(guard=wall) if barrier is None else barrier
     law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=barrier, reading=reading)
     paper = ij.presets.zhang_yan_2024()
-    return canonical(dataclasses.replace(paper, controller=law, observer=ij.observers.MEMBERS[observer](kf=20.0)))
+    return canonical(
+        dataclasses.replace(paper, controller=law, observer=ij.observers.MEMBERS[observer](kf=20.0))
+    )
 
 
 def random_loops(
-    scenario: ij.Scenario, seed: int = 0, *, states: int = STATES, speed: float = 10.0, nearest: float = 0.99, weighted: bool = False
+    scenario: ij.Scenario,
+    seed: int = 0,
+    *,
+    states: int = STATES,
+    speed: float = 10.0,
+    nearest: float = 0.99,
+    weighted: bool = False,
 ):
-    """Scenarios with other gains, masses and disturbances, and a time and state of each: (scenario, t, state), batched.
+    """Scenarios with other gains, masses and disturbances, and a time and state of each: (scenario,
+    t, state), batched.
 
-    With `weighted` the barriers have weights, and the gains are anything positive: below the conditions of Theorem 2, too.
+    With `weighted` the barriers have weights, and the gains are anything positive: below the
+    conditions of Theorem 2, too.
     """
     dtype, rng, n = scenario.initial.q.dtype, np.random.default_rng(seed), scenario.n
 
@@ -40,17 +53,25 @@ def random_loops(
     o = {} if scenario.controller.o is None else {"o": 10 ** uniform(-3, 0, n)}
     batch = _rebuilt(
         every,
-        controller=_rebuilt(every.controller, k1=10 ** uniform(-1, 1, n), K2=0.5 + 10 ** uniform(-2, 1.7, n), **o),
+        controller=_rebuilt(
+            every.controller, k1=10 ** uniform(-1, 1, n), K2=0.5 + 10 ** uniform(-2, 1.7, n), **o
+        ),
         observer=_rebuilt(every.observer, kf=1.0 + 10 ** uniform(-2, 1.7, n)),
         disturbance=_rebuilt(every.disturbance, phase=uniform(0.0, 6.28)),
-        plant=_rebuilt(every.plant, mass=every.plant.mass * uniform(0.5, 1.5, n), payload=uniform(0.0, 0.5)),
+        plant=_rebuilt(
+            every.plant, mass=every.plant.mass * uniform(0.5, 1.5, n), payload=uniform(0.0, 0.5)
+        ),
         model=_rebuilt(every.model, mass=every.model.mass * uniform(0.5, 1.5, n)),
     )
     t, dq = uniform(0.0, 20.0), uniform(-speed, speed, n)
     q, momentum = _position(batch, t, uniform(-nearest, nearest, n), dq)
     if weighted:
-        law = _rebuilt(batch.controller, weight=10 ** uniform(-3, 1.5, n), K2=10 ** uniform(-3, 1.7, n))
-        batch = _rebuilt(batch, controller=law, observer=_rebuilt(batch.observer, kf=10 ** uniform(-3, 1.7, n)))
+        law = _rebuilt(
+            batch.controller, weight=10 ** uniform(-3, 1.5, n), K2=10 ** uniform(-3, 1.7, n)
+        )
+        batch = _rebuilt(
+            batch, controller=law, observer=_rebuilt(batch.observer, kf=10 ** uniform(-3, 1.7, n))
+        )
     return batch, t, LoopState(q, dq, (), uniform(-5.0, 5.0, n) - batch.observer.kf * momentum)
 
 

@@ -1,4 +1,5 @@
-"""Settings of all tests: float64, no compilation cache on disk, no display, and the compiled runs that many tests share."""
+"""Settings of all tests: float64, no compilation cache on disk, no display, and the compiled runs
+that many tests share."""
 
 from __future__ import annotations
 
@@ -15,15 +16,20 @@ ROOT = Path(__file__).resolve().parent.parent
 os.environ.setdefault("MPLBACKEND", "Agg")
 # On a machine with a GPU, too.  `JAX_PLATFORMS=cuda,cpu` runs test_lowering_gpu.py on it.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# In the environment, for notebooks, benchmarks and commands too, which are processes of their own.  Few programs are met twice, and to keep
-# what is compiled takes longer (15 to 25 % of a test file's time) than to compile these few again.
+# In the environment, for notebooks, benchmarks and commands too, which are processes of their own.
+# Few programs are met twice, and to keep what is compiled takes longer (15 to 25 % of a test file's
+# time) than to compile these few again.
 os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "0")
-# Where in Python an operation was written stands in no program that is compiled, and costs a tenth of the tracing.
+# Where in Python an operation was written stands in no program that is compiled, and costs a tenth
+# of the tracing.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
-# Python is told to look for garbage less often: this process here, those that it starts by what they find on their path.
+# Python is told to look for garbage less often: this process here, those that it starts by what
+# they find on their path.
 STARTUP = ROOT / "tests" / "startup"
 if str(STARTUP) not in os.environ.get("PYTHONPATH", ""):
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(STARTUP), *filter(None, [os.environ.get("PYTHONPATH")])])
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        [str(STARTUP), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
 runpy.run_path(str(STARTUP / "sitecustomize.py"))
 
 import hypothesis
@@ -32,38 +38,49 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(ROOT / "tests"))
-# A shell that starts the tests in the background has them ignore Ctrl-C, and so the programs that they start.
+# A shell that starts the tests in the background has them ignore Ctrl-C, and so the programs that
+# they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 jax.config.update("jax_enable_x64", True)
 
-hypothesis.settings.register_profile("default", deadline=None, max_examples=100, derandomize=bool(os.environ.get("CI")))
+hypothesis.settings.register_profile(
+    "default", deadline=None, max_examples=100, derandomize=bool(os.environ.get("CI"))
+)
 hypothesis.settings.load_profile("default")
 
 import iblf_jax as ij
 
 PAPER = {"duration": 20.0, "dt": 1e-3, "record_every": 10}
-"""The paper's run on the grid of the reference data; used wherever the length does not matter, so that it compiles once."""
+"""The paper's run on the grid of the reference data; used wherever the length does not matter, so
+that it compiles once."""
 
 SHORT = {"duration": 0.5, "dt": 1e-3}
-"""A run with every step recorded; used wherever the length does not matter, so that it compiles once."""
+"""A run with every step recorded; used wherever the length does not matter, so that it compiles
+once."""
 
 
 XLA_FLAGS = " ".join(
     [
         "--xla_backend_optimization_level=0",
-        *(["--xla_cpu_use_fusion_emitters=false"] if jax.version.__version_info__ < (0, 11) else []),
+        *(
+            ["--xla_cpu_use_fusion_emitters=false"]
+            if jax.version.__version_info__ < (0, 11)
+            else []
+        ),
         "--xla_cpu_parallel_codegen_split_count=1",
         "--xla_disable_hlo_passes=hlo-verifier",
     ]
 )
-"""Half of the tests' time was the compilers', spent on making loops faster that run for milliseconds.  XLA is asked for the same programs;
-it writes the machine's code plainly, operation by operation and on one thread, and does not check itself after each pass.  The compiler
-of kernels does not optimise either (`quick_compiler`).  `test_users_settings.py` runs tests as users compile; so do the release tests, and
-all of them with TEST_AS_USERS=1 in the environment."""
+"""Half of the tests' time was the compilers', spent on making loops faster that run for
+milliseconds.  XLA is asked for the same programs; it writes the machine's code plainly, operation
+by operation and on one thread, and does not check itself after each pass.  The compiler of kernels
+does not optimise either (`quick_compiler`).  `test_users_settings.py` runs tests as users compile;
+so do the release tests, and all of them with TEST_AS_USERS=1 in the environment."""
 
 MEMORY = 3 * 2**30
-"""Bytes of a process from which what it has compiled is let go after a test: what is needed again is compiled again."""
+"""Bytes of a process from which what it has compiled is let go after a test: what is needed again
+is compiled again."""
 
 
 def resident() -> int:
@@ -81,14 +98,21 @@ def memory() -> dict[str, int]:
 def pytest_configure(config):
     """What compilers are told, by this process and those that it starts, and what JAX refuses.
 
-    In the default run an array of another type is a slip, not a promotion; with the slow tests it is as in a user's session.  Ranks are
-    promoted in both: the package broadcasts leading axes throughout.
+    In the default run an array of another type is a slip, not a promotion; with the slow tests it
+    is as in a user's session.  Ranks are promoted in both: the package broadcasts leading axes
+    throughout.
     """
-    # A worker's environment is its parent's, which has been here: the tester's own words are kept apart.
+    # A worker's environment is its parent's, which has been here: the tester's own words are kept
+    # apart.
     own = os.environ.setdefault("TESTER_XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
-    compiler = os.environ.setdefault("TESTER_CXX", os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), ""))
+    compiler = os.environ.setdefault(
+        "TESTER_CXX",
+        os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), ""),
+    )
     plain = config.option.markexpr != "release" and not os.environ.get("TEST_AS_USERS")
-    os.environ["XLA_FLAGS"] = f"{XLA_FLAGS if plain else ''} {own}".strip()  # read at the first program, and the last of two flags wins
+    os.environ["XLA_FLAGS"] = (
+        f"{XLA_FLAGS if plain else ''} {own}".strip()
+    )  # read at the first program, and the last of two flags wins
     if compiler:
         os.environ["CXX"] = str(ROOT / "tests" / "quick_compiler") if plain else compiler
     if "not slow" in config.option.markexpr:
@@ -99,8 +123,9 @@ def pytest_configure(config):
 def bounded_memory(memory):
     """Compiled programs of hundreds of tests would take 10 GB a process.
 
-    Not all of it comes back (four tenths of what programs took stays), and what is needed again is made again, so a process that is still
-    large afterwards is left alone until it has grown by a quarter of MEMORY: it would let go after every test.
+    Not all of it comes back (four tenths of what programs took stays), and what is needed again is
+    made again, so a process that is still large afterwards is left alone until it has grown by a
+    quarter of MEMORY: it would let go after every test.
     """
     yield
     if resident() > memory["most"]:
@@ -130,7 +155,8 @@ def short_run(paper) -> ij.Rollout:
 
 @pytest.fixture(scope="session")
 def compiled() -> Path:
-    """The folder of compiled programs of the processes that a study is divided among, or that are killed and started again."""
+    """The folder of compiled programs of the processes that a study is divided among, or that are
+    killed and started again."""
     return ROOT / ".jax_cache"
 
 

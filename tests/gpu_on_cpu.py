@@ -1,4 +1,5 @@
-"""The gpu backend on a CPU: its own source and its own launcher, with a CUDA driver that loops over the threads."""
+"""The gpu backend on a CPU: its own source and its own launcher, with a CUDA driver that loops over
+the threads."""
 
 from __future__ import annotations
 
@@ -24,16 +25,24 @@ def text(name: str) -> str:
 @lru_cache(maxsize=64)
 def driver(program, shared: int, lane: int, flags: tuple[str, ...] = ()) -> Path:
     """A library with the entries of CUDA's driver, for one program."""
-    whole = "\n".join([text("cuda_language.h"), source(program, shared, lane, CUDA), text("cuda_driver.h")])
+    whole = "\n".join(
+        [text("cuda_language.h"), source(program, shared, lane, CUDA), text("cuda_driver.h")]
+    )
     return toolchain.built(whole, ("-std=gnu++20", *flags))[0]
 
 
 @lru_cache(maxsize=64)
-def kernel(program, shared: int, lane: int, flags: tuple[str, ...] = (), image: bytes = IMAGE) -> str:
+def kernel(
+    program, shared: int, lane: int, flags: tuple[str, ...] = (), image: bytes = IMAGE
+) -> str:
     """As `gpu.kernel`, for the platform of the tests."""
     launcher = gpu.launcher(program, shared, lane, image) + text("cuda_stream.h")
-    library, key = toolchain.built(launcher, (f'-DDRIVER="{driver(program, shared, lane, flags)}"',))
-    jax.ffi.register_ffi_target(key, jax.ffi.pycapsule(toolchain.loaded(library).on_cpu), platform="cpu")
+    library, key = toolchain.built(
+        launcher, (f'-DDRIVER="{driver(program, shared, lane, flags)}"',)
+    )
+    jax.ffi.register_ffi_target(
+        key, jax.ffi.pycapsule(toolchain.loaded(library).on_cpu), platform="cpu"
+    )
     return key
 
 

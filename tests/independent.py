@@ -1,7 +1,9 @@
-"""The paper's closed loop in NumPy, written from the equations and from nothing of the package: a second opinion.
+"""The paper's closed loop in NumPy, written from the equations and from nothing of the package: a
+second opinion.
 
-Two-link arm, sinusoidal reference and bounds, the disturbance (4.3), the law (3.14) with either barrier and either reading, its
-observer.  alpha' is derived by hand here, and by automatic differentiation there.
+Two-link arm, sinusoidal reference and bounds, the disturbance (4.3), the law (3.14) with either
+barrier and either reading, its observer.  alpha' is derived by hand here, and by automatic
+differentiation there.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from scipy.integrate import solve_ivp
 
 def sine(offset, amplitude, frequency, phase):
     """A sinusoid with its first and second rate, t -> (3, n)."""
-    offset, amplitude, frequency, phase = (np.asarray(x, float) * np.ones(2) for x in (offset, amplitude, frequency, phase))
+    offset, amplitude, frequency, phase = (
+        np.asarray(x, float) * np.ones(2) for x in (offset, amplitude, frequency, phase)
+    )
 
     def at(t):
         s, c = np.sin(frequency * t + phase), np.cos(frequency * t + phase)
@@ -75,7 +79,14 @@ class Loop:
         xd, dxd, ddxd = sine(*self.reference)(t)
         lo, dlo, ddlo = sine(*self.lower)(t)
         up, dup, ddup = sine(*self.upper)(t)
-        kl, dkl, ddkl, ku, dku, ddku = xd - lo, dxd - dlo, ddxd - ddlo, up - xd, dup - dxd, ddup - ddxd
+        kl, dkl, ddkl, ku, dku, ddku = (
+            xd - lo,
+            dxd - dlo,
+            ddxd - ddlo,
+            up - xd,
+            dup - dxd,
+            ddup - ddxd,
+        )
         e1 = q - xd
         ru, rl = dku / ku, dkl / kl
         kappa = np.sqrt(ru**2 + rl**2 + self.o)
@@ -91,28 +102,67 @@ class Loop:
             slope, V1 = e1 ** (m - 1) / (k**m - e1**m), -np.log(1 - xi**m) / m
         e2 = v - alpha
         f_hat = eta + self.kf * (M @ v)
-        tau = C(v) @ (alpha if self.corrected else v) + G + M @ dalpha - f_hat - self.K2 * e2 - slope
+        tau = (
+            C(v) @ (alpha if self.corrected else v) + G + M @ dalpha - f_hat - self.K2 * e2 - slope
+        )
         f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0]
-        f = f + sum((np.asarray(size) for time, size in self.steps if time <= (t if since is None else since)), np.zeros(2))
+        f = f + sum(
+            (
+                np.asarray(size)
+                for time, size in self.steps
+                if time <= (t if since is None else since)
+            ),
+            np.zeros(2),
+        )
         ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
-        known = tau - C(v) @ v - G + self.kf * (M @ v) + (dM_dq2 * v[1] @ v if self.corrected else 0.0)
+        known = (
+            tau - C(v) @ v - G + self.kf * (M @ v) + (dM_dq2 * v[1] @ v if self.corrected else 0.0)
+        )
         deta = -self.kf * eta - self.kf * known
         V = V1.sum() + 0.5 * e2 @ M @ e2 + 0.5 * (f - f_hat) @ (f - f_hat)
-        return np.concatenate([v, ddq, deta]), {"tau": tau, "e1": e1, "e2": e2, "xi": xi, "V": V, "f": f, "f_hat": f_hat, "alpha": alpha}
+        return np.concatenate([v, ddq, deta]), {
+            "tau": tau,
+            "e1": e1,
+            "e2": e2,
+            "xi": xi,
+            "V": V,
+            "f": f,
+            "f_hat": f_hat,
+            "alpha": alpha,
+        }
 
     def solve(self, times, rtol=1e-11):
         """The run at these times, by DOP853: name -> (T, ...)."""
         x0 = np.concatenate([self.q0, self.dq0, np.zeros(2)])
         span = (0.0, float(times[-1]))
-        solution = solve_ivp(lambda t, x: self.evaluate(t, x)[0], span, x0, "DOP853", t_eval=times, rtol=rtol, atol=0.01 * rtol)
+        solution = solve_ivp(
+            lambda t, x: self.evaluate(t, x)[0],
+            span,
+            x0,
+            "DOP853",
+            t_eval=times,
+            rtol=rtol,
+            atol=0.01 * rtol,
+        )
         outputs = [self.evaluate(t, x)[1] for t, x in zip(times, solution.y.T, strict=True)]
-        return {"q": solution.y[:2].T, "dq": solution.y[2:4].T, **{k: np.array([o[k] for o in outputs]) for k in outputs[0]}}
+        return {
+            "q": solution.y[:2].T,
+            "dq": solution.y[2:4].T,
+            **{k: np.array([o[k] for o in outputs]) for k in outputs[0]},
+        }
 
     def end(self, duration, rtol=1e-12):
         """The state at the end of a run whose integration is split where a step appears."""
         x = np.concatenate([self.q0, self.dq0, np.zeros(2)])
         cuts = [0.0, *sorted({time for time, _ in self.steps if 0.0 < time < duration}), duration]
         for a, b in itertools.pairwise(cuts):
-            found = solve_ivp(lambda t, x, a=a: self.evaluate(t, x, since=a)[0], (a, b), x, "DOP853", rtol=rtol, atol=0.01 * rtol)
+            found = solve_ivp(
+                lambda t, x, a=a: self.evaluate(t, x, since=a)[0],
+                (a, b),
+                x,
+                "DOP853",
+                rtol=rtol,
+                atol=0.01 * rtol,
+            )
             x = found.y[:, -1]
         return x

@@ -11,7 +11,8 @@ from iblf_jax.simulation.signals import Signals
 
 
 class Arm3D:
-    """A robot in space: the first joint turns it about z, the others lift it.  All that a drawing asks for."""
+    """A robot in space: the first joint turns it about z, the others lift it.  All that a drawing
+    asks for."""
 
     def __init__(self, n):
         self.n = n
@@ -24,7 +25,9 @@ class Arm3D:
         return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(links, axis=0)])
 
 
-ALWAYS = [field.name for field in dataclasses.fields(Signals) if field.default is dataclasses.MISSING]
+ALWAYS = [
+    field.name for field in dataclasses.fields(Signals) if field.default is dataclasses.MISSING
+]
 """The signals that every run has."""
 
 
@@ -43,7 +46,9 @@ jax.tree_util.register_pytree_node(Holder, lambda holder: ((), holder), lambda h
 
 
 def chain(n):
-    return ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.02] * n)
+    return ij.robots.PlanarChain(
+        mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.02] * n
+    )
 
 
 def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
@@ -52,7 +57,10 @@ def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
     joints = np.arange(plant.n)
     q_d = 0.5 + 0.2 * np.sin(t[:, None] + 0.5 * joints)
     e1 = 0.15 * np.exp(-3 * t[:, None]) * (1 + 0.1 * joints) + shift * np.sin(3 * t[:, None])
-    lower, upper = q_d - 0.3 - 0.05 * np.cos(t[:, None] + joints), q_d + 0.4 + 0.05 * np.sin(t[:, None] + joints)
+    lower, upper = (
+        q_d - 0.3 - 0.05 * np.cos(t[:, None] + joints),
+        q_d + 0.4 + 0.05 * np.sin(t[:, None] + joints),
+    )
     f = 0.1 * np.cos(2 * t[:, None] + joints)
     arrays = {
         "t": t, "q": q_d + e1, "dq": np.gradient(q_d + e1, dt, axis=0), "tau": 3.0 - 8 * np.exp(-9 * t[:, None]) + joints, "e1": e1,

@@ -26,21 +26,40 @@ TWO_LINK = ij.presets.customary_two_link()
 
 ROBOTS = {
     "two_link": TWO_LINK,
-    "two_link_payload": robots.TwoLink(mass=[1.0, 2.0], length=[0.5, 0.4], centre=[0.2, 0.3], inertia=[0.02, 0.01], payload=0.7, g=1.62),
+    "two_link_payload": robots.TwoLink(
+        mass=[1.0, 2.0],
+        length=[0.5, 0.4],
+        centre=[0.2, 0.3],
+        inertia=[0.02, 0.01],
+        payload=0.7,
+        g=1.62,
+    ),
     "chain_1": robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02]),
-    "chain_3": robots.PlanarChain(mass=[2.0, 1.0, 0.5], length=[0.4, 0.3, 0.2], centre=[0.2, 0.15, 0.1], inertia=0.01, payload=0.3),
+    "chain_3": robots.PlanarChain(
+        mass=[2.0, 1.0, 0.5],
+        length=[0.4, 0.3, 0.2],
+        centre=[0.2, 0.15, 0.1],
+        inertia=0.01,
+        payload=0.3,
+    ),
     "arm": random_arm(3, seed=1, armature=0.1, payload=0.4),
 }
 
 REFERENCES = {
-    "sinusoid": references.Sinusoid(offset=0.5, amplitude=[0.14, 0.1], frequency=1.0, phase=[0.0, 1.57]),
+    "sinusoid": references.Sinusoid(
+        offset=0.5, amplitude=[0.14, 0.1], frequency=1.0, phase=[0.0, 1.57]
+    ),
     "quintic": references.Quintic(start=[0.1, 0.2], end=[0.8, -0.3], duration=3.0),
-    "waypoint_spline": references.WaypointSpline(times=(0.0, 1.0, 2.5, 4.0), waypoints=[[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.5, 0.5]]),
+    "waypoint_spline": references.WaypointSpline(
+        times=(0.0, 1.0, 2.5, 4.0), waypoints=[[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.5, 0.5]]
+    ),
 }
 
 SIDES = {
     "constant": bounds.Constant([0.9, 1.2]),
-    "sinusoid": bounds.Sinusoid(offset=[0.9, 0.8], amplitude=0.14, frequency=1.0, phase=[1.57, 0.0]),
+    "sinusoid": bounds.Sinusoid(
+        offset=[0.9, 0.8], amplitude=0.14, frequency=1.0, phase=[1.57, 0.0]
+    ),
     "funnel": bounds.Funnel(initial=0.5, final=[0.1, 0.2], rate=1.5),
 }
 
@@ -54,11 +73,17 @@ REGIONS = {
 DISTURBANCES = {
     "nothing": disturbances.Nothing(),
     "model_shaped": ij.presets.zhang_yan_2024().disturbance,
-    "sinusoids": disturbances.Sinusoids(amplitude=[1.0, 2.0], frequency=3.0, phase=[0.0, 0.4], offset=0.2),
+    "sinusoids": disturbances.Sinusoids(
+        amplitude=[1.0, 2.0], frequency=3.0, phase=[0.0, 0.4], offset=0.2
+    ),
     "step": disturbances.Step(size=[1.0, -0.5], time=5.0),
-    "tip_force": disturbances.TipForce(amplitude=[1.0, 2.0], frequency=[1.0, 0.5], phase=0.3, offset=[0.0, -1.0]),
+    "tip_force": disturbances.TipForce(
+        amplitude=[1.0, 2.0], frequency=[1.0, 0.5], phase=0.3, offset=[0.0, -1.0]
+    ),
     "friction": disturbances.Friction(viscous=[0.1, 0.2], coulomb=0.3, width=0.05),
-    "sum": disturbances.Sum((disturbances.Friction(viscous=0.1), disturbances.Step(size=1.0, time=2.0))),
+    "sum": disturbances.Sum(
+        (disturbances.Friction(viscous=0.1), disturbances.Step(size=1.0, time=2.0))
+    ),
     "sum_of_none": disturbances.Sum(()),
 }
 
@@ -92,42 +117,89 @@ VELOCITIES = {
 SENSORS = {
     "ideal": sensors.Ideal(),
     "encoder_bare": sensors.Encoder(velocity=sensors.Measured()),
-    **{f"encoder_{name}": sensors.Encoder(counts=4096, offset=[0.1, 0.0], noise=1e-4, velocity=v) for name, v in VELOCITIES.items()},
+    **{
+        f"encoder_{name}": sensors.Encoder(counts=4096, offset=[0.1, 0.0], noise=1e-4, velocity=v)
+        for name, v in VELOCITIES.items()
+    },
 }
 
 ACTUATORS = {
     "ideal": actuators.Ideal(),
     "motor_bare": actuators.Motor(),
     "motor_lag": actuators.Motor(bandwidth=[300.0, 400.0]),
-    "chain": actuators.Chain((actuators.Motor(bandwidth=900.0, limit=[40.0, 20.0]), actuators.Ideal(), actuators.Motor(bandwidth=300.0))),
-    "motor": actuators.Motor(bandwidth=300.0, limit=[40.0, 20.0], rate_limit=500.0, stall=[40.0, 20.0], no_load_speed=[6.0, 8.0]),
+    "chain": actuators.Chain(
+        (
+            actuators.Motor(bandwidth=900.0, limit=[40.0, 20.0]),
+            actuators.Ideal(),
+            actuators.Motor(bandwidth=300.0),
+        )
+    ),
+    "motor": actuators.Motor(
+        bandwidth=300.0,
+        limit=[40.0, 20.0],
+        rate_limit=500.0,
+        stall=[40.0, 20.0],
+        no_load_speed=[6.0, 8.0],
+    ),
 }
 
-SURFACE = bounds.Bounds(lower=bounds.Funnel(initial=-9.0, final=-0.5, rate=1.5), upper=bounds.Constant([8.0, 6.0]))
+SURFACE = bounds.Bounds(
+    lower=bounds.Funnel(initial=-9.0, final=-0.5, rate=1.5), upper=bounds.Constant([8.0, 6.0])
+)
 
 LAWS = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
-    "backstepping_corrected_log": controllers.Backstepping(k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"),
+    "backstepping_corrected_log": controllers.Backstepping(
+        k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"
+    ),
     "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
     "full_state_mixed": controllers.FullState(
-        k1=2.0, K2=20.0, c=1.0, barrier=barriers.Tan(), velocity_barrier=barriers.PrescribedPerformance(), weight=[0.5, 2.0]
+        k1=2.0,
+        K2=20.0,
+        c=1.0,
+        barrier=barriers.Tan(),
+        velocity_barrier=barriers.PrescribedPerformance(),
+        weight=[0.5, 2.0],
     ),
-    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1, weight=[0.5, 2.0]),
+    "dynamic_surface": controllers.DynamicSurface(
+        k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1, weight=[0.5, 2.0]
+    ),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
     "surface_barrier": controllers.SurfaceBarrier(a=2.0, K=[4.0, 3.0], surface=SURFACE),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=[10.0, 12.0]),
     "pd_gravity": controllers.PDGravity(Kp=60.0, Kd=[20.0, 10.0]),
-    "reference_governor": controllers.ReferenceGovernor(law=controllers.PDGravity(Kp=60.0, Kd=[20.0, 15.0])),
-    "reference_governor_computed": controllers.ReferenceGovernor(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), margin=[0.01, 0.03]),
-    "safety_filter": controllers.SafetyFilter(
-        law=controllers.PDGravity(Kp=60.0, Kd=20.0), a1=[8.0, 9.0], nearest="acceleration", shape1="atan", shape2="cubic", margin=[0.1, 0.2]
+    "reference_governor": controllers.ReferenceGovernor(
+        law=controllers.PDGravity(Kp=60.0, Kd=[20.0, 15.0])
     ),
-    "safety_filter_limited": controllers.SafetyFilter(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[20.0, 10.0]),
-    "saturated": controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]),
-    "saturated_smooth": controllers.Saturated(law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"),
+    "reference_governor_computed": controllers.ReferenceGovernor(
+        law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), margin=[0.01, 0.03]
+    ),
+    "safety_filter": controllers.SafetyFilter(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0),
+        a1=[8.0, 9.0],
+        nearest="acceleration",
+        shape1="atan",
+        shape2="cubic",
+        margin=[0.1, 0.2],
+    ),
+    "safety_filter_limited": controllers.SafetyFilter(
+        law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[20.0, 10.0]
+    ),
+    "saturated": controllers.Saturated(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]
+    ),
+    "saturated_smooth": controllers.Saturated(
+        law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"
+    ),
 }
 
-OPTIONAL_FOLDS = (metrics.AboveGravity(), metrics.VelocityMargin(), metrics.RegionMargin(), metrics.Slack(), metrics.RegionSlack())
+OPTIONAL_FOLDS = (
+    metrics.AboveGravity(),
+    metrics.VelocityMargin(),
+    metrics.RegionMargin(),
+    metrics.Slack(),
+    metrics.RegionSlack(),
+)
 FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), *OPTIONAL_FOLDS)}
 
 FAMILIES = {

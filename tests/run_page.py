@@ -1,4 +1,5 @@
-"""Runs every block of Python on a page as a reader would: `python tests/run_page.py PAGE` is a process of its own.
+"""Runs every block of Python on a page as a reader would: `python tests/run_page.py PAGE` is a
+process of its own.
 
 This file has no `from __future__` line, and `compile` inherits none: a block is compiled as it is
 pasted.  Python 3.14 and later do not evaluate an annotation before something reads it, and nor does

@@ -1,6 +1,8 @@
-"""The one small study that these tests share, in this process and in others: few programs to compile.
+"""The one small study that these tests share, in this process and in others: few programs to
+compile.
 
-As a script it does the small sweep in a process of its own: `python study_cases.py OUT [--store S] [--devices N] [--job ADDRESS N I]`;
+As a script it does the small sweep in a process of its own: `python study_cases.py OUT [--store S]
+  [--devices N] [--job ADDRESS N I]`;
 with `--serve` alone, in a process for each line that comes in (`Forks`).
 """
 
@@ -23,13 +25,22 @@ def perturbations(mass=0.1, q=0.05):
     """Two perturbations by standard deviation; other numbers do not recompile."""
     import iblf_jax as ij
 
-    return {"plant.mass[1]": ij.factor(ij.normal(1.0, mass)), "initial.q": ij.offset(ij.normal(0.0, q))}
+    return {
+        "plant.mass[1]": ij.factor(ij.normal(1.0, mass)),
+        "initial.q": ij.offset(ij.normal(0.0, q)),
+    }
 
 
 def options():
     import iblf_jax as ij
 
-    return {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),), "seed": 3}
+    return {
+        "duration": 0.02,
+        "dt": 1e-3,
+        "method": "euler",
+        "metrics": (ij.metrics.Margin(),),
+        "seed": 3,
+    }
 
 
 GRID = {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
@@ -67,19 +78,29 @@ def from_file(text, **more):
     from iblf_jax.files import study as study_file
 
     file = study_file.study_from_dict(tomllib.loads(text), "sweep")
-    return ij.sweep(file.scenario, file.grid, perturbations=file.perturbations, **file.options | more)
+    return ij.sweep(
+        file.scenario, file.grid, perturbations=file.perturbations, **file.options | more
+    )
 
 
 def study(runs=600, ways=None, **more):
     import iblf_jax as ij
 
-    return ij.monte_carlo(ij.presets.zhang_yan_2024(), ways or perturbations(), runs=runs, **options() | more)
+    return ij.monte_carlo(
+        ij.presets.zhang_yan_2024(), ways or perturbations(), runs=runs, **options() | more
+    )
 
 
 def table(**more):
     import iblf_jax as ij
 
-    return ij.sweep(ij.presets.zhang_yan_2024(), GRID, perturbations=perturbations(), runs=RUNS, **options() | {"unit": UNIT} | more)
+    return ij.sweep(
+        ij.presets.zhang_yan_2024(),
+        GRID,
+        perturbations=perturbations(),
+        runs=RUNS,
+        **options() | {"unit": UNIT} | more,
+    )
 
 
 def arrays(dataset):
@@ -88,18 +109,24 @@ def arrays(dataset):
 
 def named(found):
     """The arrays of a study, by names that no sweep has."""
-    return {f"study {name}": np.asarray(x) for name, x in (dict(found.metrics) | found.samples | {"status": found.status}).items()}
+    return {
+        f"study {name}": np.asarray(x)
+        for name, x in (dict(found.metrics) | found.samples | {"status": found.status}).items()
+    }
 
 
 def same(a, b):
     """Whether two mappings of arrays have the same names and bits."""
     return set(a) == set(b) and all(
-        np.asarray(a[k]).dtype == np.asarray(b[k]).dtype and np.array_equal(a[k], b[k], equal_nan=True) for k in a
+        np.asarray(a[k]).dtype == np.asarray(b[k]).dtype
+        and np.array_equal(a[k], b[k], equal_nan=True)
+        for k in a
     )
 
 
 def environment(cache: Path, **more: str) -> dict[str, str]:
-    """For a process of its own: this package, float64, and compiled programs shared between such processes."""
+    """For a process of its own: this package, float64, and compiled programs shared between such
+    processes."""
     root = str(Path(__file__).parents[1])
     import jax
 
@@ -110,7 +137,12 @@ def environment(cache: Path, **more: str) -> dict[str, str]:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
-    return os.environ | chosen | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"} | more
+    return (
+        os.environ
+        | chosen
+        | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+        | more
+    )
 
 
 def start(cache: Path, *words: str, **more: str) -> subprocess.Popen:
@@ -121,11 +153,18 @@ def start(cache: Path, *words: str, **more: str) -> subprocess.Popen:
 def start_python(cache: Path, *words: str, **more: str) -> subprocess.Popen:
     """Starts Python with these words."""
     command = [sys.executable, *words]
-    return subprocess.Popen(command, env=environment(cache, **more), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command,
+        env=environment(cache, **more),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 class Forks:
-    """Many processes of this script, each forked from one that has imported everything and started nothing: half of a start is imports.
+    """Many processes of this script, each forked from one that has imported everything and started
+    nothing: half of a start is imports.
 
     Args:
       cache: folder of compiled programs.
@@ -136,7 +175,12 @@ class Forks:
         with errors.open("w") as file:
             command = [sys.executable, __file__, "--serve"]
             self.server = subprocess.Popen(
-                command, env=environment(cache), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True
+                command,
+                env=environment(cache),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=file,
+                text=True,
             )
 
     def __enter__(self) -> Forks:
@@ -147,7 +191,8 @@ class Forks:
         self.server.communicate()
 
     def start(self, *words: str) -> int:
-        """The process that does what the script does with these words; the one before must have ended."""
+        """The process that does what the script does with these words; the one before must have
+        ended."""
         self.server.stdin.write(json.dumps(words) + "\n")
         self.server.stdin.flush()
         return int(self.line().removeprefix("pid "))
@@ -157,14 +202,16 @@ class Forks:
         return self.server.stdout.readline()
 
     def ended(self) -> int:
-        """Waits for the end of the process: its exit code, or less than 0 the signal that ended it."""
+        """Waits for the end of the process: its exit code, or less than 0 the signal that ended
+        it."""
         while not (said := self.line()).startswith("ended"):
             assert said, "the server of processes is gone"
         return int(said.removeprefix("ended "))
 
 
 def serve() -> None:
-    """Forks for each line of words, and says when the child has ended; threads, which do not survive a fork, have not been started."""
+    """Forks for each line of words, and says when the child has ended; threads, which do not
+    survive a fork, have not been started."""
     import jax  # noqa: F401
     import xarray  # noqa: F401
     import zarr  # noqa: F401
@@ -202,7 +249,9 @@ def main() -> None:
     parser.add_argument("--job", nargs=3)
     parser.add_argument("--slow", type=float, default=0.0, help="sleep so long after each unit")
     parser.add_argument("--die-after", type=int, help="kill this process after so many units")
-    parser.add_argument("--study", action="store_true", help="the study, beside the sweep if there is a store")
+    parser.add_argument(
+        "--study", action="store_true", help="the study, beside the sweep if there is a store"
+    )
     args = parser.parse_args()
     import jax
 
@@ -210,9 +259,15 @@ def main() -> None:
     import iblf_jax as ij
 
     if args.job:
-        ij.distributed.initialize(args.job[0], int(args.job[1]), int(args.job[2]), heartbeat=5, start=60)
+        ij.distributed.initialize(
+            args.job[0], int(args.job[1]), int(args.job[2]), heartbeat=5, start=60
+        )
     _hinder(args)
-    data = {} if args.study and not args.store else arrays(table(**({"store": args.store} if args.store else {})))
+    data = (
+        {}
+        if args.study and not args.store
+        else arrays(table(**({"store": args.store} if args.store else {})))
+    )
     if args.study:
         data |= named(study())
     np.savez(args.out, **data)

@@ -1,4 +1,5 @@
-"""A run says how accurate it is: its estimate against runs at a sixteenth of the step, its flags, and the step that is recommended."""
+"""A run says how accurate it is: its estimate against runs at a sixteenth of the step, its flags,
+and the step that is recommended."""
 
 from __future__ import annotations
 
@@ -31,13 +32,15 @@ FINER = 16
 
 @pytest.fixture(scope="module")
 def shaken(paper):
-    """The paper's scenario under a torque of 5 N m at 6283 rad/s, which goes through a whole period in a step of 1 ms."""
+    """The paper's scenario under a torque of 5 N m at 6283 rad/s, which goes through a whole period
+    in a step of 1 ms."""
     torque = ij.disturbances.Sinusoids(amplitude=5.0, frequency=6283.0, phase=[1.0, 0.3])
     return dataclasses.replace(paper, disturbance=torque)
 
 
 def random_leaves(rng, n=2):
-    """Leaves of RUNS random scenarios: signals up to 3,000 rad/s, gains of all sizes, starts anywhere in the tube."""
+    """Leaves of RUNS random scenarios: signals up to 3,000 rad/s, gains of all sizes, starts
+    anywhere in the tube."""
 
     def between(low, high):
         return np.exp(rng.uniform(np.log(low), np.log(high), (RUNS, n)))
@@ -59,7 +62,9 @@ def positions(scenario, varied, dt, steps, method):
     """Positions of a batch and its verdicts, at the instants of a step dt * FINER."""
     folds = as_folds((), jnp.float64)
     every = FINER if steps > 500 else 1
-    run = jax.jit(lambda varied, dt: run_batch(scenario, varied, folds, dt, Run(steps, method, every)))
+    run = jax.jit(
+        lambda varied, dt: run_batch(scenario, varied, folds, dt, Run(steps, method, every))
+    )
     found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
     arrays = found.records[0]
     return (
@@ -73,7 +78,8 @@ def positions(scenario, varied, dt, steps, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", TABLEAUS)
 def test_the_estimate_is_about_the_error(shaken, rng, method):
-    """At 1, 2 and 5 ms, too large for some: no run is off by more than the tolerance without its flag, and good ones are not flagged."""
+    """At 1, 2 and 5 ms, too large for some: no run is off by more than the tolerance without its
+    flag, and good ones are not flagged."""
     scenario, varied, flagged, good = canonical(shaken), random_leaves(rng), 0, 0
     alarms = 0
     for dt in (1e-3, 2e-3, 5e-3):
@@ -82,12 +88,18 @@ def test_the_estimate_is_about_the_error(shaken, rng, method):
         error = np.max(np.abs(q - fine) / width, axis=(1, 2))
         found = status & int(Status.INACCURATE | Status.STEP_TOO_LARGE) != 0
         assert np.all(found[error > TOLERANCE]), (dt, error[(error > TOLERANCE) & ~found])
-        np.testing.assert_array_equal(status & int(Status.INACCURATE) != 0, ~(estimate <= TOLERANCE))
+        np.testing.assert_array_equal(
+            status & int(Status.INACCURATE) != 0, ~(estimate <= TOLERANCE)
+        )
         sound = status & int(Status.STEP_TOO_LARGE | Status.GUARD_ACTIVE) == 0
         fine_run = (error < TOLERANCE / 50) & sound
         big = (error > 1e-3) & (error < 0.1) & sound
         assert np.all(estimate[big] > 0.3 * error[big])
-        flagged, good, alarms = flagged + np.sum(error > TOLERANCE), good + np.sum(fine_run), alarms + np.sum(fine_run & found)
+        flagged, good, alarms = (
+            flagged + np.sum(error > TOLERANCE),
+            good + np.sum(fine_run),
+            alarms + np.sum(fine_run & found),
+        )
     assert flagged > 0
     assert good > 0 or method == "euler"
     assert alarms <= {"rk4": 0.1, "heun": 0.4, "euler": 1.0}[method] * good
@@ -102,9 +114,13 @@ def test_a_good_run_says_how_good(short_run):
 
 @pytest.mark.parametrize("frequency", [6283.0, 4e3 * np.pi])
 def test_a_signal_that_the_stages_cannot_see_is_flagged_with_a_step_that_will_do(shaken, frequency):
-    """4000 pi rad/s goes through whole periods between the stages of a step of 1 ms: every stage sees one and the same torque."""
+    """4000 pi rad/s goes through whole periods between the stages of a step of 1 ms: every stage
+    sees one and the same torque."""
     scenario = ij.with_parameters(shaken, {"disturbance.frequency": frequency})
-    with pytest.warns(ij.SimulationWarning, match=r"error is estimated at .* rad, .* % of the tube.* Take dt=0\.000[25]"):
+    with pytest.warns(
+        ij.SimulationWarning,
+        match=r"error is estimated at .* rad, .* % of the tube.* Take dt=0\.000[25]",
+    ):
         run = ij.simulate(scenario, **SHORT)
     assert int(run.status) == Status.INACCURATE
     dt = ij.recommended_dt(scenario, duration=SHORT["duration"])
@@ -116,7 +132,9 @@ def test_a_signal_that_the_stages_cannot_see_is_flagged_with_a_step_that_will_do
 
 
 def test_a_reference_between_the_stages_is_flagged(paper):
-    fast = ij.with_parameters(paper, {"reference.frequency": 4e3 * np.pi, "reference.amplitude": 1e-3})
+    fast = ij.with_parameters(
+        paper, {"reference.frequency": 4e3 * np.pi, "reference.amplitude": 1e-3}
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert int(ij.simulate(fast, **SHORT).status) & Status.INACCURATE
@@ -124,15 +142,20 @@ def test_a_reference_between_the_stages_is_flagged(paper):
 
 def test_the_guard_beyond_the_first_instant_is_told(paper):
     wide = dataclasses.replace(paper.controller, barrier=ij.barriers.Integral(guard=0.1))
-    near = ij.with_parameters(dataclasses.replace(paper, controller=wide), {"initial.q": [1.03, 0.8]})
-    with pytest.warns(ij.SimulationWarning, match=r"guard stayed active.*another law.*smaller guard"):
+    near = ij.with_parameters(
+        dataclasses.replace(paper, controller=wide), {"initial.q": [1.03, 0.8]}
+    )
+    with pytest.warns(
+        ij.SimulationWarning, match=r"guard stayed active.*another law.*smaller guard"
+    ):
         run = ij.simulate(near, **SHORT)
     assert int(run.status) & Status.GUARD_STAYED
 
 
 @pytest.mark.slow
 def test_the_recommended_step_is_one_that_the_run_itself_is_content_with(paper):
-    """A start just outside the guard: the barrier is a thousand times stiffer there than along the reference."""
+    """A start just outside the guard: the barrier is a thousand times stiffer there than along the
+    reference."""
     near = ij.with_parameters(paper, {"initial.q": [1.04 - 2e-5, 0.9 - 1e-4]})
     dt = ij.recommended_dt(near, duration=0.1)
     assert dt < 5e-4
@@ -144,7 +167,8 @@ def test_the_recommended_step_is_one_that_the_run_itself_is_content_with(paper):
 
 @pytest.mark.slow
 def test_the_two_runs_side_by_side(shaken):
-    """The difference that decides is that between the run and one at a sixteenth of the step, but for what the third leaves."""
+    """The difference that decides is that between the run and one at a sixteenth of the step, but
+    for what the third leaves."""
     scenario = canonical(shaken)
     pair = step_size.side_by_side(scenario, 1e-3, 500, method="rk4")
     fine = ij.simulate(scenario, duration=0.5, dt=5e-5, record_every=20)
@@ -168,7 +192,13 @@ def test_no_step_will_do(shaken, monkeypatch):
 @pytest.mark.slow
 def test_a_study_names_the_step_that_its_runs_need(paper):
     perturbations = {"controller.K2": ij.factor(ij.uniform(0.5, 6.0))}
-    with pytest.warns(UserWarning, match=r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12]; ij\.recommended_dt"):
+    with pytest.warns(
+        UserWarning,
+        match=(
+            r"dt = 0\.001 s is too large for \d+ of 256 runs.* Take dt=0\.000[12];"
+            r" ij\.recommended_dt"
+        ),
+    ):
         ij.monte_carlo(paper, perturbations, runs=256, duration=0.1)
     dt = ij.recommended_dt(paper, duration=0.1, perturbations=perturbations)
     assert dt in (1e-4, 2e-4)
@@ -190,7 +220,13 @@ def test_folds_may_not_take_its_names(paper):
 
 
 def test_round_steps():
-    assert [step_size.round_down(x) for x in (1e-3, 9.99e-4, 2.1e-3, 0.05, 1.7)] == [1e-3, 5e-4, 2e-3, 0.05, 1.0]
+    assert [step_size.round_down(x) for x in (1e-3, 9.99e-4, 2.1e-3, 0.05, 1.7)] == [
+        1e-3,
+        5e-4,
+        2e-3,
+        0.05,
+        1.0,
+    ]
     assert step_size.smaller(1e-3, 1.1, 4) == 5e-4
     assert step_size.smaller(1e-3, np.inf, 4) == 1e-4
 
@@ -199,17 +235,31 @@ def test_round_steps():
 def test_solve(rng, size):
     matrix, rhs = rng.normal(size=(size, size)), rng.normal(size=(size, 3))
     matrix[0, 0] = 0.0 if size > 1 else 2.0  # so that it has to pivot
-    np.testing.assert_allclose(linalg.solve(jnp.asarray(matrix), jnp.asarray(rhs)), np.linalg.solve(matrix, rhs), rtol=1e-9)
+    np.testing.assert_allclose(
+        linalg.solve(jnp.asarray(matrix), jnp.asarray(rhs)), np.linalg.solve(matrix, rhs), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("method", ["rk4", "heun"])
-@pytest.mark.parametrize("actuator", [ij.actuators.Ideal(), ij.actuators.Motor(bandwidth=600.0)], ids=["ideal", "lag"])
+@pytest.mark.parametrize(
+    "actuator", [ij.actuators.Ideal(), ij.actuators.Motor(bandwidth=600.0)], ids=["ideal", "lag"]
+)
 def test_a_sampled_run_says_how_accurate_it_is(method, actuator):
-    """The torque jumps from step to step: the stages of each step tell its error, which is never told too small."""
-    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 5.0})
-    scenario = ij.with_parts(scenario, sampling=ij.Sampling(period=4e-3, delay=1.3e-3), actuator=actuator)
+    """The torque jumps from step to step: the stages of each step tell its error, which is never
+    told too small."""
+    scenario = ij.with_parameters(
+        ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 5.0}
+    )
+    scenario = ij.with_parts(
+        scenario, sampling=ij.Sampling(period=4e-3, delay=1.3e-3), actuator=actuator
+    )
     for dt in (2e-3, 1e-3):
-        run, fine = (ij.simulate(scenario, duration=0.5, dt=step, method=method, record_every=round(4e-3 / step)) for step in (dt, dt / 8))
+        run, fine = (
+            ij.simulate(
+                scenario, duration=0.5, dt=step, method=method, record_every=round(4e-3 / step)
+            )
+            for step in (dt, dt / 8)
+        )
         error = np.max(np.abs(run.q - fine.q) / (run.upper - run.lower))
         told = float(run.metrics.relative_numerical_error)
         assert told > error
@@ -238,21 +288,26 @@ class PowerOfE2:
 
 
 def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
-    scenario = ij.with_parts(paper, controller=PowerOfE2(K2=5.0, c=2.0), observer=ij.observers.NoObserver())
+    scenario = ij.with_parts(
+        paper, controller=PowerOfE2(K2=5.0, c=2.0), observer=ij.observers.NoObserver()
+    )
     tube = scenario.setting.tube(jnp.zeros(()))
     scenario = ij.with_parts(scenario, initial=ij.Initial(tube.q_d, tube.dq_d))  # e2 = 0
     run = ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=100)
     assert run.ok
     assert float(run.fastest_mode) < 2000.0
     assert ij.recommended_dt(scenario, duration=0.5) >= 5e-4
-    with pytest.warns(ij.SimulationWarning, match=r"time step is too large.*respect to e2.*delta\^2"):
+    with pytest.warns(
+        ij.SimulationWarning, match=r"time step is too large.*respect to e2.*delta\^2"
+    ):
         run = ij.simulate(scenario, duration=0.5, dt=1e-2, record_every=50)
     assert int(run.status) & ij.Status.STEP_TOO_LARGE
     assert int(run.status) & ij.Status.INFINITE_SLOPE
 
 
 def test_a_slope_beside_an_infinite_one_is_no_fast_mode(paper):
-    """Here e2 is 1e-4 at the instant that is looked at: differences of 6e-6 and 6e-5 both give the local slope."""
+    """Here e2 is 1e-4 at the instant that is looked at: differences of 6e-6 and 6e-5 both give the
+    local slope."""
     law = PowerOfE2(K2=5.0, c=1.5, a=0.5)
     scenario = ij.with_parts(paper, controller=law, observer=ij.observers.NoObserver())
     run = ij.simulate(scenario, duration=0.3, dt=1e-3, record_every=300)
@@ -263,7 +318,13 @@ def test_a_slope_beside_an_infinite_one_is_no_fast_mode(paper):
 
 SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
 LATE = 0.2137
-MANY = ((0.0, (3.0, 1.0)), (0.1, (-4.0, 2.0)), (LATE, (20.0, 5.0)), (0.2151, (-9.0, -3.0)), (7.0, (50.0, 50.0)))
+MANY = (
+    (0.0, (3.0, 1.0)),
+    (0.1, (-4.0, 2.0)),
+    (LATE, (20.0, 5.0)),
+    (0.2151, (-9.0, -3.0)),
+    (7.0, (50.0, 50.0)),
+)
 """At the start, at the edge of a step, two within one step of 4 ms, and after the end."""
 
 
@@ -274,12 +335,20 @@ def with_steps(scenario, steps):
 
 def split(steps, **fields):
     """The end of the loop `SLOW` under steps, by a program that shares nothing with the package."""
-    loop = Loop(K2=np.full(2, 4.0), kf=np.full(2, 4.0), force_a=(0.0, 0.0, 1.0, 0.0), force_b=(0.0, 0.0, 1.0, 0.0), steps=steps, **fields)
+    loop = Loop(
+        K2=np.full(2, 4.0),
+        kf=np.full(2, 4.0),
+        force_a=(0.0, 0.0, 1.0, 0.0),
+        force_b=(0.0, 0.0, 1.0, 0.0),
+        steps=steps,
+        **fields,
+    )
     return loop.end(0.4)
 
 
 def test_a_step_is_divided_where_a_disturbance_jumps():
-    """Two jumps within one step of 4 or 10 ms: the error is that of a smooth loop, and the estimate is not below it."""
+    """Two jumps within one step of 4 or 10 ms: the error is that of a smooth loop, and the estimate
+    is not below it."""
     truth, scenario = split(MANY[2:4]), with_steps(SLOW, MANY[2:4])
     for dt, most in ((4e-3, 1e-7), (1e-2, 5e-6)):
         run = ij.simulate(scenario, duration=0.4, dt=dt)
@@ -302,7 +371,10 @@ def test_many_jumps_at_all_places_of_a_step():
 @pytest.mark.parametrize("method", TABLEAUS)
 def test_jumps_cost_no_order(method):
     scenario, truth = with_steps(SLOW, MANY), split(MANY)
-    error = {dt: np.abs(ij.simulate(scenario, duration=0.4, dt=dt, method=method).q[-1] - truth[:2]) for dt in (2e-3, 2.5e-4)}
+    error = {
+        dt: np.abs(ij.simulate(scenario, duration=0.4, dt=dt, method=method).q[-1] - truth[:2])
+        for dt in (2e-3, 2.5e-4)
+    }
     assert np.all(np.log2(error[2e-3] / error[2.5e-4]) / 3 > TABLEAUS[method].order - 0.25)
 
 
@@ -313,11 +385,15 @@ def test_more_jumps_than_a_step_is_divided_at_are_flagged():
         warnings.simplefilter("ignore")
         run = ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=1e-2)
     assert int(run.status) & Status.INACCURATE
-    assert not int(ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3).status) & Status.INACCURATE
+    assert (
+        not int(ij.simulate(with_steps(SLOW, steps), duration=0.3, dt=2e-3).status)
+        & Status.INACCURATE
+    )
 
 
 def test_jumps_at_one_time_are_one_cut():
-    """Six parts that jump together divide a step once, so it is not one with more jumps than it is divided at."""
+    """Six parts that jump together divide a step once, so it is not one with more jumps than it is
+    divided at."""
     steps = tuple((LATE, (5.0 - k, 0.5)) for k in range(6))
     run = ij.simulate(with_steps(SLOW, steps), duration=0.4, dt=4e-3)
     np.testing.assert_allclose(run.q[-1], split(steps)[:2], atol=1e-6)
@@ -332,56 +408,99 @@ def test_a_recommended_step_is_divided_at_every_jump():
     assert not int(ij.simulate(scenario, duration=0.04, dt=dt).status) & Status.INACCURATE
 
 
-@pytest.mark.parametrize("time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"])
+@pytest.mark.parametrize(
+    "time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"]
+)
 def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
     """By time and size, against differences of the independent program."""
     scenario = with_steps(SLOW, ((time, (20.0, 5.0)),))
 
     def end(values):
-        return ij.simulate(ij.with_parameters(scenario, values), duration=0.4, dt=4e-3, record_every=100).q[-1]
+        return ij.simulate(
+            ij.with_parameters(scenario, values), duration=0.4, dt=4e-3, record_every=100
+        ).q[-1]
 
-    here = {"disturbance.parts[0].time": jnp.asarray(time), "disturbance.parts[0].size": jnp.array([20.0, 5.0])}
+    here = {
+        "disturbance.parts[0].time": jnp.asarray(time),
+        "disturbance.parts[0].size": jnp.array([20.0, 5.0]),
+    }
     slopes = jax.jacfwd(end)(here)
     by_time = (split(((time + 1e-5, (20.0, 5.0)),)) - split(((time - 1e-5, (20.0, 5.0)),))) / 2e-5
     by_size = (split(((time, (20.01, 5.0)),)) - split(((time, (19.99, 5.0)),))) / 0.02
     np.testing.assert_allclose(slopes["disturbance.parts[0].time"], by_time[:2], rtol=1e-5)
-    np.testing.assert_allclose(slopes["disturbance.parts[0].size"][:, 0], by_size[:2], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(
+        slopes["disturbance.parts[0].size"][:, 0], by_size[:2], rtol=1e-5, atol=1e-7
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sampling", [None, ij.Sampling(period=1e-2, delay=0.0033)], ids=["continuous", "sampled"])
+@pytest.mark.parametrize(
+    "sampling", [None, ij.Sampling(period=1e-2, delay=0.0033)], ids=["continuous", "sampled"]
+)
 def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
-    """What `tune` and `sensitivity` use: losses and their derivatives by jump time and gain, against differences."""
+    """What `tune` and `sensitivity` use: losses and their derivatives by jump time and gain,
+    against differences."""
     scenario = canonical(with_steps(dataclasses.replace(SLOW, sampling=sampling), MANY[2:3]))
     objective = ij.objectives.tracking() + ij.objectives.effort() + ij.objectives.torque_rate()
-    folds, dt, run, path = (Quantities(objective.quantities),), jnp.asarray(1e-2), Run(30), "disturbance.parts[0].time"
+    folds, dt, run, path = (
+        (Quantities(objective.quantities),),
+        jnp.asarray(1e-2),
+        Run(30),
+        "disturbance.parts[0].time",
+    )
     directions = {path: np.array([1.0, 0.0]), "controller.K2": np.array([[0.0, 0.0], [1.0, 0.0]])}
-    found = jax.jit(lambda v: run_batch_jvp(scenario, {path: v}, directions, folds, dt, run))(jnp.array([LATE, 0.05]))
-    ends = jax.jit(lambda v: run_batch(scenario, {path: v}, folds, dt, run).metrics["tuning_exact"])(jnp.array([LATE - 1e-6, LATE + 1e-6]))
+    found = jax.jit(lambda v: run_batch_jvp(scenario, {path: v}, directions, folds, dt, run))(
+        jnp.array([LATE, 0.05])
+    )
+    ends = jax.jit(
+        lambda v: run_batch(scenario, {path: v}, folds, dt, run).metrics["tuning_exact"]
+    )(jnp.array([LATE - 1e-6, LATE + 1e-6]))
     expected = np.asarray(ends[1] - ends[0]) / 2e-6
     np.testing.assert_allclose(found.tangents["tuning_exact"][0, 0], expected, rtol=1e-5)
 
     def loss(time):
-        metrics = run_for_reverse(ij.with_parameters(scenario, {path: time}), folds, dt, run).metrics
+        metrics = run_for_reverse(
+            ij.with_parameters(scenario, {path: time}), folds, dt, run
+        ).metrics
         return jnp.sum(metrics["tuning_exact"])
 
-    np.testing.assert_allclose(jax.jit(jax.grad(loss))(jnp.asarray(LATE)), np.sum(expected), rtol=1e-5)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(loss))(jnp.asarray(LATE)), np.sum(expected), rtol=1e-5
+    )
 
 
-@pytest.mark.parametrize("backend", ["native", pytest.param("xla", marks=pytest.mark.slow), pytest.param("vmap", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "native",
+        pytest.param("xla", marks=pytest.mark.slow),
+        pytest.param("vmap", marks=pytest.mark.slow),
+    ],
+)
 def test_every_run_of_a_batch_has_its_own_jumps(backend):
-    """Also under a sampled law whose command arrives within a step; one run jumps at a sample, one after the end."""
-    scenario = canonical(with_steps(dataclasses.replace(SLOW, sampling=ij.Sampling(period=1e-2, delay=0.0037)), MANY[2:3]))
+    """Also under a sampled law whose command arrives within a step; one run jumps at a sample, one
+    after the end."""
+    scenario = canonical(
+        with_steps(
+            dataclasses.replace(SLOW, sampling=ij.Sampling(period=1e-2, delay=0.0037)), MANY[2:3]
+        )
+    )
     folds, times = as_folds(None, jnp.float64), np.array([LATE, 0.1, 0.0537, 0.9])
     varied = {"disturbance.parts[0].time": jnp.asarray(times)}
-    run = jax.jit(lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), Run(30), backend=backend))
+    run = jax.jit(
+        lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), Run(30), backend=backend)
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no compiler
         together = run(varied)
     for i, time in enumerate(times):
-        one = ij.simulate(ij.with_parameters(scenario, {"disturbance.parts[0].time": time}), duration=0.3, dt=1e-2)
+        one = ij.simulate(
+            ij.with_parameters(scenario, {"disturbance.parts[0].time": time}), duration=0.3, dt=1e-2
+        )
         for name in ("rmse", "effort", "peak_torque", "torque_variation", "numerical_error"):
-            np.testing.assert_allclose(together.metrics[name][i], one.metrics[name], rtol=1e-9, atol=1e-14, err_msg=name)
+            np.testing.assert_allclose(
+                together.metrics[name][i], one.metrics[name], rtol=1e-9, atol=1e-14, err_msg=name
+            )
 
 
 @ij.component
@@ -448,16 +567,25 @@ class Loaded:
 
 
 PARTS = {
-    "reference": lambda: {"reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537)},
+    "reference": lambda: {
+        "reference": Switched(before=[0.7, 0.7], after=[0.72, 0.69], time=0.0537)
+    },
     "actuator": lambda: {"actuator": Failing(share=0.8, time=0.0537)},
-    "chain": lambda: {"actuator": ij.actuators.Chain((Failing(share=0.8, time=0.0537), ij.actuators.Motor(bandwidth=300.0)))},
+    "chain": lambda: {
+        "actuator": ij.actuators.Chain(
+            (Failing(share=0.8, time=0.0537), ij.actuators.Motor(bandwidth=300.0))
+        )
+    },
     "plant": lambda: {"plant": Loaded(SLOW.plant, load=0.5, time=0.0537), "model": SLOW.plant},
 }
 
 
-@pytest.mark.parametrize("part", [x if x == "actuator" else pytest.param(x, marks=pytest.mark.slow) for x in PARTS])
+@pytest.mark.parametrize(
+    "part", [x if x == "actuator" else pytest.param(x, marks=pytest.mark.slow) for x in PARTS]
+)
 def test_every_part_may_jump(part):
-    """What is switched at 0.0537 s costs no order: the errors at 4 and 1 ms are those of a smooth loop."""
+    """What is switched at 0.0537 s costs no order: the errors at 4 and 1 ms are those of a smooth
+    loop."""
     quiet = dataclasses.replace(SLOW, disturbance=ij.disturbances.Nothing(), **PARTS[part]())
 
     def end(dt):
@@ -471,7 +599,9 @@ def test_every_part_may_jump(part):
 
 def test_jump_times_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"reference.jump_times\(\).*expected times \[s\]"):
-        ij.simulate(dataclasses.replace(SLOW, reference=NoTimes(SLOW.reference)), duration=0.01, dt=1e-3)
+        ij.simulate(
+            dataclasses.replace(SLOW, reference=NoTimes(SLOW.reference)), duration=0.01, dt=1e-3
+        )
 
 
 @ij.component
@@ -490,9 +620,14 @@ class NoTimes:
 @pytest.mark.slow
 def test_a_disturbance_that_does_not_declare_its_jump_is_still_counted():
     """The estimate sees it in the rates, as it saw every jump before."""
-    hidden = dataclasses.replace(SLOW, disturbance=Undeclared(ij.disturbances.Step(size=[20.0, 5.0], time=LATE)))
+    hidden = dataclasses.replace(
+        SLOW, disturbance=Undeclared(ij.disturbances.Step(size=[20.0, 5.0], time=LATE))
+    )
     known = dataclasses.replace(SLOW, disturbance=hidden.disturbance.step)
-    errors = [np.max(ij.simulate(x, duration=0.4, dt=1e-3).metrics.numerical_error) for x in (hidden, known)]
+    errors = [
+        np.max(ij.simulate(x, duration=0.4, dt=1e-3).metrics.numerical_error)
+        for x in (hidden, known)
+    ]
     assert errors[0] > 5 * errors[1]
 
 

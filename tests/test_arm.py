@@ -25,12 +25,18 @@ mujoco = pytest.importorskip("mujoco")
 
 @jax.jit
 def dynamics(arm, q, v):
-    return jax.vmap(lambda q, v: (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q), arm.gravity(q)))(q, v)
+    return jax.vmap(
+        lambda q, v: (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q), arm.gravity(q))
+    )(q, v)
 
 
 @jax.jit
 def everything(arm, q, v):
-    return (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q)), arm.pose(q), arm.twist_jacobian(q)
+    return (
+        (arm.mass_matrix(q), arm.coriolis(q, v, v) + arm.gravity(q)),
+        arm.pose(q),
+        arm.twist_jacobian(q),
+    )
 
 
 @jax.jit
@@ -126,7 +132,9 @@ def test_random_chains_have_the_dynamics_that_mujoco_gives(n, seed):
 def test_c_is_the_one_of_the_christoffel_symbols(seed):
     arm = random_arm(4, seed)
     q, v, u = jnp.asarray(np.random.default_rng(seed).normal(size=(3, 4)))
-    ours, theirs = jax.jit(lambda a: (a.coriolis(q, v, u), coriolis_from_mass_matrix(a.mass_matrix, q, v, u)))(arm)
+    ours, theirs = jax.jit(
+        lambda a: (a.coriolis(q, v, u), coriolis_from_mass_matrix(a.mass_matrix, q, v, u))
+    )(arm)
     np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
     rate = ij.robots.mass_matrix_rate(arm, q, v) @ v - arm.coriolis(q, v, v)
     np.testing.assert_allclose(arm.energy_gradient(q, v), rate, rtol=1e-10, atol=1e-12)
@@ -183,14 +191,21 @@ def test_derivatives_by_inertial_parameters_are_finite_differences():
     for k, (x, slope) in enumerate(zip(point, slopes, strict=True)):
         for index in np.ndindex(x.shape):
             ends = [torque(*point[:k], x.at[index].add(h), *point[k + 1 :]) for h in (1e-5, -1e-5)]
-            np.testing.assert_allclose(slope[(slice(None), *index)], (ends[0] - ends[1]) / 2e-5, atol=1e-6)
+            np.testing.assert_allclose(
+                slope[(slice(None), *index)], (ends[0] - ends[1]) / 2e-5, atol=1e-6
+            )
 
 
 # ------------------------------------------------------------------------------------------------------- in the closed loop
 
 
 def scenario_with(plant, **parts) -> ij.Scenario:
-    return dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), plant=plant, model=two_link_in_space(), **parts)
+    return dataclasses.replace(
+        ij.presets.zhang_yan_2024(reading="corrected"),
+        plant=plant,
+        model=two_link_in_space(),
+        **parts,
+    )
 
 
 def accelerations(scenario, t: float) -> np.ndarray:
@@ -205,7 +220,9 @@ def test_friction_of_the_joints_acts_on_the_plant():
     damped = accelerations(scenario_with(two_link_in_space(damping=[0.5, 0.2], friction=0.1)), 0.0)
     dq = np.array([0.3, -0.4])
     M = np.asarray(two_link_in_space().mass_matrix(jnp.asarray([0.8, 0.8])))
-    np.testing.assert_allclose(M @ (damped - plain), -(np.array([0.5, 0.2]) * dq + 0.1 * np.tanh(dq / 0.05)), atol=1e-12)
+    np.testing.assert_allclose(
+        M @ (damped - plain), -(np.array([0.5, 0.2]) * dq + 0.1 * np.tanh(dq / 0.05)), atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -220,7 +237,11 @@ def test_a_load_is_picked_up():
     half = 0.5 * (without.mass_matrix(q) + held.mass_matrix(q))
     np.testing.assert_allclose(picked.at(jnp.asarray(1.1)).mass_matrix(q), half, rtol=1e-12)
     for t, same in ((0.5, without), (2.0, held)):
-        np.testing.assert_allclose(accelerations(scenario_with(picked), t), accelerations(scenario_with(same), t), rtol=1e-12)
+        np.testing.assert_allclose(
+            accelerations(scenario_with(picked), t),
+            accelerations(scenario_with(same), t),
+            rtol=1e-12,
+        )
 
 
 @pytest.mark.slow
@@ -238,8 +259,13 @@ SHORT_RUN = {"duration": 0.1, "dt": 1e-3}
 
 @pytest.mark.slow
 def test_runs_as_the_planar_robot_does():
-    planar = dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), plant=TWO_LINK, model=TWO_LINK)
-    run, other = ij.simulate(scenario_with(two_link_in_space()), **SHORT_RUN), ij.simulate(planar, **SHORT_RUN)
+    planar = dataclasses.replace(
+        ij.presets.zhang_yan_2024(reading="corrected"), plant=TWO_LINK, model=TWO_LINK
+    )
+    run, other = (
+        ij.simulate(scenario_with(two_link_in_space()), **SHORT_RUN),
+        ij.simulate(planar, **SHORT_RUN),
+    )
     np.testing.assert_allclose(run.q, other.q, atol=1e-11)
     np.testing.assert_allclose(run.tau, other.tau, atol=1e-7)
 
@@ -249,7 +275,10 @@ def test_batches_of_arms_agree_with_single_runs():
     scenario, timing = scenario_with(two_link_in_space()), SHORT_RUN | {"method": "euler"}
     study = ij.monte_carlo(
         scenario,
-        {"plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)), "plant.joint[0].damping": ij.value(ij.uniform(0.0, 0.5))},
+        {
+            "plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)),
+            "plant.joint[0].damping": ij.value(ij.uniform(0.0, 0.5)),
+        },
         runs=3,
         seed=0,
         **timing,
@@ -265,12 +294,18 @@ def test_batches_of_arms_agree_with_single_runs():
 
 def test_rows_have_names():
     arm = ij.robots.load(ARMS / "ur5.urdf")
-    scenario = scenario_with(two_link_in_space(links=("upper arm", "fore/arm"), joints=("shoulder", "elbow")))
+    scenario = scenario_with(
+        two_link_in_space(links=("upper arm", "fore/arm"), joints=("shoulder", "elbow"))
+    )
     assert float(paths.get(scenario, "plant.link[fore/arm].mass")) == float(scenario.plant.mass[1])
-    changed = ij.with_parameters(scenario, {"plant.link[fore/arm].centre[2]": 0.3, "plant.joint[elbow].damping": 0.7})
+    changed = ij.with_parameters(
+        scenario, {"plant.link[fore/arm].centre[2]": 0.3, "plant.joint[elbow].damping": 0.7}
+    )
     assert float(changed.plant.centre[1, 2]) == 0.3
     assert float(changed.plant.damping[1]) == 0.7
-    both = ij.with_parameters(dataclasses.replace(scenario, model=scenario.plant), {"robot.link[0].mass": 3.0})
+    both = ij.with_parameters(
+        dataclasses.replace(scenario, model=scenario.plant), {"robot.link[0].mass": 3.0}
+    )
     assert float(both.plant.mass[0]) == float(both.model.mass[0]) == 3.0
     listed = {p.path: p for p in ij.parameters(scenario)}
     assert listed["plant.link[fore/arm].mass"].unit == "kg"
@@ -307,7 +342,10 @@ def test_two_names_for_one_number_overlap():
     with pytest.raises(ValueError, match="do not overlap"):
         ij.monte_carlo(
             scenario_with(two_link_in_space()),
-            {"plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)), "plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))},
+            {
+                "plant.link[link2].mass": ij.factor(ij.uniform(0.7, 1.3)),
+                "plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1)),
+            },
             runs=2,
             seed=0,
             **SHORT_RUN,
@@ -336,7 +374,9 @@ def test_fields_that_do_not_fit_are_refused(fields, message):
 
 
 def test_scenario_files_hold_arms(tmp_path):
-    scenario = scenario_with(two_link_in_space(carried=Payload(mass=0.5, start=1.0), upper=[1.0, np.inf], lower=-3.0))
+    scenario = scenario_with(
+        two_link_in_space(carried=Payload(mass=0.5, start=1.0), upper=[1.0, np.inf], lower=-3.0)
+    )
     ij.save_scenario(scenario, tmp_path / "arm.toml")
     again = ij.load_scenario(tmp_path / "arm.toml")
     assert jax.tree.structure(again) == jax.tree.structure(scenario)

@@ -1,4 +1,5 @@
-"""The arms that come with the package: their data, what follows from an arm's own numbers, and the presets on them."""
+"""The arms that come with the package: their data, what follows from an arm's own numbers, and the
+presets on them."""
 
 from __future__ import annotations
 
@@ -43,14 +44,19 @@ def test_the_data_are_what_the_file_says(name):
     loaded = ij.robots.load(ROOT / "tests" / "data" / "arms" / f"{name}.urdf", tip=PRESETS[name][2])
     shipped = arms.arm(name)
     assert jax.tree.structure(shipped) == jax.tree.structure(loaded)
-    for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(shipped), jax.tree.leaves(loaded), strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=2e-14, err_msg=jax.tree_util.keystr(path))
+    for (path, one), other in zip(
+        jax.tree_util.tree_leaves_with_path(shipped), jax.tree.leaves(loaded), strict=True
+    ):
+        np.testing.assert_allclose(
+            one, other, rtol=0, atol=2e-14, err_msg=jax.tree_util.keystr(path)
+        )
     assert shipped.n == PRESETS[name][1]
 
 
 @pytest.mark.slow
 def test_an_arm_is_like_what_its_maker_says():
-    """Reach and weight, from the makers' data sheets: 0.85 m and 18.4 kg with the base; 0.82 m to the wrist and 29.9 kg."""
+    """Reach and weight, from the makers' data sheets: 0.85 m and 18.4 kg with the base; 0.82 m to
+    the wrist and 29.9 kg."""
     ur5, iiwa = arms.arm("ur5"), arms.arm("iiwa14")
     stretched = ur5.skeleton(jnp.array([0.0, np.pi / 2, 0, 0, 0, 0]))
     assert float(jnp.linalg.norm(stretched[3] - stretched[1])) == pytest.approx(0.817, abs=0.11)
@@ -83,7 +89,10 @@ def test_bounds_are_inside_the_joint_limits(scenario):
     """Strictly, at every time; other below than above; and they move."""
     t = jnp.linspace(0.0, 120.0, 12001)
     q_d = jax.vmap(scenario.reference.position)(t)
-    lower, upper = (np.asarray(jax.vmap(side.at)(t, q_d)) for side in (scenario.bounds.lower, scenario.bounds.upper))
+    lower, upper = (
+        np.asarray(jax.vmap(side.at)(t, q_d))
+        for side in (scenario.bounds.lower, scenario.bounds.upper)
+    )
     limits = scenario.plant.limits
     assert np.all(np.asarray(limits.lower) < lower)
     assert np.all(upper < np.asarray(limits.upper))
@@ -95,7 +104,9 @@ def test_bounds_are_inside_the_joint_limits(scenario):
 
 def test_the_tip_goes_through_half_a_metre(scenario):
     t = jnp.linspace(0.0, 10.0, 201)
-    tip = np.asarray(jax.jit(jax.vmap(lambda t: scenario.model.tip(scenario.reference.position(t))))(t))
+    tip = np.asarray(
+        jax.jit(jax.vmap(lambda t: scenario.model.tip(scenario.reference.position(t))))(t)
+    )
     assert np.linalg.norm(np.ptp(tip, axis=0)) > 0.5
     assert np.linalg.norm(tip, axis=1).max() < 1.3
 
@@ -129,7 +140,10 @@ def test_the_certificate_holds(name, scenario):
 def test_files_give_it_back(scenario):
     again = from_dict(scenario_to_dict(scenario)).scenario
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True)
+    )
 
 
 # --------------------------------------------------------------------------------------------- what follows from an arm's numbers
@@ -159,7 +173,9 @@ def test_efforts_become_saturation():
     assert controllers.within_effort(law, arm, edge="smooth").edge == "smooth"
     assert controllers.within_effort(law, dataclasses.replace(arm, effort=jnp.inf)) is law
     assert controllers.within_effort(law, ij.presets.customary_two_link()) is law
-    some = controllers.within_effort(law, dataclasses.replace(arm, effort=arm.effort.at[0].set(jnp.inf)))
+    some = controllers.within_effort(
+        law, dataclasses.replace(arm, effort=arm.effort.at[0].set(jnp.inf))
+    )
     assert float(some.limit[0]) == 1e6
     assert float(some.limit[1]) == 150
 
@@ -182,7 +198,11 @@ def test_other_laws_on_the_arm(law):
 
 def test_a_scenario_from_an_arm_alone():
     arm = arms.arm("ur5")
-    reference = references.Quintic(start=[0.0, -1.2, 1.6, -1.4, -1.57, 0.0], end=[0.5, -1.0, 1.2, -1.0, -1.57, 0.5], duration=2.0)
+    reference = references.Quintic(
+        start=[0.0, -1.2, 1.6, -1.4, -1.57, 0.0],
+        end=[0.5, -1.0, 1.2, -1.0, -1.57, 0.5],
+        duration=2.0,
+    )
     scenario = arms.arm_scenario(arm, reference)
     np.testing.assert_array_equal(scenario.bounds.upper.value, arm.upper)
     np.testing.assert_allclose(scenario.initial.q, reference.start)
@@ -201,7 +221,8 @@ FREQUENCY = [1.0, 0.8, 1.1, 1.3, 0.9, 1.2]
 def narrow(width):
     """Bounds at this distance from the reference."""
     return bounds.Bounds(
-        lower=bounds.Funnel(initial=-width, final=-width, rate=1.0), upper=bounds.Funnel(initial=width, final=width, rate=1.0)
+        lower=bounds.Funnel(initial=-width, final=-width, rate=1.0),
+        upper=bounds.Funnel(initial=width, final=width, rate=1.0),
     )
 
 
@@ -209,8 +230,12 @@ def light_wrist(joints=6, width=0.12):
     """The last joints of an arm of six whose last one turns 0.002 kg m^2, between narrow bounds."""
     pytest.importorskip("mujoco")
     held = dict.fromkeys(("turn", "lift", "bend", "roll", "pitch", "twist")[: 6 - joints], 0.0)
-    arm = ij.robots.load(ROOT / "tests" / "data" / "arms" / "light_wrist.urdf", tip="hand", locked=held)
-    reference = references.Sinusoid(offset=MIDDLE[-joints:], amplitude=AMPLITUDE[-joints:], frequency=FREQUENCY[-joints:])
+    arm = ij.robots.load(
+        ROOT / "tests" / "data" / "arms" / "light_wrist.urdf", tip="hand", locked=held
+    )
+    reference = references.Sinusoid(
+        offset=MIDDLE[-joints:], amplitude=AMPLITUDE[-joints:], frequency=FREQUENCY[-joints:]
+    )
     return arms.arm_scenario(arm, reference, bounds=narrow(width))
 
 
@@ -232,14 +257,19 @@ def test_a_light_wrist_keeps_narrow_bounds_at_500_hz_and_did_not_with_the_papers
     assert float(run.metrics.margin.min()) > 0.09
     for factor in (0.3, 0.1, 0.03):
         # All but 1, which would be compiled in: a program of its own.
-        papers = {"controller.K2": factor * jnp.maximum(25.0 * inertia, 0.6), "controller.weight": 1.0 - 1e-9}
+        papers = {
+            "controller.K2": factor * jnp.maximum(25.0 * inertia, 0.6),
+            "controller.weight": 1.0 - 1e-9,
+        }
         with pytest.warns(UserWarning, match="sampled too slowly"):
             run = ij.simulate(ij.with_parameters(scenario, papers), **brief)
         assert float(run.metrics.sampling_radius) > 1.05
 
 
 SLOW_PARTS = {
-    "sensor": ij.sensors.Encoder(counts=131072, velocity=ij.sensors.FilteredDifference(cutoff=400.0)),
+    "sensor": ij.sensors.Encoder(
+        counts=131072, velocity=ij.sensors.FilteredDifference(cutoff=400.0)
+    ),
     "actuator": ij.actuators.Motor(bandwidth=400.0),
 }
 """Filter and drive with a lag of 2.5 ms each."""
@@ -248,9 +278,14 @@ SLOW_PARTS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("parts", [{}, SLOW_PARTS], ids=["ideal", "encoder and motor"])
 def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are(parts):
-    unknown = {"plant.mass": ij.factor(ij.uniform(0.8, 1.25)), "initial.q": ij.offset(ij.uniform(-0.04, 0.04))}
+    unknown = {
+        "plant.mass": ij.factor(ij.uniform(0.8, 1.25)),
+        "initial.q": ij.offset(ij.uniform(-0.04, 0.04)),
+    }
     scenario = ij.with_parts(light_wrist(), **LAB, **parts)
-    study = ij.monte_carlo(scenario, unknown, runs=16, seed=0, duration=1.0, dt=1e-3, progress=False)
+    study = ij.monte_carlo(
+        scenario, unknown, runs=16, seed=0, duration=1.0, dt=1e-3, progress=False
+    )
     assert not len(study.failed)
     assert np.all(np.asarray(study.status) == 0)
     assert float(np.min(study.metrics["margin"])) > 0.03
@@ -258,19 +293,34 @@ def test_a_light_wrist_keeps_its_bounds_whatever_its_masses_are(parts):
 
 def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
     """ds/de1 at e1 = 0 is that of the barrier: 2/k^2 of the integral one, 1 of the tangent."""
-    for law, stiffness in (("integral", 2 / 0.3**2), ("log", 1 / 0.3**2), ("mapping", 1.0), ("dynamic_surface", 2 / 0.3**2)):
+    for law, stiffness in (
+        ("integral", 2 / 0.3**2),
+        ("log", 1 / 0.3**2),
+        ("mapping", 1.0),
+        ("dynamic_surface", 2 / 0.3**2),
+    ):
         scenario = arms.arm_scenario(
-            arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), law=law, bounds=narrow(0.3)
+            arms.arm("ur5"),
+            references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0),
+            law=law,
+            bounds=narrow(0.3),
         )
         inertia = jnp.diagonal(scenario.model.mass_matrix(scenario.initial.q))
-        np.testing.assert_allclose(get(scenario, "controller.weight"), np.minimum(1.0, inertia * 12.5**2 / stiffness), rtol=1e-9)
+        np.testing.assert_allclose(
+            get(scenario, "controller.weight"),
+            np.minimum(1.0, inertia * 12.5**2 / stiffness),
+            rtol=1e-9,
+        )
     with pytest.raises(ValueError, match="bounds: got 3"):
-        arms.arm_scenario(arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), bounds=3)
+        arms.arm_scenario(
+            arms.arm("ur5"), references.Quintic(start=MIDDLE, end=AMPLITUDE, duration=1.0), bounds=3
+        )
 
 
 @pytest.mark.parametrize("name", ["ur5", "iiwa14"])
 def test_joints_that_move_against_each_other_get_no_fast_mode(name):
-    """Axes of an arm are nearly parallel in some positions: with gains up to 100 M_ii, M^-1 K2 of the iiwa14 had a mode of 2195 1/s."""
+    """Axes of an arm are nearly parallel in some positions: with gains up to 100 M_ii, M^-1 K2 of
+    the iiwa14 had a mode of 2195 1/s."""
     scenario = getattr(ij.presets, name)()
     taken = np.asarray(get(scenario, "controller.K2"))
 
@@ -282,7 +332,10 @@ def test_joints_that_move_against_each_other_get_no_fast_mode(name):
     assert np.all(taken <= without * (1 + 1e-9))
 
     def fastest(gains):
-        return max(np.abs(np.linalg.eigvals(np.linalg.solve(inertia(t), np.diag(gains)))).max() for t in np.arange(0.0, 20.0, 2.5))
+        return max(
+            np.abs(np.linalg.eigvals(np.linalg.solve(inertia(t), np.diag(gains)))).max()
+            for t in np.arange(0.0, 20.0, 2.5)
+        )
 
     assert 50.0 < fastest(taken) < 200.0
     assert fastest(without) > 200.0
@@ -290,19 +343,30 @@ def test_joints_that_move_against_each_other_get_no_fast_mode(name):
 
 # --------------------------------------------------------------------------------------------------------------- the whole chain
 
-UNKNOWN = {"plant.link[iiwa_link_4].mass": ij.factor(ij.uniform(0.8, 1.2)), "initial.q": ij.offset(ij.uniform(-0.02, 0.02))}
+UNKNOWN = {
+    "plant.link[iiwa_link_4].mass": ij.factor(ij.uniform(0.8, 1.2)),
+    "initial.q": ij.offset(ij.uniform(-0.02, 0.02)),
+}
 BRIEF = {"duration": 0.02, "dt": 1e-3, "progress": False}
 
 
 @pytest.mark.release
 def test_monte_carlo_and_sweep():
-    """Every run of a batch is the run alone.  (On vmap: the C compiler takes minutes over seven joints.)"""
+    """Every run of a batch is the run alone.  (On vmap: the C compiler takes minutes over seven
+    joints.)"""
     scenario = ij.presets.iiwa14()
     study = ij.monte_carlo(scenario, UNKNOWN, runs=4, seed=0, backend="vmap", **BRIEF)
     assert not len(study.failed)
     np.testing.assert_allclose(study.metrics.rmse[2], study.replay(2).metrics.rmse, rtol=1e-6)
     grid = {"plant.link[iiwa_link_4].mass": [3.0, 4.0]}
-    table = ij.sweep(scenario, grid, runs=2, perturbations={"initial.q": UNKNOWN["initial.q"]}, backend="vmap", **BRIEF)
+    table = ij.sweep(
+        scenario,
+        grid,
+        runs=2,
+        perturbations={"initial.q": UNKNOWN["initial.q"]},
+        backend="vmap",
+        **BRIEF,
+    )
     assert table.rmse.shape == (2, 2, 7)
 
 
@@ -310,7 +374,15 @@ def test_monte_carlo_and_sweep():
 def test_tune_21_gains():
     scenario = ij.presets.iiwa14()
     gains = ["controller.k1", "controller.K2", "observer.kf"]
-    best = ij.tune(scenario, gains, ij.objectives.tracking(), method="euler", iterations=2, report_runs=2, **BRIEF)
+    best = ij.tune(
+        scenario,
+        gains,
+        ij.objectives.tracking(),
+        method="euler",
+        iterations=2,
+        report_runs=2,
+        **BRIEF,
+    )
     assert len(best.names) == 21
     assert ij.simulate(best.scenario, duration=0.02, dt=1e-3).ok
 

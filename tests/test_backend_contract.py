@@ -1,7 +1,8 @@
-"""The contract between backends: on every preset, over ten seconds, each gives what plain vmap of the reference run gives.
+"""The contract between backends: on every preset, over ten seconds, each gives what plain vmap of
+the reference run gives.
 
-The paper's preset goes by Runge-Kutta, the others by Euler's method, which has one stage to compile.  The default run holds the native
-backend to it over a tenth of the way.
+The paper's preset goes by Runge-Kutta, the others by Euler's method, which has one stage to
+compile.  The default run holds the native backend to it over a tenth of the way.
 """
 
 from __future__ import annotations
@@ -42,9 +43,13 @@ def outcome_of(scenario, varied, folds, dt, run, backend):
 
 ONE_TYPE = {"ur5": "float32", "iiwa14": "float64"}
 """Arms of many joints take minutes to compile: each in one type."""
-IN_CI = {("zhang_yan_2024", "float32")} | {(name, "float64") for name in ij.presets.PRESETS if name not in ONE_TYPE}
+IN_CI = {("zhang_yan_2024", "float32")} | {
+    (name, "float64") for name in ij.presets.PRESETS if name not in ONE_TYPE
+}
 CASES = [
-    pytest.param(name, dtype, marks=pytest.mark.slow if (name, dtype) in IN_CI else pytest.mark.release)
+    pytest.param(
+        name, dtype, marks=pytest.mark.slow if (name, dtype) in IN_CI else pytest.mark.release
+    )
     for name in ij.presets.PRESETS
     for dtype in TOLERANCE
     if dtype == ONE_TYPE.get(name, dtype)
@@ -72,20 +77,28 @@ def agree(name, dtype, run, asked):
     assert np.any(ok), expected.status
     assert np.any(~ok), expected.status
     scenario, varied, folds, dt = arguments
-    taken = {execute.chosen_backend(backend, scenario, varied, folds, dt, method=run.method) for backend in asked}
+    taken = {
+        execute.chosen_backend(backend, scenario, varied, folds, dt, method=run.method)
+        for backend in asked
+    }
     for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap
         found = jax.tree.map(np.asarray, outcome_of(*arguments, run=run, backend=backend))
-        np.testing.assert_array_equal(comparable(found.status), comparable(expected.status), err_msg=backend)
+        np.testing.assert_array_equal(
+            comparable(found.status), comparable(expected.status), err_msg=backend
+        )
         times = (x.metrics["first_violation_time"] for x in (found, expected))
         np.testing.assert_allclose(*times, rtol=0, atol=1.01 * DT, err_msg=backend)
         for field in ("q", "dq", "e1", "xi", "tau", "disturbance_estimate"):
             one, other = (x.records[0][field][ok] for x in (found, expected))
             scale = max(1.0, np.abs(other).max())
-            np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=f"{backend} {field}")
+            np.testing.assert_allclose(
+                one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=f"{backend} {field}"
+            )
 
 
 def comparable(status):
-    """A status without what is chance: the fastest mode of a run at the instant at which it ran away."""
+    """A status without what is chance: the fastest mode of a run at the instant at which it ran
+    away."""
     return np.where(status & int(Status.NOT_FINITE), status & ~int(Status.STEP_TOO_LARGE), status)
 
 

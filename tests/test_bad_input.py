@@ -1,4 +1,5 @@
-"""Bad input is a ValueError that names the field, the value and the remedy; a doubtful one is a warning."""
+"""Bad input is a ValueError that names the field, the value and the remedy; a doubtful one is a
+warning."""
 
 from __future__ import annotations
 
@@ -72,7 +73,19 @@ def test_numbers_of_a_component(case):
 
 @pytest.mark.parametrize(
     "value",
-    [2, 2.0, np.float32(2), np.float64(2), np.int8(2), np.asarray(2.0), jnp.asarray(2), Fraction(2), [2, 2], (2.0, 2), np.full(2, 2)],
+    [
+        2,
+        2.0,
+        np.float32(2),
+        np.float64(2),
+        np.int8(2),
+        np.asarray(2.0),
+        jnp.asarray(2),
+        Fraction(2),
+        [2, 2],
+        (2.0, 2),
+        np.full(2, 2),
+    ],
 )
 def test_numbers_that_are_fine(value):
     if isinstance(value, Fraction):
@@ -84,24 +97,72 @@ def test_numbers_that_are_fine(value):
 
 
 COMPONENTS = {
-    "two-link-of-three": (lambda: robots.TwoLink(**(ARM | {"mass": [1.0, 1.0, 1.0]})), "TwoLink.mass", "(2,)"),
-    "chain-sizes": (lambda: robots.PlanarChain(mass=[1.0, 1.0], length=[1.0], centre=0.1, inertia=0.1), "PlanarChain.length", "(2,)"),
-    "chain-of-scalars": (lambda: robots.PlanarChain(mass=1.0, length=1.0, centre=0.1, inertia=0.1), "PlanarChain.mass", "how many"),
-    "chain-of-none": (lambda: robots.PlanarChain(mass=[], length=[], centre=[], inertia=[]), "PlanarChain.mass", "at least one"),
-    "payload-array": (lambda: robots.TwoLink(**ARM, payload=[1.0, 2.0]), "TwoLink.payload", "one number"),
-    "reading": (lambda: controllers.Backstepping(2.0, 20.0, reading="exact"), "Backstepping.reading", "'printed', 'corrected'"),
-    "reading-array": (lambda: controllers.Backstepping(2.0, 20.0, reading=np.asarray(["printed"])), "reading", "hashable"),
-    "barrier-name": (lambda: controllers.Backstepping(2.0, 20.0, barrier="integral"), "Backstepping.barrier", "barriers.Integral()"),
-    "barrier-class": (lambda: controllers.Backstepping(2.0, 20.0, barrier=barriers.Log), "Backstepping.barrier", "brackets"),
-    "barrier-number": (lambda: controllers.Backstepping(2.0, 20.0, barrier=3), "Backstepping.barrier", "Integral()"),
-    "barrier-none": (lambda: controllers.Backstepping(2.0, 20.0, barrier=None), "Backstepping.barrier", "component"),
+    "two-link-of-three": (
+        lambda: robots.TwoLink(**(ARM | {"mass": [1.0, 1.0, 1.0]})),
+        "TwoLink.mass",
+        "(2,)",
+    ),
+    "chain-sizes": (
+        lambda: robots.PlanarChain(mass=[1.0, 1.0], length=[1.0], centre=0.1, inertia=0.1),
+        "PlanarChain.length",
+        "(2,)",
+    ),
+    "chain-of-scalars": (
+        lambda: robots.PlanarChain(mass=1.0, length=1.0, centre=0.1, inertia=0.1),
+        "PlanarChain.mass",
+        "how many",
+    ),
+    "chain-of-none": (
+        lambda: robots.PlanarChain(mass=[], length=[], centre=[], inertia=[]),
+        "PlanarChain.mass",
+        "at least one",
+    ),
+    "payload-array": (
+        lambda: robots.TwoLink(**ARM, payload=[1.0, 2.0]),
+        "TwoLink.payload",
+        "one number",
+    ),
+    "reading": (
+        lambda: controllers.Backstepping(2.0, 20.0, reading="exact"),
+        "Backstepping.reading",
+        "'printed', 'corrected'",
+    ),
+    "reading-array": (
+        lambda: controllers.Backstepping(2.0, 20.0, reading=np.asarray(["printed"])),
+        "reading",
+        "hashable",
+    ),
+    "barrier-name": (
+        lambda: controllers.Backstepping(2.0, 20.0, barrier="integral"),
+        "Backstepping.barrier",
+        "barriers.Integral()",
+    ),
+    "barrier-class": (
+        lambda: controllers.Backstepping(2.0, 20.0, barrier=barriers.Log),
+        "Backstepping.barrier",
+        "brackets",
+    ),
+    "barrier-number": (
+        lambda: controllers.Backstepping(2.0, 20.0, barrier=3),
+        "Backstepping.barrier",
+        "Integral()",
+    ),
+    "barrier-none": (
+        lambda: controllers.Backstepping(2.0, 20.0, barrier=None),
+        "Backstepping.barrier",
+        "component",
+    ),
     "guard": (lambda: barriers.Integral(guard=1.5), "Integral.guard", "between 0 and 1"),
     "guard-zero": (lambda: barriers.Log(guard=0.0), "Log.guard", "positive"),
     "guard-word": (lambda: barriers.Log(guard="small"), "Log.guard", "positive"),
     "p-zero": (lambda: barriers.Log(p=0), "Log.p", ">= 1"),
     "p-half": (lambda: barriers.Log(p=1.5), "Log.p", "whole"),
     "p-bool": (lambda: barriers.Log(p=True), "Log.p", "whole"),
-    "observer-start": (lambda: observers.Printed(kf=20.0, start="cold"), "Printed.start", "'matched'"),
+    "observer-start": (
+        lambda: observers.Printed(kf=20.0, start="cold"),
+        "Printed.start",
+        "'matched'",
+    ),
     "side-number": (lambda: bounds.Bounds(0.1, 0.9), "Bounds.lower", "Constant(value)"),
     "side-none": (lambda: bounds.Bounds(bounds.Constant(0.1), None), "Bounds.upper", "component"),
     "friction-width": (lambda: disturbances.Friction(width=0.0), "Friction.width", "> 0"),
@@ -109,15 +170,35 @@ COMPONENTS = {
     "sum-of-numbers": (lambda: disturbances.Sum((1.0, 2.0)), "Sum.parts", "tuple of disturbances"),
     "sum-of-one": (lambda: disturbances.Sum(disturbances.Friction()), "Sum.parts", "brackets"),
     "sum-of-words": (lambda: disturbances.Sum(("friction",)), "Sum.parts[0]", "Disturbance"),
-    "spline-order": (lambda: references.WaypointSpline((0.0, 0.0), [[0.0], [1.0]]), "WaypointSpline.times", "increasing"),
-    "spline-words": (lambda: references.WaypointSpline(("a", "b"), [[0.0], [1.0]]), "WaypointSpline.times", "increasing"),
-    "spline-rows": (lambda: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0], [2.0]]), "WaypointSpline.waypoints", "row"),
-    "spline-list": (lambda: references.WaypointSpline([0.0, 1.0], [[0.0], [1.0]]), "WaypointSpline.times", "tuple"),
+    "spline-order": (
+        lambda: references.WaypointSpline((0.0, 0.0), [[0.0], [1.0]]),
+        "WaypointSpline.times",
+        "increasing",
+    ),
+    "spline-words": (
+        lambda: references.WaypointSpline(("a", "b"), [[0.0], [1.0]]),
+        "WaypointSpline.times",
+        "increasing",
+    ),
+    "spline-rows": (
+        lambda: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0], [2.0]]),
+        "WaypointSpline.waypoints",
+        "row",
+    ),
+    "spline-list": (
+        lambda: references.WaypointSpline([0.0, 1.0], [[0.0], [1.0]]),
+        "WaypointSpline.times",
+        "tuple",
+    ),
     "quintic": (lambda: references.Quintic(0.0, 1.0, duration=-2.0), "Quintic.duration", "> 0"),
     "preset-law": (lambda: ij.presets.zhang_yan_2024(law="tangent"), "law", "'integral', 'log'"),
     "preset-reading": (lambda: ij.presets.zhang_yan_2024(reading=None), "reading", "'printed'"),
     "dtype-int": (lambda: ij.astype(ij.presets.zhang_yan_2024(), "int32"), "dtype", "float32"),
-    "dtype-word": (lambda: ij.astype(ij.presets.zhang_yan_2024(), "double-double"), "dtype", "float32"),
+    "dtype-word": (
+        lambda: ij.astype(ij.presets.zhang_yan_2024(), "double-double"),
+        "dtype",
+        "float32",
+    ),
 }
 
 
@@ -137,7 +218,12 @@ SCENARIOS = {
     "plant-none": (with_part(plant=None), "Scenario.plant", "component"),
     "plant-name": (with_part(plant="two_link"), "Scenario.plant", "robots"),
     "plant-class": (with_part(plant=robots.TwoLink), "Scenario.plant", "brackets"),
-    "plant-is-a-bound": (with_part(plant=bounds.Constant(1.0)), "Scenario.plant", "lacks", "mass_matrix"),
+    "plant-is-a-bound": (
+        with_part(plant=bounds.Constant(1.0)),
+        "Scenario.plant",
+        "lacks",
+        "mass_matrix",
+    ),
     "model-of-three": (with_part(model=CHAIN3), "Scenario.model", "3 joints", "2 joints"),
     "plant-of-three": (with_part(plant=CHAIN3, model=CHAIN3), "got", "3 (one a joint)"),
     "reference-class": (with_part(reference=references.Sinusoid), "Scenario.reference", "brackets"),
@@ -149,26 +235,66 @@ SCENARIOS = {
         "(2,)",
     ),
     "bounds-one-side": (with_part(bounds=bounds.Constant(0.1)), "Scenario.bounds", "Bounds(lower="),
-    "bounds-exchanged": (with_part(bounds=bounds.Bounds(TUBE.upper, TUBE.lower)), "bounds of joint 0", "lower < upper", "Exchange"),
-    "bounds-wrong-n": (with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)), "bounds.lower.value", "2 (one a joint)"),
+    "bounds-exchanged": (
+        with_part(bounds=bounds.Bounds(TUBE.upper, TUBE.lower)),
+        "bounds of joint 0",
+        "lower < upper",
+        "Exchange",
+    ),
+    "bounds-wrong-n": (
+        with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)),
+        "bounds.lower.value",
+        "2 (one a joint)",
+    ),
     "controller-object": (with_part(controller=object()), "Scenario.controller", "check_law"),
     "controller-gains": (with_part(controller=[2.0, 20.0]), "Scenario.controller", "Controller"),
     "observer-number": (with_part(observer=20.0), "Scenario.observer", "NoObserver()"),
-    "disturbance-list": (with_part(disturbance=[disturbances.Friction()]), "Scenario.disturbance", "Nothing()"),
-    "tip-force-in-space": (with_part(disturbance=disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])), "disturbance.torque", "(2,)"),
+    "disturbance-list": (
+        with_part(disturbance=[disturbances.Friction()]),
+        "Scenario.disturbance",
+        "Nothing()",
+    ),
+    "tip-force-in-space": (
+        with_part(disturbance=disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])),
+        "disturbance.torque",
+        "(2,)",
+    ),
     "initial-tuple": (with_part(initial=(0.8, 0.8)), "Scenario.initial", "Initial(q="),
-    "initial-of-three": (with_part(initial=ij.Initial(q=[0.8, 0.8, 0.8])), "initial.q", "2 (one a joint)"),
-    "start-above": (with_part(initial=ij.Initial(q=[1.05, 0.8])), "initial.q[0]", "1.05", "(0.34, 1.04)", "Move the start"),
-    "start-on-the-bound": (with_part(initial=ij.Initial(q=[0.8, 0.9])), "initial.q[1]", "inside the bounds"),
+    "initial-of-three": (
+        with_part(initial=ij.Initial(q=[0.8, 0.8, 0.8])),
+        "initial.q",
+        "2 (one a joint)",
+    ),
+    "start-above": (
+        with_part(initial=ij.Initial(q=[1.05, 0.8])),
+        "initial.q[0]",
+        "1.05",
+        "(0.34, 1.04)",
+        "Move the start",
+    ),
+    "start-on-the-bound": (
+        with_part(initial=ij.Initial(q=[0.8, 0.9])),
+        "initial.q[1]",
+        "inside the bounds",
+    ),
     "start-below": (with_part(initial=ij.Initial(q=[0.8, 0.1])), "initial.q[1]", "0.1"),
     "start-too-fast": (with_part(initial=ij.Initial(q=0.8, dq=1e5)), "initial.dq", "10000"),
-    "reference-outside": (with_part(reference=references.Sinusoid(1.5, 0.1)), "reference of joint 0", "Assumption 2"),
+    "reference-outside": (
+        with_part(reference=references.Sinusoid(1.5, 0.1)),
+        "reference of joint 0",
+        "Assumption 2",
+    ),
     "massless-link": (
         with_part(plant=robots.TwoLink(mass=1.0, length=1.0, centre=0.0, inertia=0.0)),
         "plant.mass_matrix",
         "positive definite",
     ),
-    "float16": (lambda: ij.simulate(ij.astype(ij.presets.zhang_yan_2024(), "float16"), **SHORT), "scenario", "float16", "float32"),
+    "float16": (
+        lambda: ij.simulate(ij.astype(ij.presets.zhang_yan_2024(), "float16"), **SHORT),
+        "scenario",
+        "float16",
+        "float32",
+    ),
     "not-a-scenario": (lambda: ij.simulate({"law": "integral"}, **SHORT), "scenario", "ij.presets"),
     "not-a-scenario-dt": (lambda: ij.recommended_dt(None), "scenario", "ij.presets"),
 }
@@ -203,7 +329,13 @@ ARGUMENTS = {
     "duration-text": ({"duration": np.str_("1")}, "duration", "positive"),
     "duration-huge": ({"duration": 10**400}, "duration", "positive"),
     "duration-long": ({"duration": 1e300}, "duration", "at most", "Shorten"),
-    "duration-broken": ({"duration": 0.0105}, "duration", "0.0105", "whole number", "Take duration=0.01 or dt=0.00105"),
+    "duration-broken": (
+        {"duration": 0.0105},
+        "duration",
+        "0.0105",
+        "whole number",
+        "Take duration=0.01 or dt=0.00105",
+    ),
     "too-many-samples": ({"duration": 1e6}, "record_every", "Take record_every="),
     "record-zero": ({"record_every": 0}, "record_every", ">= 1"),
     "record-half": ({"record_every": 1.5}, "record_every", "whole"),
@@ -304,7 +436,10 @@ def test_with_parameters_changes_what_it_says_and_nothing_else(paper):
 def test_every_parameter_can_be_written_back_by_its_path(paper):
     table = {p.path: p.value for p in ij.parameters(paper)}
     again = ij.with_parameters(paper, table)
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(paper), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(paper), strict=True)
+    )
 
 
 # --------------------------------------------------------------------------------------- every function, before it does anything
@@ -319,19 +454,41 @@ GOOD = {
     "simulate": lambda **x: ij.simulate(**({"scenario": WEAK, **SHORT} | x)),
     "compare": lambda **x: ij.compare(**({"scenario": WEAK, "laws": ["integral"], **SHORT} | x)),
     "certify": lambda **x: ij.certify(**({"scenario": WEAK, **SHORT} | x)),
-    "monte_carlo": lambda **x: ij.monte_carlo(**({"scenario": WEAK, "perturbations": DRAWN, "runs": 2, **SHORT} | x)),
-    "sweep": lambda **x: ij.sweep(**({"scenario": WEAK, "grid": {"controller.K2": [10.0, 20.0]}, **SHORT} | x)),
-    "sensitivity": lambda **x: ij.sensitivity(**({"scenario": WEAK, "perturbations": DRAWN, "points": 2, **SHORT} | x)),
-    "tune": lambda **x: ij.tune(**({"scenario": WEAK, "parameters": ["controller.K2"], "objective": TRACKING, **SHORT} | x)),
+    "monte_carlo": lambda **x: ij.monte_carlo(
+        **({"scenario": WEAK, "perturbations": DRAWN, "runs": 2, **SHORT} | x)
+    ),
+    "sweep": lambda **x: ij.sweep(
+        **({"scenario": WEAK, "grid": {"controller.K2": [10.0, 20.0]}, **SHORT} | x)
+    ),
+    "sensitivity": lambda **x: ij.sensitivity(
+        **({"scenario": WEAK, "perturbations": DRAWN, "points": 2, **SHORT} | x)
+    ),
+    "tune": lambda **x: ij.tune(
+        **({"scenario": WEAK, "parameters": ["controller.K2"], "objective": TRACKING, **SHORT} | x)
+    ),
     "falsify": lambda **x: ij.falsify(**({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)),
     "pareto": lambda **x: ij.pareto(
-        **({"scenario": WEAK, "parameters": ["controller.K2"], "objectives": (TRACKING, ij.objectives.effort()), **SHORT} | x)
+        **(
+            {
+                "scenario": WEAK,
+                "parameters": ["controller.K2"],
+                "objectives": (TRACKING, ij.objectives.effort()),
+                **SHORT,
+            }
+            | x
+        )
     ),
-    "identify": lambda **x: ij.identify(**({"scenario": WEAK, "log": {}, "paths": ["plant.mass"]} | x)),
+    "identify": lambda **x: ij.identify(
+        **({"scenario": WEAK, "log": {}, "paths": ["plant.mass"]} | x)
+    ),
     "excitation": lambda **x: ij.excitation(**({"scenario": WEAK, "paths": ["plant.mass"]} | x)),
     "export": lambda **x: ij.export(**({"scenario": WEAK, "folder": "never", "period": 1e-3} | x)),
-    "export-loop": lambda **x: ij.export(**({"scenario": WEAK, "folder": "never", "target": "wasm"} | x)),
-    "cosimulate": lambda **x: ij.cosimulate(**({"scenario": WEAK, "plant": "never.xml", "period": 1e-3, "duration": 0.01} | x)),
+    "export-loop": lambda **x: ij.export(
+        **({"scenario": WEAK, "folder": "never", "target": "wasm"} | x)
+    ),
+    "cosimulate": lambda **x: ij.cosimulate(
+        **({"scenario": WEAK, "plant": "never.xml", "period": 1e-3, "duration": 0.01} | x)
+    ),
     "explain": lambda **x: ij.explain(**({"scenario": WEAK} | x)),
     "explore": lambda **x: ij.explore(**({"scenario": WEAK} | x)),
     "report": lambda **x: ij.report(**({"result": WEAK, "path": "never.html"} | x)),
@@ -347,7 +504,23 @@ GOOD = {
 """Function -> a call of it that is fine, but for what a case replaces."""
 
 NO_WORDS = (None, [], {}, 3, b"rk4", ["rk4"], np.asarray(["rk4", "x"]), "nope", True, float("nan"))
-NO_TIMES = (None, "x", [], True, 0.0, -1.0, float("nan"), np.inf, 5e-324, 3e-300, 1e300, 4e9, 10**30, 1j, np.ones(2))
+NO_TIMES = (
+    None,
+    "x",
+    [],
+    True,
+    0.0,
+    -1.0,
+    float("nan"),
+    np.inf,
+    5e-324,
+    3e-300,
+    1e300,
+    4e9,
+    10**30,
+    1j,
+    np.ones(2),
+)
 NO_SEEDS = (None, "x", [], True, -1, 1.5, float("nan"), 2**32, 10**30, np.ones(2))
 NO_COUNTS = (None, "x", [], True, 0, -3, 1.5, float("nan"), np.inf, 10**30, 7 * 10**29, np.ones(2))
 NO_FLAGS = ("yes", 1, 0.0, [], np.ones(2))
@@ -375,7 +548,10 @@ REFUSED = {
     "sweep store": (NO_PATHS[:7], ["path of a folder"]),
     "sensitivity backend": (NO_WORDS, ["'auto'"]),
     "sensitivity output": ((None, [], 3, "nope", "", LONG_NAME), []),
-    "tune objective": ((None, [], "rmse", "x", 3, {}, ij.objectives.tracking), ["ij.objectives.tracking() + 0.1 * ij.objectives.effort()"]),
+    "tune objective": (
+        (None, [], "rmse", "x", 3, {}, ij.objectives.tracking),
+        ["ij.objectives.tracking() + 0.1 * ij.objectives.effort()"],
+    ),
     "tune parameters": ((None, [], {}, "controller.K2", [None], [3], [["controller.K2"]]), []),
     "tune backend": (NO_WORDS, ["'auto'"]),
     "tune report_seed": (NO_SEEDS[1:], ["whole number"]),
@@ -432,7 +608,10 @@ REFUSED = {
     "tunable low": (([], float("nan"), "x"), []),
     "tunable high": (([], float("nan"), "x"), []),
     "factor shared": (NO_FLAGS, []),
-    "factor distribution": ((None, float("nan"), 3.0, ij.uniform), ["ij.factor(ij.uniform(low, high))"]),
+    "factor distribution": (
+        (None, float("nan"), 3.0, ij.uniform),
+        ["ij.factor(ij.uniform(low, high))"],
+    ),
     "save_scenario path": ((None, *NO_PATHS, f"{NO_FOLDER}/scenario.toml"), []),
 }
 
@@ -466,7 +645,10 @@ def test_a_duration_that_no_step_can_be_tried_on_is_refused(monkeypatch):
 
 def test_a_file_or_folder_that_does_not_exist_is_named_with_its_argument(tmp_path):
     gains, place = ["controller.K2"], tmp_path / "none" / "state.npz"
-    with pytest.raises(FileNotFoundError, match=r"checkpoint: got .*The folder .*none does not exist: create it first\.$"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"checkpoint: got .*The folder .*none does not exist: create it first\.$",
+    ):
         ij.tune(WEAK, gains, ij.objectives.tracking(), duration=0.01, dt=1e-3, checkpoint=place)
     refuses(lambda: ij.load_rollouts(tmp_path / "none.nc"), "path", "Nothing is there.")
     with pytest.raises(ValueError, match=r"Nothing is there\.$"):
@@ -474,16 +656,35 @@ def test_a_file_or_folder_that_does_not_exist_is_named_with_its_argument(tmp_pat
 
 
 def test_misspelt_parts_and_fields_get_a_suggestion():
-    refuses(lambda: ij.with_parts(WEAK, contoller=WEAK.controller), "part", "'contoller'", "Did you mean controller?")
+    refuses(
+        lambda: ij.with_parts(WEAK, contoller=WEAK.controller),
+        "part",
+        "'contoller'",
+        "Did you mean controller?",
+    )
     refuses(lambda: ij.with_parts(WEAK, velocity_bound=None), "Did you mean velocity_bounds?")
     refuses(lambda: ij.with_parts(WEAK, zzz=None), "'zzz'", "robot, plant")
-    refuses(lambda: dataclasses.replace(WEAK, refrence=WEAK.reference), "Scenario", "Did you mean reference?")
-    refuses(lambda: controllers.Backstepping(2.0, K2=20.0, barier=barriers.Log()), "Backstepping", "Did you mean barrier")
+    refuses(
+        lambda: dataclasses.replace(WEAK, refrence=WEAK.reference),
+        "Scenario",
+        "Did you mean reference?",
+    )
+    refuses(
+        lambda: controllers.Backstepping(2.0, K2=20.0, barier=barriers.Log()),
+        "Backstepping",
+        "Did you mean barrier",
+    )
 
 
 def test_constructors_name_the_field_that_is_missing():
     for call, *words in (
-        (lambda: ij.sensors.Encoder(), "Encoder.velocity", "nothing", "a Velocity", "Encoder(velocity=...)"),
+        (
+            lambda: ij.sensors.Encoder(),
+            "Encoder.velocity",
+            "nothing",
+            "a Velocity",
+            "Encoder(velocity=...)",
+        ),
         (lambda: ij.Sampling(), "Sampling.period", "nothing", "[s]"),
         (lambda: ij.Scenario(plant=WEAK.plant), "Scenario.reference", "a Reference"),
         (lambda: controllers.Backstepping(2.0), "Backstepping.K2", "number"),
@@ -491,7 +692,9 @@ def test_constructors_name_the_field_that_is_missing():
         (lambda: barriers.Log(1, 2, 3, 4, 5), "Log", "5 positional arguments"),
     ):
         refuses(call, *words)
-        with pytest.raises(TypeError):  # what Python itself raises, so that programs that expect it go on
+        with pytest.raises(
+            TypeError
+        ):  # what Python itself raises, so that programs that expect it go on
             call()
 
 
@@ -534,7 +737,9 @@ CALLS_THAT_ADVISE = {
     "sensitivity": lambda: ij.sensitivity(WEAK, NO_LEAF, points=2, **SHORT),
     "falsify": lambda: ij.falsify(WEAK, NO_LEAF, **SHORT),
     "tune": lambda: ij.tune(WEAK, ["controller.nope"], TRACKING, **SHORT),
-    "pareto": lambda: ij.pareto(WEAK, ["controller.nope"], (TRACKING, ij.objectives.effort()), **SHORT),
+    "pareto": lambda: ij.pareto(
+        WEAK, ["controller.nope"], (TRACKING, ij.objectives.effort()), **SHORT
+    ),
     "excitation": lambda: ij.excitation(WEAK, ["controller.nope"], duration=1.0),
     "identify": lambda: ij.identify(WEAK, {}, ["controller.nope"]),
     "export": lambda: ij.export(SAMPLED, "/dev/null/below"),
@@ -552,8 +757,12 @@ def test_every_function_gives_a_warning_once_at_the_callers_line(name, monkeypat
     from iblf_jax.deployment import live
 
     monkeypatch.setattr(controllers.Backstepping, "advice", lambda *_: [ADVICE], raising=False)
-    monkeypatch.setattr(_certify, "_one", lambda run: run)  # what comes after the run warns of nothing, and takes long
-    monkeypatch.setattr(live, "_loop", lambda scenario, *_: {"rows": ij.simulate(scenario, **SHORT).t.size})
+    monkeypatch.setattr(
+        _certify, "_one", lambda run: run
+    )  # what comes after the run warns of nothing, and takes long
+    monkeypatch.setattr(
+        live, "_loop", lambda scenario, *_: {"rows": ij.simulate(scenario, **SHORT).t.size}
+    )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with contextlib.suppress(ValueError):
@@ -586,7 +795,8 @@ def test_a_second_call_warns_again_and_what_is_muted_does_not_count(monkeypatch)
 
 
 def test_a_warning_shows_no_line_of_the_package(tmp_path):
-    """In a process of its own, as a user sees it: the text is there once, with the user's line below."""
+    """In a process of its own, as a user sees it: the text is there once, with the user's line
+    below."""
     script = tmp_path / "mine.py"
     script.write_text(
         "import iblf_jax as ij\n"
@@ -597,14 +807,22 @@ def test_a_warning_shows_no_line_of_the_package(tmp_path):
         "        notices.warn('Look at this.')\n"
         "work()\n"
     )
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stderr.count("Look at this.") == 2, "the message, and the line of the user's that gave it"
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stderr.count("Look at this.") == 2, (
+        "the message, and the line of the user's that gave it"
+    )
     assert "mine.py:6: UserWarning" in done.stderr and "stacklevel" not in done.stderr
 
 
 def test_every_warning_of_the_package_looks_for_the_users_line():
     for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
-        uses = re.search(r"warnings\.warn(_explicit)?\(.*stacklevel|warnings\.warn\($", path.read_text(), re.MULTILINE)
+        uses = re.search(
+            r"warnings\.warn(_explicit)?\(.*stacklevel|warnings\.warn\($",
+            path.read_text(),
+            re.MULTILINE,
+        )
         assert not uses or path.name == "notices.py", path
 
 
@@ -614,9 +832,24 @@ def test_every_warning_of_the_package_looks_for_the_users_line():
 @pytest.mark.parametrize(
     ("noun", "expected"),
     [
-        *(("Actuator", "an Actuator"), ("Encoder", "an Encoder"), ("Ideal", "an Ideal"), ("Observer", "an Observer")),
-        *(("Controller", "a Controller"), ("Uniform", "a Uniform"), ("user", "a user"), ("Universal", "a Universal")),
-        *(("unit", "a unit"), ("unimportant part", "an unimportant part"), ("hinge", "a hinge"), ("one-sided", "a one-sided")),
+        *(
+            ("Actuator", "an Actuator"),
+            ("Encoder", "an Encoder"),
+            ("Ideal", "an Ideal"),
+            ("Observer", "an Observer"),
+        ),
+        *(
+            ("Controller", "a Controller"),
+            ("Uniform", "a Uniform"),
+            ("user", "a user"),
+            ("Universal", "a Universal"),
+        ),
+        *(
+            ("unit", "a unit"),
+            ("unimportant part", "an unimportant part"),
+            ("hinge", "a hinge"),
+            ("one-sided", "a one-sided"),
+        ),
     ],
 )
 def test_the_article_of_a_noun(noun, expected):
@@ -624,15 +857,22 @@ def test_the_article_of_a_noun(noun, expected):
 
 
 def test_no_message_has_a_fixed_article_before_a_name_that_varies():
-    """An f-string with "a " or "an " right before a value, unless the value is one of those words that are known."""
+    """An f-string with "a " or "an " right before a value, unless the value is one of those words
+    that are known."""
     known = {"kind", "'number >= 0' if zero else 'positive number'", "noun"}
     found = []
     for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             pairs = itertools.pairwise(node.values) if isinstance(node, ast.JoinedStr) else ()
             for before, after in pairs:
-                has_article = isinstance(before, ast.Constant) and re.search(r"(?i)\ban? $", str(before.value))
-                if has_article and isinstance(after, ast.FormattedValue) and ast.unparse(after.value) not in known:
+                has_article = isinstance(before, ast.Constant) and re.search(
+                    r"(?i)\ban? $", str(before.value)
+                )
+                if (
+                    has_article
+                    and isinstance(after, ast.FormattedValue)
+                    and ast.unparse(after.value) not in known
+                ):
                     found.append(f"{path.name}:{after.lineno}: {ast.unparse(after.value)}")
     assert not found
 

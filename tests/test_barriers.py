@@ -1,4 +1,5 @@
-"""Barriers against quadrature and the paper's statements: Theorem 1, Lemma 1, V_integral = 2 V_log, kappa, limits."""
+"""Barriers against quadrature and the paper's statements: Theorem 1, Lemma 1, V_integral = 2 V_log,
+kappa, limits."""
 
 from __future__ import annotations
 
@@ -21,20 +22,29 @@ RATE = st.floats(-1e3, 1e3)
 
 def tube(k_l, k_u, dk_l=0.0, dk_u=0.0, q_d=0.0):
     """A tube of these widths and rates around q_d."""
-    shaped = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in (q_d, 0.0, q_d - k_l, q_d + k_u, -dk_l, dk_u)))
+    shaped = np.broadcast_arrays(
+        *(
+            np.atleast_1d(np.asarray(x, float))
+            for x in (q_d, 0.0, q_d - k_l, q_d + k_u, -dk_l, dk_u)
+        )
+    )
     return Tube(*shaped)
 
 
 def compiled(function):
     """`function` under jit, for arguments that may be lists of numbers."""
     inner = jax.jit(function)
-    return lambda part, *args: inner(part, *(x if isinstance(x, Tube) else np.asarray(x, float) for x in args))
+    return lambda part, *args: inner(
+        part, *(x if isinstance(x, Tube) else np.asarray(x, float) for x in args)
+    )
 
 
 value = compiled(lambda barrier, tube, q: barrier.value(tube, q))
 slope = compiled(lambda barrier, tube, q: barrier.slope(tube, q))
 alpha = compiled(lambda barrier, tube, q, k1, o: barrier.virtual_velocity(tube, q, k1, o))
-derivative = compiled(lambda barrier, tube, q: jax.grad(lambda q: jnp.sum(barrier.slope(tube, q)))(q))
+derivative = compiled(
+    lambda barrier, tube, q: jax.grad(lambda q: jnp.sum(barrier.slope(tube, q)))(q)
+)
 xi_of = compiled(lambda tube, q: tube.xi(q))
 kappa_of = compiled(bound_motion_gain)
 
@@ -44,7 +54,9 @@ def test_integral_barrier_is_the_integral(xi, k_l, k_u):
     """(2.6): V1 = int_0^xi 2 s / (1 - s^2) ds, by quadrature."""
     q = xi * (k_u if xi > 0 else k_l)
     expected = quad(lambda s: 2 * s / (1 - s**2), 0, xi, limit=200)[0]
-    assert float(value(Integral(), tube(k_l, k_u), [q])[0]) == pytest.approx(expected, rel=1e-7, abs=1e-12)
+    assert float(value(Integral(), tube(k_l, k_u), [q])[0]) == pytest.approx(
+        expected, rel=1e-7, abs=1e-12
+    )
 
 
 @given(xi=INSIDE, k_l=WIDTH, k_u=WIDTH, p=st.integers(1, 3))
@@ -61,7 +73,8 @@ def test_log_barrier_is_the_integral_of_its_slope(xi, k_l, k_u, p):
 
 @given(xi=st.floats(-1.5, 1.5), k_l=WIDTH, k_u=WIDTH)
 def test_integral_is_twice_the_logarithm(xi, k_l, k_u):
-    """V_integral = 2 V_log(p = 1) identically, past the wall too; so is the slope, and alpha is the same."""
+    """V_integral = 2 V_log(p = 1) identically, past the wall too; so is the slope, and alpha is the
+    same."""
     t, q = tube(k_l, k_u, 0.1, -0.2), [xi * (k_u if xi > 0 else k_l)]
     np.testing.assert_allclose(value(Integral(), t, q), 2 * value(Log(), t, q), rtol=1e-12)
     np.testing.assert_allclose(slope(Integral(), t, q), 2 * slope(Log(), t, q), rtol=1e-12)
@@ -85,7 +98,8 @@ def test_lemma_1(e1, k_l, k_u):
 
 @given(k_l=WIDTH, k_u=WIDTH, dk_l=RATE, dk_u=RATE, o=st.floats(1e-6, 10))
 def test_kappa_outweighs_the_motion_of_the_bound(k_l, k_u, dk_l, dk_u, o):
-    """kappa + k'/k >= 0 on both sides for every o > 0 (which needs the root that the printed text lost)."""
+    """kappa + k'/k >= 0 on both sides for every o > 0 (which needs the root that the printed text
+    lost)."""
     kappa = float(kappa_of(tube(k_l, k_u, dk_l, dk_u), o)[0])
     largest = max(1.0, abs(dk_u / k_u), abs(dk_l / k_l))
     assert kappa + dk_u / k_u >= -1e-12 * largest
@@ -93,7 +107,8 @@ def test_kappa_outweighs_the_motion_of_the_bound(k_l, k_u, dk_l, dk_u, o):
 
 
 def test_without_the_root_kappa_fails_on_the_papers_bounds():
-    """The text as printed, o = 0.1: the inequality before (3.9) is false 22 % of the time for each joint."""
+    """The text as printed, o = 0.1: the inequality before (3.9) is false 22 % of the time for each
+    joint."""
     t = np.linspace(0, 2 * np.pi, 20001)
     k_u = np.stack([0.4 + 0.14 * (np.cos(t) - np.sin(t)), 0.4 + 0.14 * (np.sin(t) - np.cos(t))])
     k_l = np.stack([0.3 + 0.14 * (np.sin(t) - np.cos(t)), 0.3 + 0.14 * (np.cos(t) - np.sin(t))])
@@ -110,7 +125,9 @@ def test_limit_of_wide_bounds(barrier):
     t, e1 = tube(1e9, 1e9), np.asarray([0.3, -0.2])
     t = jax.tree.map(lambda x: np.broadcast_to(x, (2,)), t)
     np.testing.assert_allclose(slope(barrier, t, e1), 0, atol=1e-15)
-    np.testing.assert_allclose(alpha(barrier, t, e1, 2.0, 0.1), -(2.0 + np.sqrt(0.1)) * e1, rtol=1e-9)
+    np.testing.assert_allclose(
+        alpha(barrier, t, e1, 2.0, 0.1), -(2.0 + np.sqrt(0.1)) * e1, rtol=1e-9
+    )
 
 
 def test_the_guard_is_exact_inside_and_tangent_beyond():
@@ -126,7 +143,8 @@ def test_the_guard_is_exact_inside_and_tangent_beyond():
 
 
 def test_the_guarded_error_on_both_sides():
-    """e = min(|e1|, (1 - guard) k) sign(e1) and the rest beyond, with the width and the rate of the side that e1 is on."""
+    """e = min(|e1|, (1 - guard) k) sign(e1) and the rest beyond, with the width and the rate of the
+    side that e1 is on."""
     t = tube(*np.array([[0.3] * 4, [0.5] * 4]), dk_l=0.1, dk_u=-0.2, q_d=1.0)
     e1 = np.array([-0.4, -0.1, 0.49, 0.7])
     got = guarded_error(t, jnp.asarray(1.0 + e1), 0.1)
@@ -137,10 +155,19 @@ def test_the_guarded_error_on_both_sides():
     assert list(guard_is_active(t, jnp.asarray(1.0 + e1), 0.1)) == [True, False, True, True]
 
 
-@given(e=st.floats(allow_nan=False, allow_infinity=False, width=32), k_l=st.floats(0, 10), k_u=st.floats(0, 10))
+@given(
+    e=st.floats(allow_nan=False, allow_infinity=False, width=32),
+    k_l=st.floats(0, 10),
+    k_u=st.floats(0, 10),
+)
 def test_finite_for_any_error_and_any_width(e, k_l, k_u):
     """Widths of zero too: a reference on its bound is flagged, not divided by."""
     t = tube(k_l, k_u, 0.3, -0.4)
     for barrier in (Integral(), Log(p=2)):
-        numbers = [value(barrier, t, [e]), slope(barrier, t, [e]), alpha(barrier, t, [e], 2.0, 0.1), derivative(barrier, t, [e])]
+        numbers = [
+            value(barrier, t, [e]),
+            slope(barrier, t, [e]),
+            alpha(barrier, t, [e], 2.0, 0.1),
+            derivative(barrier, t, [e]),
+        ]
         assert np.all(np.isfinite(np.concatenate(numbers))), numbers

@@ -1,4 +1,5 @@
-"""Every barrier against its definition: quadrature, AD of V1, V1' along alpha, limits, symmetry, claims, and the singular points."""
+"""Every barrier against its definition: quadrature, AD of V1, V1' along alpha, limits, symmetry,
+claims, and the singular points."""
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +20,20 @@ KAPPA = {"integral", "log", "log_p2"}
 
 REFERENCE = ij.references.Sinusoid(0.5, 0.14, 1.0, [0.0, 1.5])
 BOUNDS = {
-    "paper": ij.bounds.Bounds(ij.bounds.Sinusoid(0.2, 0.14, 1.0, [1.57, 0.0]), ij.bounds.Sinusoid(0.9, 0.14, 1.0, [1.57, 0.0])),
-    "breathing": ij.bounds.Bounds(ij.bounds.Sinusoid(0.1, 0.1, 1.3, [0.2, 2.0]), ij.bounds.Sinusoid(1.0, 0.2, 0.7, [0.0, 1.0])),
+    "paper": ij.bounds.Bounds(
+        ij.bounds.Sinusoid(0.2, 0.14, 1.0, [1.57, 0.0]),
+        ij.bounds.Sinusoid(0.9, 0.14, 1.0, [1.57, 0.0]),
+    ),
+    "breathing": ij.bounds.Bounds(
+        ij.bounds.Sinusoid(0.1, 0.1, 1.3, [0.2, 2.0]), ij.bounds.Sinusoid(1.0, 0.2, 0.7, [0.0, 1.0])
+    ),
     "funnel": ij.bounds.Bounds(ij.bounds.Funnel(-0.5, -0.05, 0.8), ij.bounds.Funnel(0.4, 0.1, 0.6)),
 }
-_GRID = [(t, xi) for t in (0.0, 0.4, 2.2) for xi in (-0.97, -0.5, -1e-3, -1e-9, 0.0, 1e-9, 1e-3, 0.4, 0.95)]
+_GRID = [
+    (t, xi)
+    for t in (0.0, 0.4, 2.2)
+    for xi in (-0.97, -0.5, -1e-3, -1e-9, 0.0, 1e-9, 1e-3, 0.4, 0.95)
+]
 POINTS = tuple(np.array(column) for column in zip(*_GRID, strict=True))
 
 
@@ -37,14 +47,25 @@ def position(tube, xi):
 
 def simple_tube(k_l, k_u, dtype=None, dk_l=0.1, dk_u=-0.2, q_d=0.0):
     one = jnp.ones(2, dtype)
-    return Tube(q_d * one, 0.3 * one, (q_d - k_l) * one, (q_d + k_u) * one, (0.3 - dk_l) * one, (0.3 + dk_u) * one)
+    return Tube(
+        q_d * one,
+        0.3 * one,
+        (q_d - k_l) * one,
+        (q_d + k_u) * one,
+        (0.3 - dk_l) * one,
+        (0.3 + dk_u) * one,
+    )
 
 
 def rates(barrier, bounds, t, xi):
     """V1 and its total derivative along q' = alpha, joint by joint."""
     q = position(tube_of(bounds, t), xi)
     alpha = barrier.virtual_velocity(tube_of(bounds, t), q, K1, MARGIN)
-    return jax.jvp(lambda t, q: barrier.value(tube_of(bounds, t), q), (jnp.asarray(t), q), (jnp.ones(()), alpha))
+    return jax.jvp(
+        lambda t, q: barrier.value(tube_of(bounds, t), q),
+        (jnp.asarray(t), q),
+        (jnp.ones(()), alpha),
+    )
 
 
 def test_integral_is_twice_the_logarithmic_barrier():
@@ -64,7 +85,10 @@ def test_slope_is_the_derivative_of_the_value(name, bounds):
     def both(t, xi):
         tube = tube_of(BOUNDS[bounds], t)
         q = position(tube, xi)
-        return barrier.slope(tube, q), jax.jvp(lambda q: barrier.value(tube, q), (q,), (jnp.ones(2),))[1]
+        return (
+            barrier.slope(tube, q),
+            jax.jvp(lambda q: barrier.value(tube, q), (q,), (jnp.ones(2),))[1],
+        )
 
     slope, derivative = jax.jit(jax.vmap(both))(*POINTS)
     np.testing.assert_allclose(slope, derivative, rtol=1e-9, atol=1e-13)
@@ -107,7 +131,10 @@ def test_rate_of_V1_along_alpha_is_what_the_law_promises(name, bounds):
 @pytest.mark.parametrize("name", BARRIERS)
 def test_decay_rate_holds(name, bounds):
     barrier, generator = BARRIERS[name], np.random.default_rng(0)
-    t, xi = jnp.asarray(generator.uniform(0, 6, 400)), jnp.asarray(generator.uniform(-0.998, 0.998, 400))
+    t, xi = (
+        jnp.asarray(generator.uniform(0, 6, 400)),
+        jnp.asarray(generator.uniform(-0.998, 0.998, 400)),
+    )
     V, dV = jax.jit(jax.vmap(lambda t, xi: rates(barrier, BOUNDS[bounds], t, xi)))(t, xi)
     excess = dV + barrier.decay_rate(K1) * V
     assert float(jnp.max(excess / (1e-12 + V))) < 1e-8
@@ -129,7 +156,12 @@ def test_xi_bound_holds_and_is_reached_on_the_worse_side(name, bounds):
 
     def claims(t, size):
         tube = tube_of(BOUNDS[bounds], t)
-        return jnp.stack([barrier.xi_bound(barrier.value(tube, position(tube, side * size)), tube) for side in (1, -1)])
+        return jnp.stack(
+            [
+                barrier.xi_bound(barrier.value(tube, position(tube, side * size)), tube)
+                for side in (1, -1)
+            ]
+        )
 
     t, size = (np.ravel(x) for x in np.meshgrid([0.0, 1.1], [1e-3, 0.3, 0.9, 0.99]))
     bound, size = jax.jit(jax.vmap(claims))(t, size), size[:, None]
@@ -141,19 +173,28 @@ def test_no_claim_without_a_barrier():
     assert barriers.Quadratic().xi_bound(jnp.ones(()), simple_tube(1.0, 1.0)) is None
 
 
-LIMITS = {"integral": (0.0, None), "log": (0.0, None), "log_p2": (0.0, None), "prescribed_performance": (0.0, 1.0), "tan": (1.0, 0.5)}
+LIMITS = {
+    "integral": (0.0, None),
+    "log": (0.0, None),
+    "log_p2": (0.0, None),
+    "prescribed_performance": (0.0, 1.0),
+    "tan": (1.0, 0.5),
+}
 LIMITS |= dict.fromkeys(("state", "mapping", "quadratic"), (1.0, 1.0))
 
 
 @pytest.mark.parametrize("name", BARRIERS)
 def test_limit_of_wide_bounds(name):
-    # The state's barrier looks at where the reference is between its walls, so its limit keeps that in the middle.
+    # The state's barrier looks at where the reference is between its walls, so its limit keeps that
+    # in the middle.
     barrier, wide = BARRIERS[name], simple_tube(1e6, 1e6 + 0.5 if name == "state" else 2e6)
     e = jnp.array([0.3, -0.2])
     slope, gain = LIMITS[name]
     gain = K1 * gain if gain is not None else K1 + jnp.sqrt(MARGIN)
     np.testing.assert_allclose(barrier.slope(wide, e), slope * e, atol=1e-5)
-    np.testing.assert_allclose(barrier.virtual_velocity(wide, e, K1, MARGIN), 0.3 - gain * e, atol=1e-5)
+    np.testing.assert_allclose(
+        barrier.virtual_velocity(wide, e, K1, MARGIN), 0.3 - gain * e, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", BARRIERS)
@@ -170,14 +211,22 @@ def test_symmetric_bounds_give_an_odd_law(name):
 def test_symmetric_forms_are_those_of_the_literature():
     k, e = 0.4, jnp.array([0.1, -0.3])
     tube = simple_tube(k, k, dk_l=0.0, dk_u=0.0)
-    np.testing.assert_allclose(barriers.PrescribedPerformance().value(tube, e), 0.5 * jnp.arctanh(e / k) ** 2, rtol=1e-12)
-    np.testing.assert_allclose(barriers.Mapping().slope(tube, e), e * k**4 * (k**2 + e**2) / (k**2 - e**2) ** 3, rtol=1e-12)
+    np.testing.assert_allclose(
+        barriers.PrescribedPerformance().value(tube, e), 0.5 * jnp.arctanh(e / k) ** 2, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        barriers.Mapping().slope(tube, e), e * k**4 * (k**2 + e**2) / (k**2 - e**2) ** 3, rtol=1e-12
+    )
     # y = 0: the state's barrier is the error's, and alpha = q_d' (kc^2 - e^2)/kc^2 rho - k1 e
     rho = k / (2 * e) * jnp.log((k + e) / (k - e))
-    np.testing.assert_allclose(barriers.State().value(tube, e), -0.5 * k**2 * jnp.log(1 - (e / k) ** 2), rtol=1e-12)
+    np.testing.assert_allclose(
+        barriers.State().value(tube, e), -0.5 * k**2 * jnp.log(1 - (e / k) ** 2), rtol=1e-12
+    )
     fixed = tube._replace(dlower=jnp.zeros(2), dupper=jnp.zeros(2))
     expected = fixed.dq_d * (k**2 - e**2) / k**2 * rho - K1 * e
-    np.testing.assert_allclose(barriers.State().virtual_velocity(fixed, e, K1, None), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        barriers.State().virtual_velocity(fixed, e, K1, None), expected, rtol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -188,19 +237,42 @@ def test_singular_points_are_finite(name, dtype):
     k1, o = K1.astype(dtype), MARGIN.astype(dtype)
 
     def everything(tube, q, k1):
-        return barrier.value(tube, q), barrier.slope(tube, q), barrier.virtual_velocity(tube, q, k1, o)
+        return (
+            barrier.value(tube, q),
+            barrier.slope(tube, q),
+            barrier.virtual_velocity(tube, q, k1, o),
+        )
 
     def total(tube, q, k1):
         return sum(jnp.sum(x) for x in everything(tube, q, k1))
 
     def at(q):
         tangents = jax.tree.map(jnp.ones_like, (tube, q, k1))
-        (values, forward), (_, second) = jax.jvp(lambda *x: jax.jvp(everything, x, tangents), (tube, q, k1), tangents)
+        (values, forward), (_, second) = jax.jvp(
+            lambda *x: jax.jvp(everything, x, tangents), (tube, q, k1), tangents
+        )
         reverse = jax.grad(total, argnums=(0, 1, 2))(tube, q, k1)
         return values, forward, second, reverse
 
     tiny = float(jnp.finfo(dtype).tiny)
-    e = [0.0, -0.0, tiny, -tiny, 1e-20, 1e-7, -0.3, 0.5, 0.4995, -0.2997, 0.49999, -0.29999, 0.51, -0.4, 3.0, -1e3]
+    e = [
+        0.0,
+        -0.0,
+        tiny,
+        -tiny,
+        1e-20,
+        1e-7,
+        -0.3,
+        0.5,
+        0.4995,
+        -0.2997,
+        0.49999,
+        -0.29999,
+        0.51,
+        -0.4,
+        3.0,
+        -1e3,
+    ]
     results = jax.jit(jax.vmap(at))(jnp.asarray(e, dtype)[:, None] * jnp.ones(2, dtype))
     for part in jax.tree.leaves(results):
         assert part.dtype == dtype
@@ -228,14 +300,23 @@ def test_beyond_the_wall_everything_leads_back(name):
 @pytest.mark.parametrize("name", BARRIERS)
 def test_switch_at_zero_error_is_continuous(name):
     barrier, tube = BARRIERS[name], simple_tube(0.3, 0.5)
-    for method in (barrier.value, barrier.slope, lambda tube, q: barrier.virtual_velocity(tube, q, K1, MARGIN)):
+    for method in (
+        barrier.value,
+        barrier.slope,
+        lambda tube, q: barrier.virtual_velocity(tube, q, K1, MARGIN),
+    ):
         below, above = method(tube, jnp.full(2, -1e-12)), method(tube, jnp.full(2, 1e-12))
         np.testing.assert_allclose(below, above, atol=1e-10)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_removable_singularities_are_accurate(dtype):
-    u = np.concatenate([np.linspace(-3, 0.99, 500), [0.0, 1e-9, -1e-9, 0.2499, 0.2501, -0.2499, -0.2501, 0.0299, 0.0301]])
+    u = np.concatenate(
+        [
+            np.linspace(-3, 0.99, 500),
+            [0.0, 1e-9, -1e-9, 0.2499, 0.2501, -0.2499, -0.2501, 0.0299, 0.0301],
+        ]
+    )
     u = np.asarray(u, dtype).astype(np.longdouble)
     exact = [np.where(u == 0, 1, np.sin(u) / np.where(u == 0, 1, u))]
     small = np.abs(u) < 0.05
@@ -243,4 +324,6 @@ def test_removable_singularities_are_accurate(dtype):
     exact.append(np.where(small, series, (-np.log1p(-u) - u) / np.where(small, 1, u) ** 2))
     for function, wanted in zip((sinc, log_remainder), exact, strict=True):
         tolerance = 600 * float(jnp.finfo(dtype).eps)  # XLA's log1p itself is good to some 100 eps
-        np.testing.assert_allclose(function(jnp.asarray(u.astype(float), dtype)), wanted.astype(float), rtol=tolerance)
+        np.testing.assert_allclose(
+            function(jnp.asarray(u.astype(float), dtype)), wanted.astype(float), rtol=tolerance
+        )

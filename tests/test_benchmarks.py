@@ -12,7 +12,8 @@ import pytest
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
-"""They choose JAX's type and devices, of which a process has one; the others spare themselves another start."""
+"""They choose JAX's type and devices, of which a process has one; the others spare themselves
+another start."""
 
 
 @pytest.mark.slow

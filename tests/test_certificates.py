@@ -1,4 +1,5 @@
-"""Certificates: the inequality at random states, whole runs, what has no claim, many runs, and the printed proof's gap."""
+"""Certificates: the inequality at random states, whole runs, what has no claim, many runs, and the
+printed proof's gap."""
 
 from __future__ import annotations
 
@@ -39,14 +40,17 @@ BARRIERS = {
     "log_p2": pytest.param(ij.barriers.Log(p=2), marks=pytest.mark.slow),
     "tan": ij.barriers.Tan(),
     "state": pytest.param(ij.barriers.State(), marks=pytest.mark.slow),
-    "prescribed_performance": pytest.param(ij.barriers.PrescribedPerformance(), marks=pytest.mark.slow),
+    "prescribed_performance": pytest.param(
+        ij.barriers.PrescribedPerformance(), marks=pytest.mark.slow
+    ),
     "mapping": pytest.param(ij.barriers.Mapping(), marks=pytest.mark.slow),
     "quadratic": pytest.param(ij.barriers.Quadratic(), marks=pytest.mark.slow),
 }
 
 
 def proven_rate(scenario, t, state, proof):
-    """V2' of the integral barrier as the proof writes it, (3.8) and (3.24), with the terms that it drops."""
+    """V2' of the integral barrier as the proof writes it, (3.8) and (3.24), with the terms that it
+    drops."""
     law, kf = scenario.controller, scenario.observer.kf
     tube = scenario.setting.tube(t)
     above = state.q > tube.q_d
@@ -60,7 +64,9 @@ def proven_rate(scenario, t, state, proof):
 
 def left_side(batch, proof):
     """V2' + rho V2 - |f'|^2/2 with lambda_max of each position."""
-    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.claim(scenario), largest, 2))(batch, proof.lambda_max)
+    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.claim(scenario), largest, 2))(
+        batch, proof.lambda_max
+    )
     return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.df**2, axis=-1))
 
 
@@ -99,7 +105,8 @@ def test_corrected_keeps_the_inequality_at_every_state(barrier):
 
 @pytest.mark.slow
 def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
-    # One joint, e1 = 0, e2 = f_tilde = f', and all rates of the claim the same: each step of the proof is an equality.
+    # One joint, e1 = 0, e2 = f_tilde = f', and all rates of the claim the same: each step of the
+    # proof is an equality.
     rate = 1.7
     arm = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
     scenario = ij.Scenario(
@@ -108,7 +115,9 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
         bounds=ij.bounds.Bounds(lower=ij.bounds.Constant(-1.0), upper=ij.bounds.Constant(2.0)),
         disturbance=ij.disturbances.Sinusoids(amplitude=0.8, frequency=1.0),
         controller=ij.controllers.Backstepping(
-            k1=5.0, K2=0.5 + 0.5 * rate * float(arm.mass_matrix(jnp.zeros(1))[0, 0]), reading="corrected"
+            k1=5.0,
+            K2=0.5 + 0.5 * rate * float(arm.mass_matrix(jnp.zeros(1))[0, 0]),
+            reading="corrected",
         ),
         observer=ij.observers.Momentum(kf=1.0 + 0.5 * rate, start="matched"),
         initial=ij.Initial(q=0.5, dq=0.1 + 0.8),
@@ -122,9 +131,12 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     assert abs(left) <= rounding("float64") * float(seen.terms) < 1e-11
 
 
-@pytest.mark.parametrize("name", [x if x == "integral" else pytest.param(x, marks=pytest.mark.slow) for x in BARRIERS])
+@pytest.mark.parametrize(
+    "name", [x if x == "integral" else pytest.param(x, marks=pytest.mark.slow) for x in BARRIERS]
+)
 def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(name):
-    """(W.1) with any a, b and w_f, at gains far below Theorem 2's conditions and at any weights of the barriers."""
+    """(W.1) with any a, b and w_f, at gains far below Theorem 2's conditions and at any weights of
+    the barriers."""
     rng, barrier = np.random.default_rng(5), getattr(BARRIERS[name], "values", [BARRIERS[name]])[0]
     batch, t, state = random_loops(loop(barrier=barrier), 5, states=1024, speed=30.0, weighted=True)
     proof = jax.tree.map(np.asarray, terms_of(batch, t, state))
@@ -146,11 +158,19 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
     free = ~proof.held
     assert np.mean(free) > 0.9
     assert np.all(left[free] <= allowed[free])
-    # V_w holds all that it says: what is left of it without e2 and f_tilde is the barriers' with their weights.
+    # V_w holds all that it says: what is left of it without e2 and f_tilde is the barriers' with
+    # their weights.
     M0 = np.asarray(jax.vmap(lambda scenario, q: scenario.model.mass_matrix(q))(batch, state.q))
     V1 = V - w_f * half_square - 0.5 * np.einsum("ti,tij,tj->t", proof.e2, M0, proof.e2)
-    one = jax.vmap(lambda scenario, t, q: scenario.controller.barrier.value(scenario.setting.tube(t), q))(batch, t, state.q)
-    np.testing.assert_allclose(V1, np.sum(np.asarray(batch.controller.weight) * one, axis=1), rtol=1e-6, atol=1e-9 * np.abs(V).max())
+    one = jax.vmap(
+        lambda scenario, t, q: scenario.controller.barrier.value(scenario.setting.tube(t), q)
+    )(batch, t, state.q)
+    np.testing.assert_allclose(
+        V1,
+        np.sum(np.asarray(batch.controller.weight) * one, axis=1),
+        rtol=1e-6,
+        atol=1e-9 * np.abs(V).max(),
+    )
 
 
 def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
@@ -163,9 +183,16 @@ def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
         return (given["V_rest"] + w_f * given["half_square"]) * fading + rho2 / rho
 
     found = weighted.best(constants, *given.values(), 2)
-    assert np.min(weighted.rate_terms(constants, 0.9, found.a, found.b, found.w_f)) == pytest.approx(found.rho)
+    assert np.min(
+        weighted.rate_terms(constants, 0.9, found.a, found.b, found.w_f)
+    ) == pytest.approx(found.rho)
     rng, others = np.random.default_rng(0), []
-    for a, b, w_f in zip(rng.uniform(0, 1, 20000), rng.uniform(0, 0.8, 20000), 10 ** rng.uniform(0, 4, 20000), strict=True):
+    for a, b, w_f in zip(
+        rng.uniform(0, 1, 20000),
+        rng.uniform(0, 0.8, 20000),
+        10 ** rng.uniform(0, 4, 20000),
+        strict=True,
+    ):
         rho = np.min(weighted.rate_terms(constants, 0.9, a, b, w_f))
         others.append(mean(rho, w_f, w_f * given["F_d"] ** 2 / (2 * b)) if rho > 0 else np.inf)
     assert mean(found.rho, found.w_f, found.rho2) < 1.01 * min(others)
@@ -193,12 +220,17 @@ def corrected_certificate(corrected_run) -> Certificate:
 @pytest.mark.slow
 def test_rate_along_the_run_is_its_difference_quotient(paper_run):
     _, stretches = look(jax.tree.map(np.asarray, paper_run))
-    seen = [jax.tree.map(lambda x, trajectory=trajectory: x[trajectory.recorded], trajectory.proof) for trajectory in stretches]
+    seen = [
+        jax.tree.map(lambda x, trajectory=trajectory: x[trajectory.recorded], trajectory.proof)
+        for trajectory in stretches
+    ]
     proof = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
     V, h = proof.V, 0.01
     quotient = (V[:-4] - 8 * V[1:-3] + 8 * V[3:-1] - V[4:]) / (12 * h)
     quiet = slice(100, None)  # from 1 s on, when the fastest modes have died out
-    np.testing.assert_allclose(proof.dV[2:-2][quiet], quotient[quiet], atol=2e-6 * np.abs(proof.dV[102:]).max() + 1e-9)
+    np.testing.assert_allclose(
+        proof.dV[2:-2][quiet], quotient[quiet], atol=2e-6 * np.abs(proof.dV[102:]).max() + 1e-9
+    )
     np.testing.assert_allclose(V, paper_run.V, rtol=1e-9)
     np.testing.assert_allclose(proof.f, paper_run.disturbance, atol=1e-10)
 
@@ -212,16 +244,26 @@ def test_paper_run_keeps_the_printed_inequality(paper_certificate):
     line = paper_certificate["inequality, case 2"]
     assert line.verdict == "holds"
     assert 1e-6 < line.margin < 1e-3
-    for name, equation in (("inequality, case 1", "(3.18)"), ("envelope, case 1", "(3.20)"), ("rho, case 1", "(3.19)")):
-        assert (paper_certificate[name].verdict, paper_certificate[name].equation) == ("not applicable", equation)
+    for name, equation in (
+        ("inequality, case 1", "(3.18)"),
+        ("envelope, case 1", "(3.20)"),
+        ("rho, case 1", "(3.19)"),
+    ):
+        assert (paper_certificate[name].verdict, paper_certificate[name].equation) == (
+            "not applicable",
+            equation,
+        )
     assert paper_certificate["xi"].equation == "(3.31)"
-    by_law, by_observer = (paper_certificate[f"dropped term of the {part}"] for part in ("law", "observer"))
+    by_law, by_observer = (
+        paper_certificate[f"dropped term of the {part}"] for part in ("law", "observer")
+    )
     assert 1e-3 < by_law.value < by_observer.value < 0.05
     assert "at most 18.5 %" in by_observer.note
 
 
 def test_lambda_max_over_the_box_is_that_of_the_stretched_arm(paper_certificate, paper):
-    # M0 of two links depends on q2 alone, and grows as the arm stretches: the box is q2 in (0.06, 1.04).
+    # M0 of two links depends on q2 alone, and grows as the arm stretches: the box is q2 in (0.06,
+    # 1.04).
     expected = np.linalg.eigvalsh(np.asarray(paper.model.mass_matrix(jnp.array([0.0, 0.06]))))[-1]
     assert paper_certificate.numbers["lambda_max_box"] == pytest.approx(expected, rel=1e-6)
     assert paper_certificate.numbers["lambda_max_run"] <= expected
@@ -231,7 +273,9 @@ def test_lambda_max_over_the_box_is_that_of_the_stretched_arm(paper_certificate,
 @pytest.mark.slow
 def test_lambda_max_over_the_box_of_many_joints():
     n = 4
-    arm = ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.01] * n)
+    arm = ij.robots.PlanarChain(
+        mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=[0.01] * n
+    )
     extremes = eigenvalues_over(arm, np.full(n, -1.0), np.full(n, 1.0))
     straight = np.linalg.eigvalsh(np.asarray(arm.mass_matrix(jnp.zeros(n))))
     assert extremes.lambda_max == pytest.approx(straight[-1], rel=1e-6)
@@ -259,7 +303,12 @@ CALM = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitu
     [
         {"controller.K2": 0.6, "observer.kf": 1.1, "initial.dq": [2.0, -2.0]},
         {"plant.mass": [2.6, 0.5], "plant.payload": 0.4},
-        {"plant.mass[1]": 1.2, "controller.k1": 8.0, "disturbance.phase": 2.0, "initial.q": [0.4, 0.7]},
+        {
+            "plant.mass[1]": 1.2,
+            "controller.k1": 8.0,
+            "disturbance.phase": 2.0,
+            "initial.q": [0.4, 0.7],
+        },
         CALM | {"initial.dq": [3.0, 1.0]},
     ],
     ids=["low gains", "another plant", "several", "no disturbance"],
@@ -294,7 +343,8 @@ LIGHT = {"controller.K2": [0.3, 0.1], "observer.kf": [0.4, 0.9], "controller.wei
 
 
 def test_a_law_with_weights_has_a_claim_below_the_conditions_of_theorem_2(corrected_run):
-    """Its own lines fail, and say what is lost; those with weights hold, and bound xi, e2 and f_tilde."""
+    """Its own lines fail, and say what is lost; those with weights hold, and bound xi, e2 and
+    f_tilde."""
     scenario = ij.with_parameters(corrected_run.scenario, LIGHT)
     certificate = certify(scenario, ij.simulate(scenario, **SHORT))
     assert certificate.holds, certificate
@@ -321,14 +371,20 @@ def test_with_the_papers_weights_its_own_conditions_decide(corrected_run):
     assert certificate["weighted inequality, case 2"].verdict == "holds"
 
 
-def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_observer(paper_certificate):
+def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_observer(
+    paper_certificate,
+):
     assert not [line.name for line in paper_certificate.lines if line.name.startswith("weighted")]
 
 
 def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     """With a rate that is too large the inequality fails where the right one holds."""
     best = weighted.best
-    monkeypatch.setattr(weighted, "best", lambda *given: (found := best(*given)) and found._replace(rho=1e3 * found.rho))
+    monkeypatch.setattr(
+        weighted,
+        "best",
+        lambda *given: (found := best(*given)) and found._replace(rho=1e3 * found.rho),
+    )
     scenario = ij.with_parameters(corrected_run.scenario, LIGHT)
     certificate = certify(scenario, ij.simulate(scenario, **SHORT))
     assert certificate["weighted inequality, case 2"].verdict == "fails"
@@ -337,7 +393,8 @@ def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
 
 @pytest.mark.parametrize("weight", [[0.3, 2.5], [40.0, 7.0]])
 def test_the_papers_claim_scales_with_the_weights(corrected_run, weight):
-    """V1 = sum w_i V1_i in every line: the inequality, the envelope, and xi by the barrier of its own joint."""
+    """V1 = sum w_i V1_i in every line: the inequality, the envelope, and xi by the barrier of its
+    own joint."""
     scenario = ij.with_parameters(corrected_run.scenario, {"controller.weight": weight})
     run = ij.simulate(scenario, **SHORT)
     certificate = certify(scenario, run)
@@ -354,12 +411,16 @@ def test_the_papers_claim_scales_with_the_weights(corrected_run, weight):
 def test_envelope_starts_anew_at_jumps_and_after_held_samples():
     t = np.arange(6.0)
     held = np.array([False, False, True, False, False, False])
-    np.testing.assert_array_equal(starts_of(t, held, np.array([3.5, 5.0])), [True, False, False, True, True, True])
+    np.testing.assert_array_equal(
+        starts_of(t, held, np.array([3.5, 5.0])), [True, False, False, True, True, True]
+    )
 
 
 @pytest.mark.slow
 def test_jump_of_the_disturbance_restarts_the_envelope(corrected_run):
-    scenario = dataclasses.replace(corrected_run.scenario, disturbance=ij.disturbances.Step(size=[3.0, -2.0], time=10.0))
+    scenario = dataclasses.replace(
+        corrected_run.scenario, disturbance=ij.disturbances.Step(size=[3.0, -2.0], time=10.0)
+    )
     run = ij.simulate(scenario, **PAPER)
     certificate = certify(scenario, run)
     assert certificate.holds, certificate
@@ -375,14 +436,25 @@ def test_jump_of_the_disturbance_restarts_the_envelope(corrected_run):
 
 def decimated(run, every: int, **changes):
     """What record_every=`every` leaves of a run that recorded every step."""
-    names = [f.name for f in dataclasses.fields(run) if f.name not in ("scenario", "metrics", "status", "fastest_mode", "dt")]
-    kept = {name: jax.tree.map(lambda x: x[::every], getattr(run, name)) for name in names if name not in ("method", "steps")}
+    names = [
+        f.name
+        for f in dataclasses.fields(run)
+        if f.name not in ("scenario", "metrics", "status", "fastest_mode", "dt")
+    ]
+    kept = {
+        name: jax.tree.map(lambda x: x[::every], getattr(run, name))
+        for name in names
+        if name not in ("method", "steps")
+    }
     return dataclasses.replace(run, **kept, **changes)
 
 
 def pushed(scenario, amplitude: float, period: float):
     """A run under a disturbance of a period, every step recorded."""
-    changes = {"disturbance.acceleration_amplitude": amplitude, "disturbance.acceleration_frequency": 2 * np.pi / period}
+    changes = {
+        "disturbance.acceleration_amplitude": amplitude,
+        "disturbance.acceleration_frequency": 2 * np.pi / period,
+    }
     return ij.simulate(ij.with_parameters(scenario, changes), **SHORT)
 
 
@@ -411,7 +483,8 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert sparse.traces.t.shape == run.t.shape
     assert sparse.numbers["F_d"] == pytest.approx(whole.numbers["F_d"], rel=1e-9)
     assert_alike(sparse, whole)
-    # The steps after the last sample count too; and a long run, which is not kept in memory, gives the same.
+    # The steps after the last sample count too; and a long run, which is not kept in memory, gives
+    # the same.
     monkeypatch.setattr(trajectory, "CERTIFY_KEPT", 0)
     assert_alike(certify(run.scenario, decimated(shaken, 300)), whole)
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
@@ -424,18 +497,26 @@ def test_certificate_never_contradicts_the_status(corrected_run):
     assert np.all((ends.q > ends.lower) & (ends.q < ends.upper))
     certificate = certify(run.scenario, ends)
     assert certificate["joints inside"].verdict == "fails"
-    assert certificate["joints inside"].margin == pytest.approx(1 - float(jnp.abs(run.xi).max()), abs=1e-9)
+    assert certificate["joints inside"].margin == pytest.approx(
+        1 - float(jnp.abs(run.xi).max()), abs=1e-9
+    )
     with pytest.raises(ValueError, match="samples that cover the run"):
         certify(run.scenario, decimated(run, 501, steps=None))
     with pytest.raises(ValueError, match=r"run\.status"):
         certify(run.scenario, dataclasses.replace(ends, status=jnp.int32(0)))
-    lost = jax.tree.map(lambda *x: jnp.stack(x), run, dataclasses.replace(run, status=run.status | int(ij.Status.NOT_FINITE)))
+    lost = jax.tree.map(
+        lambda *x: jnp.stack(x),
+        run,
+        dataclasses.replace(run, status=run.status | int(ij.Status.NOT_FINITE)),
+    )
     assert certify(run.scenario, lost).verdict == "fails"
 
 
 def test_batch_with_a_run_that_is_not_believed_does_not_hold(corrected_run):
     lost = dataclasses.replace(corrected_run, status=jnp.int32(int(ij.Status.NOT_FINITE)))
-    certificate = certify(corrected_run.scenario, jax.tree.map(lambda *x: jnp.stack(x), corrected_run, lost))
+    certificate = certify(
+        corrected_run.scenario, jax.tree.map(lambda *x: jnp.stack(x), corrected_run, lost)
+    )
     assert certificate.verdict == "not applicable"
     assert "not applicable in 1 of 2 runs" in certificate["inequality, case 2"].note
 
@@ -443,7 +524,9 @@ def test_batch_with_a_run_that_is_not_believed_does_not_hold(corrected_run):
 def test_run_that_its_scenario_does_not_reproduce_is_refused(shaken):
     run = decimated(shaken, 100)
     near = jax.tree.map(lambda x: x * (1 + 1e-13), run.observer_state)
-    assert certify(run.scenario, dataclasses.replace(run, q=run.q * (1 + 1e-14), observer_state=near)).holds
+    assert certify(
+        run.scenario, dataclasses.replace(run, q=run.q * (1 + 1e-14), observer_state=near)
+    ).holds
     others = {
         "K2": {"scenario": ij.with_parameters(run.scenario, {"controller.K2": 20.01})},
         "initial": {"scenario": ij.with_parameters(run.scenario, {"initial.q[0]": 0.8001})},
@@ -502,7 +585,9 @@ def one_joint(plant):
 terms_there = jax.jit(terms_at)
 
 
-@pytest.mark.parametrize(("changes", "steady"), [({}, True), ({"damping": 0.5}, False), ({"growth": 0.5}, False)])
+@pytest.mark.parametrize(
+    ("changes", "steady"), [({}, True), ({"damping": 0.5}, False), ({"growth": 0.5}, False)]
+)
 def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, steady):
     scenario = canonical(one_joint(Growing(mass=[1.3], **changes)))
     apart = dataclasses.replace(scenario, model=jax.tree.map(jnp.copy, scenario.model))
@@ -516,7 +601,12 @@ def test_f_is_constant_only_where_nothing_that_changes_is_left_in_it(changes, st
 
 def pendulum(**changes):
     """An arm of one joint."""
-    body = {"mass": [1.3], "centre": [[0.2, 0, 0]], "inertia": [[0.01, 0.02, 0.02, 0, 0, 0]], "position": [[0, 0, 0]]}
+    body = {
+        "mass": [1.3],
+        "centre": [[0.2, 0, 0]],
+        "inertia": [[0.01, 0.02, 0.02, 0, 0, 0]],
+        "position": [[0, 0, 0]],
+    }
     return ij.robots.Arm(**body, tip_position=[0.4, 0, 0], g=[0, -9.81, 0], **changes)
 
 
@@ -525,14 +615,18 @@ LOAD = {"carried": ij.robots.Payload(mass=0.5, start=0.1, rise=0.2)}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "changes", [{"damping": 0.5, "friction": 0.3}, pytest.param(LOAD, marks=pytest.mark.release)], ids=["friction", "load"]
+    "changes",
+    [{"damping": 0.5, "friction": 0.3}, pytest.param(LOAD, marks=pytest.mark.release)],
+    ids=["friction", "load"],
 )
 def test_one_arm_with_friction_or_a_load_is_case_2(changes):
     scenario = one_joint(pendulum(**changes))
     certificate = certify(scenario, duration=0.5, method="euler")
     assert certificate.holds
     assert certificate.numbers["case"] == 2
-    apart = certify(dataclasses.replace(scenario, model=pendulum(**changes)), duration=0.5, method="euler")
+    apart = certify(
+        dataclasses.replace(scenario, model=pendulum(**changes)), duration=0.5, method="euler"
+    )
     assert_alike(apart, certificate)
     # The same physics with a model that has neither.
     bare = certify(dataclasses.replace(scenario, model=pendulum()), duration=0.5, method="euler")
@@ -546,7 +640,11 @@ def test_one_arm_with_friction_or_a_load_is_case_2(changes):
 @pytest.mark.parametrize("name", ["PDGravity", pytest.param("NoObserver", marks=pytest.mark.slow)])
 def test_no_claim_is_not_applicable(paper, name):
     law = ij.controllers.PDGravity(Kp=60.0, Kd=20.0) if name == "PDGravity" else paper.controller
-    certificate = certify(dataclasses.replace(paper, controller=law, observer=ij.observers.NoObserver()), duration=0.5, method="euler")
+    certificate = certify(
+        dataclasses.replace(paper, controller=law, observer=ij.observers.NoObserver()),
+        duration=0.5,
+        method="euler",
+    )
     assert certificate.verdict == "not applicable"
     assert not certificate.holds
     assert name in certificate["inequality, case 2"].note
@@ -559,7 +657,8 @@ def test_no_claim_is_not_applicable(paper, name):
 
 @ij.component
 class Passive:
-    """A user's law with a proof of its own: V = r^T M0 r / 2 + e^T slope K e, V' = -W + r . f_tilde exactly."""
+    """A user's law with a proof of its own: V = r^T M0 r / 2 + e^T slope K e, V' = -W + r . f_tilde
+    exactly."""
 
     slope: ij.Leaf = ij.leaf("1/s", sign="positive")
     K: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
@@ -579,7 +678,13 @@ class Passive:
     def command(self, t, q, dq, f_hat, setting, state):
         _, _, r, dv = self.errors(t, q, dq, setting)
         model, no = setting.model, jnp.zeros(q.shape, bool)
-        tau = model.mass_matrix(q) @ dv + model.coriolis(q, dq, dq - r) + model.gravity(q) - f_hat - self.K * r
+        tau = (
+            model.mass_matrix(q) @ dv
+            + model.coriolis(q, dq, dq - r)
+            + model.gravity(q)
+            - f_hat
+            - self.K * r
+        )
         return ij.controllers.Command(tau, dq - r, 0.0 * q, no, no), ()
 
     def lyapunov(self, t, q, dq, f_tilde, setting, state):
@@ -588,7 +693,9 @@ class Passive:
 
     def decay(self, t, q, dq, f_tilde, setting, state):
         e, de, _, _ = self.errors(t, q, dq, setting)
-        return self.share * jnp.sum(self.K * (de**2 + (self.slope * e) ** 2)) + jnp.where(t > 0.05, self.late, 0.0)
+        return self.share * jnp.sum(self.K * (de**2 + (self.slope * e) ** 2)) + jnp.where(
+            t > 0.05, self.late, 0.0
+        )
 
 
 OWN = {"duration": 0.1, "dt": 1e-3, "method": "euler"}
@@ -597,7 +704,11 @@ OWN = {"duration": 0.1, "dt": 1e-3, "method": "euler"}
 @pytest.fixture(scope="module")
 def own(paper):
     """The paper's arm with more load than its model, under a law that states its own claim."""
-    scenario = dataclasses.replace(paper, controller=Passive(slope=[3.0, 4.0], K=[8.0, 2.0]), observer=ij.observers.NoObserver())
+    scenario = dataclasses.replace(
+        paper,
+        controller=Passive(slope=[3.0, 4.0], K=[8.0, 2.0]),
+        observer=ij.observers.NoObserver(),
+    )
     return ij.with_parameters(scenario, {"plant.payload": 0.4})
 
 
@@ -605,7 +716,8 @@ def test_a_law_that_states_its_own_claim_is_held_against_it(own):
     certificate = certify(own, **OWN)
     assert certificate.holds
     line = certificate["inequality, own V"]
-    # The proof leaves nothing: the inequality is an equality, to rounding, although f_tilde is large.
+    # The proof leaves nothing: the inequality is an equality, to rounding, although f_tilde is
+    # large.
     assert abs(line.margin) <= line.tolerance < 1e-10
     assert certificate.numbers["F_m"] > 0.9
     assert [line.name for line in certificate.applicable] == [
@@ -615,7 +727,11 @@ def test_a_law_that_states_its_own_claim_is_held_against_it(own):
     text = repr(certificate)
     assert "inequality, own V" in text
     assert "not applicable" not in text
-    assert text.endswith("18 lines of the paper's theorem do not apply, because " + certificate["inequality, case 2"].note + ".")
+    assert text.endswith(
+        "18 lines of the paper's theorem do not apply, because "
+        + certificate["inequality, case 2"].note
+        + "."
+    )
     assert "18 lines" in certificate.table_html()
     assert len(certificate.lines) == len(certificate.applicable) + 18
     assert certificate.is_of_own_claim
@@ -626,7 +742,10 @@ def test_a_law_that_states_its_own_claim_is_held_against_it(own):
 @pytest.mark.slow
 def test_an_own_claim_is_drawn_as_one(own, paper_certificate):
     figure = certify(own, **OWN).plot()
-    words = " ".join(text.get_text() for text in [*figure.texts, *(text for axes in figure.axes for text in axes.texts)])
+    words = " ".join(
+        text.get_text()
+        for text in [*figure.texts, *(text for axes in figure.axes for text in axes.texts)]
+    )
     assert "The law's own claim along the run: holds" in words
     assert "own decay" in words
     assert not paper_certificate.is_of_own_claim
@@ -637,7 +756,9 @@ def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
     line = certificate["inequality, own V"]
     assert certificate.verdict == line.verdict == "fails"
     assert line.first == 0.0
-    late = certify(ij.with_parameters(own, {"controller.share": 0.98, "controller.late": 9.0}), **OWN)["inequality, own V"]
+    late = certify(
+        ij.with_parameters(own, {"controller.share": 0.98, "controller.late": 9.0}), **OWN
+    )["inequality, own V"]
     assert late.verdict == "fails"
     assert late.first == pytest.approx(0.051)
     assert "first broken at t = 0.051 s" in late.where()
@@ -660,22 +781,29 @@ def test_the_rate_of_an_own_V_is_its_difference_quotient(own):
 def test_an_own_V_with_the_error_of_the_estimate_in_it(paper):
     @ij.component
     class WithEstimate(Passive):
-        """V + f_tilde . f_tilde / 2: with the momentum observer V' = -W - kf |f_tilde|^2 + r . f_tilde + f_tilde . f' exactly."""
+        """V + f_tilde . f_tilde / 2: with the momentum observer V' = -W - kf |f_tilde|^2 + r .
+        f_tilde + f_tilde . f' exactly."""
 
         kf: ij.Leaf = ij.leaf("1/s", default=20.0)
 
         def lyapunov(self, t, q, dq, f_tilde, setting, state):
-            return Passive.lyapunov(self, t, q, dq, f_tilde, setting, state) + 0.5 * f_tilde @ f_tilde
+            return (
+                Passive.lyapunov(self, t, q, dq, f_tilde, setting, state) + 0.5 * f_tilde @ f_tilde
+            )
 
         def decay(self, t, q, dq, f_tilde, setting, state):
-            return Passive.decay(self, t, q, dq, f_tilde, setting, state) + jnp.sum(self.kf * f_tilde**2)
+            return Passive.decay(self, t, q, dq, f_tilde, setting, state) + jnp.sum(
+                self.kf * f_tilde**2
+            )
 
     law = WithEstimate(slope=2.0, K=5.0, kf=12.0)
     scenario = dataclasses.replace(paper, controller=law, observer=ij.observers.Momentum(kf=12.0))
     line = certify(scenario, **OWN)["inequality, own V"]
     assert line.verdict == "holds"
     assert abs(line.margin) <= line.tolerance < 1e-10
-    too_fast = certify(ij.with_parameters(scenario, {"controller.kf": 13.0}), **OWN)["inequality, own V"]
+    too_fast = certify(ij.with_parameters(scenario, {"controller.kf": 13.0}), **OWN)[
+        "inequality, own V"
+    ]
     assert too_fast.verdict == "fails"
 
 
@@ -683,7 +811,8 @@ def test_an_own_V_with_the_error_of_the_estimate_in_it(paper):
 def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
     @ij.component
     class Adaptive:
-        """V = r . M0 r / 2 + d . d / (2 gamma), joint by joint, with T = r f; it is given f itself, as it uses no estimate."""
+        """V = r . M0 r / 2 + d . d / (2 gamma), joint by joint, with T = r f; it is given f itself,
+        as it uses no estimate."""
 
         K: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
         gamma: ij.Leaf = ij.leaf("1/s", sign="positive")
@@ -699,7 +828,13 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
         def command(self, t, q, dq, f_hat, setting, state):
             r, dv = self.errors(t, q, dq, setting)
             model, no = setting.model, jnp.zeros(q.shape, bool)
-            tau = model.mass_matrix(q) @ dv + model.coriolis(q, dq, dq - r) + model.gravity(q) - self.K * r - state["d"]
+            tau = (
+                model.mass_matrix(q) @ dv
+                + model.coriolis(q, dq, dq - r)
+                + model.gravity(q)
+                - self.K * r
+                - state["d"]
+            )
             return ij.controllers.Command(tau, dq - r, 0.0 * q, no, no), {"d": self.gamma * r}
 
         def lyapunov(self, t, q, dq, f_tilde, setting, state):
@@ -712,7 +847,9 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
         def disturbance_terms(self, t, q, dq, f_tilde, df, setting, state):
             return self.errors(t, q, dq, setting)[0] * f_tilde
 
-    certificate = certify(dataclasses.replace(paper, controller=Adaptive(K=6.0, gamma=[2.0, 3.0])), **OWN)
+    certificate = certify(
+        dataclasses.replace(paper, controller=Adaptive(K=6.0, gamma=[2.0, 3.0])), **OWN
+    )
     line = certificate["inequality, own V"]
     assert certificate.holds
     assert abs(line.margin) <= line.tolerance < 1e-10
@@ -723,14 +860,22 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
 def test_where_an_own_claim_is_not_made(own):
     law = own.controller
     smooth = ij.controllers.Saturated(law=law, limit=[20.0, 9.0], edge="smooth")
-    assert "all the time" in certify(dataclasses.replace(own, controller=smooth), **OWN)["inequality, own V"].note
-    cut = certify(dataclasses.replace(own, controller=ij.controllers.Saturated(law=law, limit=[8.0, 1.0])), **OWN)
+    assert (
+        "all the time"
+        in certify(dataclasses.replace(own, controller=smooth), **OWN)["inequality, own V"].note
+    )
+    cut = certify(
+        dataclasses.replace(own, controller=ij.controllers.Saturated(law=law, limit=[8.0, 1.0])),
+        **OWN,
+    )
     assert 0 < cut.numbers["samples_left_out"] < 101
     assert cut["inequality, own V"].verdict == "holds"
     lagging = certify(dataclasses.replace(own, actuator=ij.actuators.Motor(bandwidth=200.0)), **OWN)
     assert lagging.verdict == "not applicable"
     assert "Motor" in lagging["inequality, own V"].note
-    filtered = certify(dataclasses.replace(own, controller=ij.controllers.SafetyFilter(law=law)), **OWN)
+    filtered = certify(
+        dataclasses.replace(own, controller=ij.controllers.SafetyFilter(law=law)), **OWN
+    )
     assert "does not cover the SafetyFilter" in filtered.omitted
     sampled = certify(ij.with_parts(own, sampling=ij.Sampling(period=1e-3)), **OWN)
     assert sampled["inequality, own V"].verdict == "not applicable"
@@ -745,7 +890,9 @@ def test_half_a_claim_is_refused(own):
 @pytest.mark.slow
 def test_saturated_samples_are_left_out(corrected_run):
     paper = corrected_run.scenario
-    scenario = dataclasses.replace(paper, controller=ij.controllers.Saturated(law=paper.controller, limit=[8.0, 3.0]))
+    scenario = dataclasses.replace(
+        paper, controller=ij.controllers.Saturated(law=paper.controller, limit=[8.0, 3.0])
+    )
     certificate = certify(scenario, duration=2.0, method="euler")
     left_out = certificate.numbers["samples_left_out"]
     assert 0 < left_out < 1000
@@ -770,7 +917,10 @@ def test_wrong_arguments_are_named(paper, corrected_run):
     with pytest.raises(ValueError, match="a Rollout, a study or None"):
         certify(paper, 3)
     with pytest.raises(ValueError, match="claim"):
-        counterexample(dataclasses.replace(paper, observer=ij.observers.NoObserver()), {"initial.q": between(0.4, 0.7)})
+        counterexample(
+            dataclasses.replace(paper, observer=ij.observers.NoObserver()),
+            {"initial.q": between(0.4, 0.7)},
+        )
     with pytest.raises(ValueError, match="low < high"):
         counterexample(paper, {"initial.q": between(0.7, 0.4)})
     with pytest.raises(ValueError, match="bounded"):
@@ -785,7 +935,9 @@ def batch(corrected_run):
     """Three runs of the corrected law; the second has kf below (3.25)."""
     runs = [corrected_run]
     for kf in (0.9, 5.0):
-        runs.append(ij.simulate(ij.with_parameters(corrected_run.scenario, {"observer.kf": kf}), **PAPER))
+        runs.append(
+            ij.simulate(ij.with_parameters(corrected_run.scenario, {"observer.kf": kf}), **PAPER)
+        )
     return jax.tree.map(lambda *x: jnp.stack(x), *runs)
 
 
@@ -839,7 +991,10 @@ def gap_certificate(reading):
 def test_printed_breaks_its_claim_where_corrected_keeps_it():
     printed, corrected = (gap_certificate(reading) for reading in ("printed", "corrected"))
     for certificate in (printed, corrected):  # inside the paper's own conditions
-        assert all(certificate[name].verdict == "holds" for name in ("K2", "kf, case 1", "kf, case 2", "start inside"))
+        assert all(
+            certificate[name].verdict == "holds"
+            for name in ("K2", "kf, case 1", "kf, case 2", "start inside")
+        )
     broken = printed["inequality, case 1"]
     assert broken.verdict == "fails"
     assert broken.margin < -10.0
@@ -872,7 +1027,11 @@ def test_search_finds_the_gap_of_the_printed_law_only():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "perturbations", [{"initial.q": between(0.2, 1.2), "initial.dq": between(-4.0, 4.0)}, {"robot.mass": between(-1.0, 2.0)}]
+    "perturbations",
+    [
+        {"initial.q": between(0.2, 1.2), "initial.dq": between(-4.0, 4.0)},
+        {"robot.mass": between(-1.0, 2.0)},
+    ],
 )
 def test_search_returns_what_can_be_run(perturbations):
     found = counterexample(ij.presets.printed_gap(), perturbations, starts=3)
@@ -881,15 +1040,27 @@ def test_search_returns_what_can_be_run(perturbations):
 
 
 def test_search_refuses_perturbations_without_a_start(paper):
-    cases = ({"initial.q": between(1.1, 1.2)}, "start inside the bounds"), ({"robot.mass": between(-2.0, -1.0)}, "positive")
+    cases = (
+        ({"initial.q": between(1.1, 1.2)}, "start inside the bounds"),
+        (
+            {"robot.mass": between(-2.0, -1.0)},
+            "positive",
+        ),
+    )
     for perturbations, words in cases:
-        with pytest.raises(ValueError, match=rf"perturbations: got .*{next(iter(perturbations))}.*{words}.*Narrow"):
+        with pytest.raises(
+            ValueError, match=rf"perturbations: got .*{next(iter(perturbations))}.*{words}.*Narrow"
+        ):
             counterexample(paper, perturbations, starts=2)
 
 
 def test_search_takes_the_perturbations_of_a_study(paper):
-    """Around the nominal value, one draw for all joints where it is shared, and plant and model alike under `robot`."""
-    ways = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1), shared=True), "robot.mass": ij.factor(ij.log_uniform(0.8, 1.25))}
+    """Around the nominal value, one draw for all joints where it is shared, and plant and model
+    alike under `robot`."""
+    ways = {
+        "controller.K2": ij.factor(ij.uniform(0.9, 1.1), shared=True),
+        "robot.mass": ij.factor(ij.log_uniform(0.8, 1.25)),
+    }
     cube = bounded(canonical(paper), ways)
     values = cube.values(jnp.array([0.25, 0.5, 1.0]))
     np.testing.assert_allclose(values["controller.K2"], 0.95 * paper.controller.K2)
@@ -900,9 +1071,14 @@ def test_search_takes_the_perturbations_of_a_study(paper):
 @pytest.mark.parametrize(("search", "old"), [(counterexample, "ranges"), (ij.falsify, "sets")])
 def test_old_names_and_tuples_are_told_the_new_ones(paper, search, old):
     timing = {} if old == "ranges" else {"duration": 0.01}
-    with pytest.raises(ValueError, match=rf"{old}: got .*{search.__name__}\(\.\.\., perturbations=\.\.\.\)"):
+    with pytest.raises(
+        ValueError, match=rf"{old}: got .*{search.__name__}\(\.\.\., perturbations=\.\.\.\)"
+    ):
         search(paper, **{old: {"initial.q": (0.4, 0.7)}}, **timing)
-    with pytest.raises(ValueError, match=r"perturbations\['initial\.q'\].*ij\.value\(ij\.uniform\(0\.4, \[0\.7, 0\.8\]\)\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"perturbations\['initial\.q'\].*ij\.value\(ij\.uniform\(0\.4, \[0\.7, 0\.8\]\)\)",
+    ):
         search(paper, {"initial.q": (0.4, np.array([0.7, 0.8]))}, **timing)
 
 
@@ -912,10 +1088,21 @@ def test_old_names_and_tuples_are_told_the_new_ones(paper, search, old):
 def test_certificate_shows_itself(paper_certificate):
     text = repr(paper_certificate)
     assert text.startswith("Certificate: holds")
-    for words in ("(3.17)", "(3.25)", "(3.27)", "(3.26)", "(3.28)", "(3.31)", "Assumption 2", "t = 7.629 s"):
+    for words in (
+        "(3.17)",
+        "(3.25)",
+        "(3.27)",
+        "(3.26)",
+        "(3.28)",
+        "(3.31)",
+        "Assumption 2",
+        "t = 7.629 s",
+    ):
         assert words in text
     assert "<table>" in paper_certificate._repr_html_()
-    assert json.loads(json.dumps(paper_certificate.to_dict(), allow_nan=False))["verdict"] == "holds"
+    assert (
+        json.loads(json.dumps(paper_certificate.to_dict(), allow_nan=False))["verdict"] == "holds"
+    )
     with pytest.raises(KeyError, match="envelope, case 1"):
         paper_certificate["envelopes"]
 

@@ -56,7 +56,17 @@ def test_reproduce(command, tmp_path):
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert written == sorted([*figures, "arm.gif", "metrics.json", "rollouts.nc"])
     assert all((tmp_path / "out" / name).stat().st_size > 1000 for name in written)
-    for word in ("settling_time", "0.993", "0.713", "1.077", "0.837", "N m", "with compilation", "for the two runs alone", "Remark"):
+    for word in (
+        "settling_time",
+        "0.993",
+        "0.713",
+        "1.077",
+        "0.837",
+        "N m",
+        "with compilation",
+        "for the two runs alone",
+        "Remark",
+    ):
         assert word in out
     assert out.count("HELD ") == 8
     assert "DID NOT HOLD" not in out
@@ -91,8 +101,11 @@ def test_the_assumed_numbers_are_those_of_the_runs(paper):
 
 
 def test_claims_can_fail(paper, short_run):
-    """The same run twice is neither faster nor more accurate; half a second is too short to settle."""
-    held = {claim.claim: claim.held for claim in _claims.paper_claims({"a": short_run, "b": short_run})}
+    """The same run twice is neither faster nor more accurate; half a second is too short to
+    settle."""
+    held = {
+        claim.claim: claim.held for claim in _claims.paper_claims({"a": short_run, "b": short_run})
+    }
     assert held["Neither law violates its time-varying asymmetric bounds."]
     assert not held["Both laws track the reference."]
     assert not held["The integral form converges faster."]
@@ -111,11 +124,25 @@ def test_claims_can_fail(paper, short_run):
 
 def test_simulate_a_file(command, paper, tmp_path):
     ij.save_scenario(paper, tmp_path / "mine.toml", run={"duration": 0.05, "method": "heun"})
-    code, out, err = command("simulate", "mine.toml", "--set", "controller.K2=30", "--set", "initial.q=[0.7, 0.6]", "--out", "out")
+    code, out, err = command(
+        "simulate",
+        "mine.toml",
+        "--set",
+        "controller.K2=30",
+        "--set",
+        "initial.q=[0.7, 0.6]",
+        "--out",
+        "out",
+    )
     assert (code, err) == (0, "")
     assert "status: ok" in out
     assert "mine.toml: 0.05 s, dt = 0.001 s, heun" in out
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["metrics.json", "overview.png", "rollout.nc", "scenario.toml"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "metrics.json",
+        "overview.png",
+        "rollout.nc",
+        "scenario.toml",
+    ]
 
     again = scenario_file.load_scenario_file(tmp_path / "out" / "scenario.toml")
     assert again.run == {"duration": 0.05, "dt": 1e-3, "method": "heun", "record_every": 1}
@@ -129,7 +156,9 @@ def test_simulate_a_file(command, paper, tmp_path):
 
 def test_a_seed_fixes_the_noise(command, paper, tmp_path):
     noisy = ij.with_parts(
-        paper, sampling=ij.Sampling(2e-3), sensor=ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Tracking(bandwidth=100.0))
+        paper,
+        sampling=ij.Sampling(2e-3),
+        sensor=ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Tracking(bandwidth=100.0)),
     )
     ij.save_scenario(noisy, tmp_path / "noisy.toml", run={"duration": 0.02})
     for folder, seed in (("a", "3"), ("b", "3"), ("c", "4")):
@@ -141,14 +170,26 @@ def test_a_seed_fixes_the_noise(command, paper, tmp_path):
 
 
 def test_simulate_a_preset(command):
-    code, out, _ = command("simulate", "zhang_yan_2024", *SHORT, "--arg", "law=log", "--arg", "reading=corrected", "--record-every", "7")
+    code, out, _ = command(
+        "simulate",
+        "zhang_yan_2024",
+        *SHORT,
+        "--arg",
+        "law=log",
+        "--arg",
+        "reading=corrected",
+        "--record-every",
+        "7",
+    )
     assert code == 0
     assert "peak_torque" in out
 
 
 @pytest.mark.slow
 def test_a_failed_run_exits_with_one(command, tmp_path):
-    code, out, err = command("simulate", "zhang_yan_2024", *SHORT, "--set", "controller.K2=500", "--out", "out")
+    code, out, err = command(
+        "simulate", "zhang_yan_2024", *SHORT, "--set", "controller.K2=500", "--out", "out"
+    )
     assert code == 1
     assert "the time step is too large for the closed loop" in out
     assert err.startswith("iblf-jax: warning: The run failed")
@@ -159,7 +200,9 @@ def test_a_failed_run_exits_with_one(command, tmp_path):
 
 
 def test_a_preset_file_with_its_own_run(command, tmp_path):
-    (tmp_path / "a.toml").write_text('preset = "zhang_yan_2024"\n[run]\nduration = 0.05\nmethod = "heun"\n')
+    (tmp_path / "a.toml").write_text(
+        'preset = "zhang_yan_2024"\n[run]\nduration = 0.05\nmethod = "heun"\n'
+    )
     code, out, _ = command("simulate", "a.toml")
     assert code == 0
     assert "0.05 s, dt = 0.001 s, heun" in out
@@ -177,7 +220,9 @@ def test_presets(command, paper):
     assert "--arg law=integral" in out
     code, out, _ = command("presets", "zhang_yan_2024", "--toml", "--arg", "law=log")
     assert code == 0
-    assert isinstance(scenario_file.from_dict(tomllib.loads(out)).scenario.controller.barrier, ij.barriers.Log)
+    assert isinstance(
+        scenario_file.from_dict(tomllib.loads(out)).scenario.controller.barrier, ij.barriers.Log
+    )
 
 
 def test_parameters(command, paper):
@@ -207,21 +252,30 @@ REFUSALS = [
     (["reproduce"], "required: --out"),
     (["reproduce", "--out", "out", "--reading", "x"], "invalid choice: 'x'"),
     (["reproduce", "--out", "out", "--dt", "0"], "dt: got 0.0, expected a positive number [s]"),
-    (["reproduce", "--out", "file.toml"], "--out: got 'file.toml', expected a folder that can be written"),
+    (
+        ["reproduce", "--out", "file.toml"],
+        "--out: got 'file.toml', expected a folder that can be written",
+    ),
     (["simulate"], "required: SCENARIO.toml|PRESET"),
     (["simulate", "none.toml"], "none.toml: no such file"),
     (["simulate", "zhang_yan"], "Did you mean zhang_yan_2024"),
     (["simulate", "."], ".: no such file"),
     (["simulate", "file.toml"], "file.toml: contrller: got an unknown key"),
     (["simulate", "binary.toml"], "binary.toml: not a TOML file"),
-    (["simulate", "zhang_yan_2024", "--duration", "long"], "argument --duration: invalid float value: 'long'"),
+    (
+        ["simulate", "zhang_yan_2024", "--duration", "long"],
+        "argument --duration: invalid float value: 'long'",
+    ),
     (["simulate", "zhang_yan_2024", "--duration", "nan"], "duration: got nan"),
     (["simulate", "zhang_yan_2024", "--duration", "1e300"], "duration: got 1e+300"),
     (["simulate", "zhang_yan_2024", "--duration", "1", "--dt", "0.3"], "Take duration=0.9"),
     (["simulate", "zhang_yan_2024", "--method", "rk5"], "method: got 'rk5'"),
     (["simulate", "zhang_yan_2024", "--record-every", "0"], "record_every: got 0"),
     (["simulate", "zhang_yan_2024", "--record-every", "1.5"], "invalid int value: '1.5'"),
-    (["simulate", "zhang_yan_2024", "--set", "controller.K2"], "--set: got 'controller.K2', expected NAME=VALUE"),
+    (
+        ["simulate", "zhang_yan_2024", "--set", "controller.K2"],
+        "--set: got 'controller.K2', expected NAME=VALUE",
+    ),
     (["simulate", "zhang_yan_2024", "--set", "controller.K2="], "--set: got 'controller.K2='"),
     (["simulate", "zhang_yan_2024", "--set", "controller.K3=1"], "Did you mean controller.K2"),
     (["simulate", "zhang_yan_2024", "--set", "controller.K2=fast"], "controller.K2: got 'fast'"),
@@ -230,14 +284,19 @@ REFUSALS = [
     (["simulate", "zhang_yan_2024", "--arg", "lw=log"], "Did you mean law?"),
     (["simulate", "zhang_yan_2024", "--arg", "p=two"], "arguments.p: got 'two'"),
     (["simulate", "good.toml", "--arg", "law=log"], "only presets take arguments"),
-    (["simulate", "zhang_yan_2024", "--set", "initial.q=2"], "initial.q[0]: got 2.0, expected a start inside the bounds"),
+    (
+        ["simulate", "zhang_yan_2024", "--set", "initial.q=2"],
+        "initial.q[0]: got 2.0, expected a start inside the bounds",
+    ),
     (["presets", "zhang"], "preset: got 'zhang'"),
     (["presets", "--toml"], "expected the name of a preset"),
     (["parameters", "none"], "none: no such file"),
 ]
 
 
-@pytest.mark.parametrize(("argv", "message"), REFUSALS, ids=[" ".join(argv) for argv, _ in REFUSALS])
+@pytest.mark.parametrize(
+    ("argv", "message"), REFUSALS, ids=[" ".join(argv) for argv, _ in REFUSALS]
+)
 def test_refusals_are_one_line_and_exit_with_two(argv, message, command, paper, tmp_path):
     tables = scenario_file.scenario_to_dict(paper)
     (tmp_path / "good.toml").write_text(tomli_w.dumps(tables))
@@ -251,7 +310,10 @@ def test_refusals_are_one_line_and_exit_with_two(argv, message, command, paper, 
     assert message in err
 
 
-@pytest.mark.skipif(os.geteuid() == 0 if hasattr(os, "geteuid") else True, reason="the superuser may write everywhere")
+@pytest.mark.skipif(
+    os.geteuid() == 0 if hasattr(os, "geteuid") else True,
+    reason="the superuser may write everywhere",
+)
 def test_a_folder_without_permission(command, tmp_path):
     (tmp_path / "locked").mkdir(mode=0o500)
     code, _, err = command("simulate", "zhang_yan_2024", *SHORT, "--out", "locked/out")
@@ -266,7 +328,17 @@ def test_a_folder_without_permission(command, tmp_path):
 def test_as_a_process_with_its_own_cache(tmp_path):
     env = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     env |= {"XDG_CACHE_HOME": str(tmp_path), "MPLBACKEND": "Agg"}
-    argv = [sys.executable, "-m", "iblf_jax", "simulate", "zhang_yan_2024", "--duration", "0.01", "--method", "euler"]
+    argv = [
+        sys.executable,
+        "-m",
+        "iblf_jax",
+        "simulate",
+        "zhang_yan_2024",
+        "--duration",
+        "0.01",
+        "--method",
+        "euler",
+    ]
     done = subprocess.run(argv, env=env, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "status: ok" in done.stdout
@@ -274,7 +346,14 @@ def test_as_a_process_with_its_own_cache(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("module", "started"), [("_start", "-m"), ("numpy", "-m"), ("iblf_jax.cli", "-m"), ("_start", "script"), ("jax", "script")]
+    ("module", "started"),
+    [
+        ("_start", "-m"),
+        ("numpy", "-m"),
+        ("iblf_jax.cli", "-m"),
+        ("_start", "script"),
+        ("jax", "script"),
+    ],
 )
 def test_a_command_is_interrupted_quietly_while_python_imports(module, started, tmp_path):
     script = tmp_path / "iblf-jax"
@@ -333,9 +412,16 @@ def test_the_cache_is_only_a_help(cache, tmp_path, monkeypatch):
 
 def test_numbers_as_text():
     assert _common.number(float("inf")) == "-"
-    assert _common.strict({"a": np.array([1.0, np.nan]), "b": np.float32(2.0), "c": (np.inf, True, None)}) == {
+    assert _common.strict(
+        {"a": np.array([1.0, np.nan]), "b": np.float32(2.0), "c": (np.inf, True, None)}
+    ) == {
         "a": [1.0, None],
         "b": 2.0,
         "c": [None, True, None],
     }
-    assert _common.assignments("--set", ["a=1", "b = [1, 2]", "c=x y", 'd="q"']) == {"a": 1, "b": [1, 2], "c": "x y", "d": "q"}
+    assert _common.assignments("--set", ["a=1", "b = [1, 2]", "c=x y", 'd="q"']) == {
+        "a": 1,
+        "b": [1, 2],
+        "c": "x y",
+        "d": "q",
+    }

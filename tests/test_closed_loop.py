@@ -1,4 +1,5 @@
-"""The whole closed loop, with other masses, gains, starts and bounds, against an independent program (independent.py)."""
+"""The whole closed loop, with other masses, gains, starts and bounds, against an independent
+program (independent.py)."""
 
 from __future__ import annotations
 
@@ -16,8 +17,16 @@ def random_loop(seed, law, reading) -> independent.Loop:
     """A feasible closed loop, far from the paper's numbers."""
     rng = np.random.default_rng(seed)
     mass, length = rng.uniform([1.5, 0.8], [3.0, 1.6]), rng.uniform(0.3, 0.5, 2)
-    reference = (rng.uniform(-0.5, 0.5, 2), rng.uniform(0.05, 0.15, 2), rng.uniform(0.5, 2, 2), rng.uniform(0, 6, 2))
-    wobble = lambda: (rng.uniform(0.02, 0.1, 2), rng.uniform(0.5, 2, 2), rng.uniform(0, 6, 2))  # noqa: E731
+    reference = (
+        rng.uniform(-0.5, 0.5, 2),
+        rng.uniform(0.05, 0.15, 2),
+        rng.uniform(0.5, 2, 2),
+        rng.uniform(0, 6, 2),
+    )
+
+    def wobble():
+        return rng.uniform(0.02, 0.1, 2), rng.uniform(0.5, 2, 2), rng.uniform(0, 6, 2)
+
     loop = independent.Loop(
         mass=mass,
         length=length,
@@ -37,7 +46,9 @@ def random_loop(seed, law, reading) -> independent.Loop:
         force_b=(np.zeros(2), *rng.uniform(0.1, 1.5, (3, 2))),
         dq0=rng.uniform(-0.5, 0.5, 2),
     )
-    q_d, lower, upper = (independent.sine(*x)(0.0)[0] for x in (loop.reference, loop.lower, loop.upper))
+    q_d, lower, upper = (
+        independent.sine(*x)(0.0)[0] for x in (loop.reference, loop.lower, loop.upper)
+    )
     loop.q0 = q_d + rng.choice([-0.6, 0.6], 2) * np.minimum(upper - q_d, q_d - lower)
     return loop
 
@@ -47,12 +58,20 @@ def scenario_of(loop: independent.Loop) -> ij.Scenario:
     observer = ij.observers.Momentum if loop.corrected else ij.observers.Printed
     a, b = loop.force_a[1:], loop.force_b[1:]
     return ij.Scenario(
-        plant=ij.robots.TwoLink(mass=loop.mass, length=loop.length, centre=loop.centre, inertia=loop.inertia, g=loop.g),
+        plant=ij.robots.TwoLink(
+            mass=loop.mass, length=loop.length, centre=loop.centre, inertia=loop.inertia, g=loop.g
+        ),
         reference=ij.references.Sinusoid(*loop.reference),
-        bounds=ij.bounds.Bounds(lower=ij.bounds.Sinusoid(*loop.lower), upper=ij.bounds.Sinusoid(*loop.upper)),
+        bounds=ij.bounds.Bounds(
+            lower=ij.bounds.Sinusoid(*loop.lower), upper=ij.bounds.Sinusoid(*loop.upper)
+        ),
         disturbance=ij.disturbances.ModelShaped(*a, *b),
         controller=ij.controllers.Backstepping(
-            k1=loop.k1, K2=loop.K2, o=loop.o, barrier=barrier, reading="corrected" if loop.corrected else "printed"
+            k1=loop.k1,
+            K2=loop.K2,
+            o=loop.o,
+            barrier=barrier,
+            reading="corrected" if loop.corrected else "printed",
         ),
         observer=observer(kf=loop.kf),
         initial=ij.Initial(q=loop.q0, dq=loop.dq0),
@@ -68,12 +87,23 @@ def test_other_numbers_against_scipy(seed, law, reading):
     expected = loop.solve(TIMES, rtol=1e-9)
     run = ij.simulate(scenario_of(loop), **PAPER)
     assert run.ok
-    tolerances = {"q": 1e-7, "dq": 5e-5, "e1": 1e-7, "xi": 1e-6, "alpha": 1e-6, "e2": 5e-5, "tau": 2e-3, "V": 1e-5}
+    tolerances = {
+        "q": 1e-7,
+        "dq": 5e-5,
+        "e1": 1e-7,
+        "xi": 1e-6,
+        "alpha": 1e-6,
+        "e2": 5e-5,
+        "tau": 2e-3,
+        "V": 1e-5,
+    }
     for name, tolerance in tolerances.items():
         error = np.max(np.abs(np.asarray(getattr(run, name))[: TIMES.size] - expected[name]))
         assert error <= tolerance, (name, error)
     for name, key in (("disturbance", "f"), ("disturbance_estimate", "f_hat")):
-        assert np.max(np.abs(np.asarray(getattr(run, name))[: TIMES.size] - expected[key])) <= 1e-4, name
+        assert (
+            np.max(np.abs(np.asarray(getattr(run, name))[: TIMES.size] - expected[key])) <= 1e-4
+        ), name
 
 
 def test_the_independent_program_reproduces_the_reference_data(reference_data):
@@ -85,38 +115,59 @@ def test_the_independent_program_reproduces_the_reference_data(reference_data):
 
 
 def test_a_matched_start_of_the_observer():
-    """eta(0) = -kf M0 q'(0) makes f_hat(0) = 0, also with a moving start; as printed it does not."""
+    """eta(0) = -kf M0 q'(0) makes f_hat(0) = 0, also with a moving start; as printed it does
+    not."""
     import dataclasses
 
     scenario = scenario_of(random_loop(1, "integral", "printed"))
     model, q, dq = scenario.model, scenario.initial.q, scenario.initial.dq
-    for start, expected in (("zero", scenario.observer.kf * (model.mass_matrix(q) @ dq)), ("matched", np.zeros(2))):
+    for start, expected in (
+        ("zero", scenario.observer.kf * (model.mass_matrix(q) @ dq)),
+        ("matched", np.zeros(2)),
+    ):
         observer = dataclasses.replace(scenario.observer, start=start)
-        np.testing.assert_allclose(observer.estimate(0.0, q, dq, model, observer.init(q, dq, model)), expected, atol=1e-12)
+        np.testing.assert_allclose(
+            observer.estimate(0.0, q, dq, model, observer.init(q, dq, model)), expected, atol=1e-12
+        )
 
 
 def test_alpha_rate_against_finite_differences(short_run):
-    """Solve (3.14) for alpha' from the recorded torque, and compare with differences of the recorded alpha."""
+    """Solve (3.14) for alpha' from the recorded torque, and compare with differences of the
+    recorded alpha."""
     scenario, run = short_run.scenario, short_run
     import jax
 
     model = scenario.model
 
     def alpha_rate(q, dq, tau, f_hat, e2, slope):
-        rest = tau + f_hat + scenario.controller.K2 * e2 + slope - model.coriolis(q, dq, dq) - model.gravity(q)
+        rest = (
+            tau
+            + f_hat
+            + scenario.controller.K2 * e2
+            + slope
+            - model.coriolis(q, dq, dq)
+            - model.gravity(q)
+        )
         return jax.numpy.linalg.solve(model.mass_matrix(q), rest)
 
-    k = np.where(np.asarray(run.e1) > 0, np.asarray(run.upper - run.q_d), np.asarray(run.q_d - run.lower))
+    k = np.where(
+        np.asarray(run.e1) > 0, np.asarray(run.upper - run.q_d), np.asarray(run.q_d - run.lower)
+    )
     slope = 2 * np.asarray(run.e1) / (k**2 - np.asarray(run.e1) ** 2)
-    got = np.asarray(jax.vmap(alpha_rate)(run.q, run.dq, run.tau, run.disturbance_estimate, run.e2, slope))
+    got = np.asarray(
+        jax.vmap(alpha_rate)(run.q, run.dq, run.tau, run.disturbance_estimate, run.e2, slope)
+    )
     a, dt = np.asarray(run.alpha), float(run.dt)
     difference = (a[:-4] - 8 * a[1:-3] + 8 * a[3:-1] - a[4:]) / (12 * dt)
-    after = slice(100, -100)  # the first 0.1 s hold modes of 1000 1/s, which differences at 1 ms do not resolve
+    after = slice(
+        100, -100
+    )  # the first 0.1 s hold modes of 1000 1/s, which differences at 1 ms do not resolve
     np.testing.assert_allclose(got[2:-2][after], difference[after], atol=1e-6)
 
 
 def test_plant_error_is_the_uncertain_term(rng):
-    """A payload and friction that the model does not know: f = M0 q" + C0 q' + G0 - tau, with q" from the plant by hand."""
+    """A payload and friction that the model does not know: f = M0 q" + C0 q' + G0 - tau, with q"
+    from the plant by hand."""
     import dataclasses
 
     import jax
@@ -135,7 +186,11 @@ def test_plant_error_is_the_uncertain_term(rng):
     loaded.mass, loaded.centre, loaded.inertia = (2.0, m2 + mp), (0.175, c), (0.06125, i2)
     for _ in range(5):
         q, v, eta = rng.uniform(0.4, 0.7, 2), rng.normal(size=2), rng.normal(size=2)
-        rate, sample = step(scenario, np.asarray(0.3), LoopState(*map(jax.numpy.asarray, (q, v)), (), jax.numpy.asarray(eta)))
+        rate, sample = step(
+            scenario,
+            np.asarray(0.3),
+            LoopState(*map(jax.numpy.asarray, (q, v)), (), jax.numpy.asarray(eta)),
+        )
         tau = np.asarray(sample.tau)
         M, C, G, _ = loaded.arm(q)
         ddq = np.linalg.solve(M, tau - 0.3 * v - 0.2 * np.tanh(v / 0.1) - C(v) @ v - G)

@@ -37,20 +37,29 @@ def test_equal_effort_is_equal_effort(comparison):
     assert comparison.factors["integral"] == 1.0
     for name, gains in (("log", ("k1", "K2")), ("pd", ("Kp", "Kd"))):
         for gain in gains:
-            before, after = (getattr(runs[name].scenario.controller, gain) for runs in (comparison.rollouts, comparison.equal_effort))
+            before, after = (
+                getattr(runs[name].scenario.controller, gain)
+                for runs in (comparison.rollouts, comparison.equal_effort)
+            )
             np.testing.assert_allclose(after, before * comparison.factors[name], rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_the_fold_measures_the_torque_above_gravity():
-    run = ij.simulate(ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, metrics=(ij.metrics.AboveGravity(),))
+    run = ij.simulate(
+        ij.presets.zhang_yan_2024(), duration=0.5, dt=1e-3, metrics=(ij.metrics.AboveGravity(),)
+    )
     assert float(run.metrics.effort_above_gravity) == pytest.approx(effort(run), rel=1e-9)
 
 
 @pytest.mark.slow
 def test_laws_by_name_take_the_gains_the_observer_and_the_limit_of_the_scenario():
-    scenario = ij.with_parameters(ij.presets.zhang_yan_2024_saturated(), {"controller.k1": [1.5, 2.5], "controller.K2": 15.0})
-    comparison = ij.compare(scenario, ["log", "adaptive_rbf"], duration=0.02, dt=1e-3, equal_effort=False)
+    scenario = ij.with_parameters(
+        ij.presets.zhang_yan_2024_saturated(), {"controller.k1": [1.5, 2.5], "controller.K2": 15.0}
+    )
+    comparison = ij.compare(
+        scenario, ["log", "adaptive_rbf"], duration=0.02, dt=1e-3, equal_effort=False
+    )
     for name, run in comparison.rollouts.items():
         law = run.scenario.controller
         assert isinstance(law, controllers.Saturated)
@@ -101,28 +110,41 @@ def test_at_equal_gains_the_integral_form_works_harder_than_the_logarithmic_one(
 def test_failed_runs_are_named():
     scenario = ij.presets.zhang_yan_2024()
     laws = {"good": "integral", "weak": controllers.PDGravity(Kp=0.01, Kd=0.01)}
-    comparison = ij.compare(dataclasses.replace(scenario, initial=ij.Initial(q=0.8, dq=[1.0, 1.0])), laws, **RUN)
+    comparison = ij.compare(
+        dataclasses.replace(scenario, initial=ij.Initial(q=0.8, dq=[1.0, 1.0])), laws, **RUN
+    )
     assert "bound was violated" in comparison.failed["weak"]
     assert "weak FAILED: a bound was violated" in repr(comparison)
-    reverse = ij.compare(comparison.rollouts["weak"].scenario, {"weak": laws["weak"], "good": "integral"}, **RUN)
+    reverse = ij.compare(
+        comparison.rollouts["weak"].scenario, {"weak": laws["weak"], "good": "integral"}, **RUN
+    )
     assert math.isnan(reverse.factors["good"])
     assert "weak, failed itself" in repr(reverse)
 
 
 @pytest.mark.slow
 def test_laws_for_other_constraints_have_names_and_margins():
-    """They stand beside the others at equal effort, though the first law leaves what it does not know of."""
+    """They stand beside the others at equal effort, though the first law leaves what it does not
+    know of."""
     speeds = ij.Bounds(ij.bounds.Constant([-1.0, -0.6]), ij.bounds.Constant([0.6, 0.5]))
     wall = ij.regions.HalfSpace(normal=[-1.0, 0.0], offset=-0.245)
-    scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,))
-    comparison = ij.compare(scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3)
+    scenario = ij.with_parts(
+        ij.presets.zhang_yan_2024_full_state(), velocity_bounds=speeds, regions=(wall,)
+    )
+    comparison = ij.compare(
+        scenario, ["integral", "full_state", "reference_governor"], duration=0.1, dt=1e-3
+    )
     given = {row.law: row for row in comparison.table["gains"]}
     assert given["integral"].velocity_margin < 0 < given["full_state"].velocity_margin
     for row in given.values():
-        assert row.region_margin == float(np.min(comparison.rollouts[row.law].metrics.region_margin))
+        assert row.region_margin == float(
+            np.min(comparison.rollouts[row.law].metrics.region_margin)
+        )
     assert given["integral"].region_margin < 0
     law = comparison.rollouts["reference_governor"].scenario.controller
-    assert isinstance(law, controllers.ReferenceGovernor) and isinstance(law.law, controllers.PDGravity)
+    assert isinstance(law, controllers.ReferenceGovernor) and isinstance(
+        law.law, controllers.PDGravity
+    )
     assert comparison.factors["full_state"] > 1.0
     assert "region margin [m]" in repr(comparison) and "region_margin" in comparison.to_pandas()
     with pytest.raises(ValueError, match="velocity_bounds"):
@@ -132,14 +154,24 @@ def test_laws_for_other_constraints_have_names_and_margins():
 def test_a_filter_by_name_is_around_the_unconstrained_law():
     law = controllers.law_by_name("safety_filter", k1=3.0, reading="corrected")
     assert isinstance(law.law.barrier, ij.barriers.Quadratic) and float(law.law.k1) == 3.0
-    found = ij.compare(ij.with_parts(ij.presets.zhang_yan_2024(), controller=law), ["pd"], duration=0.02, dt=1e-3, equal_effort=False)
-    assert isinstance(found.rollouts["pd"].scenario.controller, controllers.PDGravity)  # a filter is a law's own, unlike a torque limit
+    found = ij.compare(
+        ij.with_parts(ij.presets.zhang_yan_2024(), controller=law),
+        ["pd"],
+        duration=0.02,
+        dt=1e-3,
+        equal_effort=False,
+    )
+    assert isinstance(
+        found.rollouts["pd"].scenario.controller, controllers.PDGravity
+    )  # a filter is a law's own, unlike a torque limit
 
 
 def test_a_law_without_a_factor_is_said_so():
     # A limit far below what the integral form does: no gain makes this one work as hard.
     capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])
-    comparison = ij.compare(ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, **RUN)
+    comparison = ij.compare(
+        ij.presets.zhang_yan_2024(), {"integral": "integral", "capped": capped}, **RUN
+    )
     assert math.isnan(comparison.factors["capped"])
     assert "capped" not in comparison.equal_effort
     assert "capped: no factor; its effort stays below" in repr(comparison)
@@ -163,14 +195,20 @@ class Bang:
 
 @pytest.mark.slow
 def test_laws_of_a_users_own():
-    laws = [controllers.Backstepping(k1=2.0, K2=20.0, barrier=barriers.Tan()), Bang(), Bang(size=0.2)]
+    laws = [
+        controllers.Backstepping(k1=2.0, K2=20.0, barrier=barriers.Tan()),
+        Bang(),
+        Bang(size=0.2),
+    ]
     comparison = ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1, dt=1e-3)
     assert list(comparison.rollouts) == ["Backstepping(Tan)", "Bang", "Bang 2"]
     assert "no gains to scale" in comparison.reasons["Bang"]
     assert "no gains (Bang, Bang 2)" in repr(comparison)
 
 
-@pytest.mark.parametrize("laws", [[], "integral", ["nonsense"], [3.0], {"x": None}, 7, [controllers.PDGravity]])
+@pytest.mark.parametrize(
+    "laws", [[], "integral", ["nonsense"], [3.0], {"x": None}, 7, [controllers.PDGravity]]
+)
 def test_wrong_laws_are_value_errors(laws):
     with pytest.raises(ValueError, match="laws"):
         ij.compare(ij.presets.zhang_yan_2024(), laws, duration=0.1)
@@ -200,10 +238,15 @@ def test_the_factor_is_the_one_nearest_one(effort, target, expected):
 def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison):
     figure = comparison.plot(joint=1)
     assert len(figure.axes) == 6
-    left, right = ({line.get_label(): line.get_color() for line in axes.lines} for axes in figure.axes[:2])
+    left, right = (
+        {line.get_label(): line.get_color() for line in axes.lines} for axes in figure.axes[:2]
+    )
     assert list(left)[:3] == ["integral", "log", "pd"]
     assert left == right
-    fewer = dataclasses.replace(comparison, equal_effort={"integral": comparison.rollouts["integral"], "pd": comparison.rollouts["pd"]})
+    fewer = dataclasses.replace(
+        comparison,
+        equal_effort={"integral": comparison.rollouts["integral"], "pd": comparison.rollouts["pd"]},
+    )
     axes = fewer.plot().axes
     assert {line.get_label(): line.get_color() for line in axes[1].lines}["pd"] == left["pd"]
     assert [text.get_text() for text in axes[5].texts] == ["no factor"] + ["never"] * sum(
@@ -219,7 +262,17 @@ def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison)
 @pytest.mark.slow
 def test_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    words = ["--laws", "integral", "log", "--duration", "2", "--record-every", "10", "--out", str(tmp_path / "out")]
+    words = [
+        "--laws",
+        "integral",
+        "log",
+        "--duration",
+        "2",
+        "--record-every",
+        "10",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert cli.main(["compare", *words]) == 0
     out = capsys.readouterr().out
     assert "Equal effort" in out
@@ -249,7 +302,8 @@ def test_command_line_refuses_an_unknown_law(capsys):
 
 @ij.component
 class Wavy:
-    """A PD law whose stiffness falls and rises with its gain k, and which is stiff in a band of gains."""
+    """A PD law whose stiffness falls and rises with its gain k, and which is stiff in a band of
+    gains."""
 
     gains = ("k",)
     k: object = ij.leaf("1", sign="positive", shape="scalar", default=1.0)
@@ -275,11 +329,14 @@ BRIEF = {"duration": 0.5, "dt": 1e-3, "record_every": 50}
 
 @pytest.fixture(scope="module")
 def wavy():
-    return ij.compare(ij.presets.zhang_yan_2024(), {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}, **BRIEF)
+    return ij.compare(
+        ij.presets.zhang_yan_2024(), {"at 1.28": Wavy(k=1.28), "at 1": Wavy()}, **BRIEF
+    )
 
 
 def test_the_factor_nearest_one_is_found_beyond_trials_that_fail(wavy):
-    """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from 1.4 to 1.6 fail."""
+    """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from
+    1.4 to 1.6 fail."""
     assert wavy.factors["at 1"] == pytest.approx(1.28, rel=1e-4)
     found = wavy.searches["at 1"]
     assert len(found.crossings) == 2
@@ -288,7 +345,9 @@ def test_the_factor_nearest_one_is_found_beyond_trials_that_fail(wavy):
     np.testing.assert_allclose(efforts, efforts[0], rtol=1e-4)
     assert all(1.17 <= factor <= 1.23 or factor >= 1.4 for factor in found.failed)
     assert any(1.17 < factor < 1.23 for factor in found.failed)
-    assert all("time step is too large" in why for factor, why in found.failed.items() if factor < 1.23)
+    assert all(
+        "time step is too large" in why for factor, why in found.failed.items() if factor < 1.23
+    )
 
 
 def test_failed_trials_are_in_the_text_and_in_the_dictionary(wavy):
@@ -297,7 +356,10 @@ def test_failed_trials_are_in_the_text_and_in_the_dictionary(wavy):
     assert f"{len(found.factors)} factors from 0.0312 to 32 were run" in text
     assert f"{len(found.failed)} of them fail" in text
     assert "the time step is too large" in text
-    assert f"only the time step is to blame: with dt={found.smaller_dt:g}" in text and found.smaller_dt < 1e-3
+    assert (
+        f"only the time step is to blame: with dt={found.smaller_dt:g}" in text
+        and found.smaller_dt < 1e-3
+    )
     data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert data["factor"] == found.factor
     assert len(data["trials"]["status"]) == len(found.factors)
@@ -310,7 +372,12 @@ def banded(low, high, flags):
 
     def run(factors):
         inside = (factors > low) & (factors < high)
-        return Trials(factors.copy(), np.where(inside, int(flags), 0), np.where(inside, 5e3, 10.0), np.zeros(len(factors)))
+        return Trials(
+            factors.copy(),
+            np.where(inside, int(flags), 0),
+            np.where(inside, 5e3, 10.0),
+            np.zeros(len(factors)),
+        )
 
     return run
 
@@ -327,10 +394,14 @@ def test_where_no_factor_is_found_the_nearest_trial_and_a_smaller_step_are_named
     best = np.min(np.abs(found.efforts[found.valid] - 1.32))
     assert abs(effort - 1.32) == best
     words = found.in_words()
-    assert f"its effort does not pass through 1.32 N m (0.03125 to 32); the nearest of them has {effort:.4g} N m, at {factor:.4g}" in words
+    assert (
+        "its effort does not pass through 1.32 N m (0.03125 to 32); the nearest of them has"
+        f" {effort:.4g} N m, at {factor:.4g}" in words
+    )
     assert "ran away" in words
     assert "with dt=0.0002" in words and found.smaller_dt == 2e-4
-    # A violation is no matter of the step, and what lies beyond the factor that was found hides nothing nearer.
+    # A violation is no matter of the step, and what lies beyond the factor that was found hides
+    # nothing nearer.
     assert search(banded(1.1, 1.5, Status.BOUND_VIOLATED), 1.32, dt_for).smaller_dt is None
     beyond = search(banded(1.4, 1.5, Status.STEP_TOO_LARGE), 1.32, dt_for)
     assert beyond.factor == pytest.approx(1.32, rel=1e-6) and beyond.smaller_dt is None
@@ -350,12 +421,24 @@ def test_inaccurate_trials_count_only_where_the_given_runs_are_inaccurate_too():
     ("effort", "target", "expected"),
     [
         (lambda c: 2.0 + math.sin(12.0 * math.log(c)), 2.5, math.exp(math.asin(0.5) / 12.0)),
-        (lambda c: 2.0 - (c - 0.71) ** 2, 2.0 - 1e-4, 0.72),  # turns back just beyond the target, between grid points
+        (
+            lambda c: 2.0 - (c - 0.71) ** 2,
+            2.0 - 1e-4,
+            0.72,
+        ),  # turns back just beyond the target, between grid points
         (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.35, 1.35),
         (lambda c: math.nan if 1.1 < c < 1.3 else c, 1.2, math.nan),
-        (lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2), 1.2, math.nan),  # a jump over the target is no factor
+        (
+            lambda c: math.nan if 1.03 < c < 1.3 else c + 3.0 * (c < 0.2),
+            1.2,
+            math.nan,
+        ),  # a jump over the target is no factor
         (lambda c: 1.0 / c, 0.3, 1.0 / 0.3),
-        (lambda c: abs(math.log(c)) + 0.1, 1.1, math.exp(-1.0)),  # 1/e and e are equally near: the first one
+        (
+            lambda c: abs(math.log(c)) + 0.1,
+            1.1,
+            math.exp(-1.0),
+        ),  # 1/e and e are equally near: the first one
     ],
 )
 def test_efforts_of_any_shape(effort, target, expected):

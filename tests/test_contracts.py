@@ -1,6 +1,8 @@
-"""Every member of every family fits its contract; and the checkers notice members that do not (test_testing.py).
+"""Every member of every family fits its contract; and the checkers notice members that do not
+(test_testing.py).
 
-The default run checks one instance of every class, the first that `members.py` lists; CI checks all of them.
+The default run checks one instance of every class, the first that `members.py` lists; CI checks all
+of them.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from iblf_jax.testing import robots
 from iblf_jax.testing._contract import Findings
 
 LONG = {"arm"}
-"""Takes a minute to compile: the default run holds it to a part of its contract, in a test of its own."""
+"""Takes a minute to compile: the default run holds it to a part of its contract, in a test of its
+own."""
 
 
 def cases():

@@ -1,4 +1,5 @@
-"""A law against MuJoCo's robot: equal to `simulate` where the robots are equal, and what happens where they are not."""
+"""A law against MuJoCo's robot: equal to `simulate` where the robots are equal, and what happens
+where they are not."""
 
 from __future__ import annotations
 
@@ -14,22 +15,35 @@ from iblf_jax.deployment.film import has_shapes
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 
 TIMING = {"duration": 0.4, "dt": 5e-4}
-PAPER = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0})
+PAPER = ij.with_parameters(
+    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+)
 """Slow enough for a filter and a drive in the loop."""
 DRIVEN = ij.with_parts(
     PAPER,
     sampling=ij.Sampling(1e-3, delay=0.7e-3),
-    sensor=ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)),
-    actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0, limit=[15.0, 5.0], stall=[14.0, 6.0], no_load_speed=[6.0, 8.0]),
+    sensor=ij.sensors.Encoder(
+        counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
+    ),
+    actuator=ij.actuators.Motor(
+        bandwidth=600.0,
+        rate_limit=900.0,
+        limit=[15.0, 5.0],
+        stall=[14.0, 6.0],
+        no_load_speed=[6.0, 8.0],
+    ),
 )
 
 
 def two_link(robot, *, inside: str = "", elbow: str = "", outside: str = "") -> str:
     """The planar arm as an MJCF: gravity along -y, hinges about z."""
-    m, length, centre, inertia = (np.asarray(x) for x in (robot.mass, robot.length, robot.centre, robot.inertia))
+    m, length, centre, inertia = (
+        np.asarray(x) for x in (robot.mass, robot.length, robot.centre, robot.inertia)
+    )
     bodies = [
-        f'<inertial pos="{centre[i]} 0 0" mass="{m[i]}" diaginertia="{inertia[i]} {inertia[i]} {inertia[i]}"/>'
-        f'<geom type="capsule" fromto="0 0 0 {length[i]} 0 0" size="0.03" contype="0" conaffinity="0"/>'
+        f'<inertial pos="{centre[i]} 0 0" mass="{m[i]}" diaginertia="{inertia[i]} {inertia[i]}'
+        f' {inertia[i]}"/><geom type="capsule" fromto="0 0 0 {length[i]} 0 0" size="0.03"'
+        ' contype="0" conaffinity="0"/>'
         for i in (0, 1)
     ]
     return f"""<mujoco><compiler angle="radian"/><option timestep="0.0008" gravity="0 -{float(robot.g)} 0"/><worldbody>
@@ -46,11 +60,18 @@ def largest_difference(a, b) -> float:
     return float(np.max(np.abs(np.asarray(a) - np.asarray(b))))
 
 
-CHAINED = ij.with_parts(DRIVEN, actuator=ij.actuators.Chain((ij.actuators.Motor(bandwidth=900.0), ij.actuators.Motor(limit=[15.0, 5.0]))))
+CHAINED = ij.with_parts(
+    DRIVEN,
+    actuator=ij.actuators.Chain(
+        (ij.actuators.Motor(bandwidth=900.0), ij.actuators.Motor(limit=[15.0, 5.0]))
+    ),
+)
 
 
 @pytest.mark.parametrize(
-    "scenario", [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN, CHAINED], ids=["ideal", "driven", "chained"]
+    "scenario",
+    [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN, CHAINED],
+    ids=["ideal", "driven", "chained"],
 )
 def test_on_the_nominal_arm_it_is_simulate(scenario):
     run = ij.simulate(scenario, **TIMING, seed=3)
@@ -63,7 +84,9 @@ def test_on_the_nominal_arm_it_is_simulate(scenario):
     for name in ("q", "dq", "tau", "alpha", "disturbance", "disturbance_estimate", "V", "xi"):
         assert largest_difference(getattr(run, name), getattr(other, name)) < 1e-9, name
     for name in run.metrics.keys() & other.metrics.keys():
-        np.testing.assert_allclose(other.metrics[name], run.metrics[name], rtol=1e-9, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            other.metrics[name], run.metrics[name], rtol=1e-9, atol=1e-9, err_msg=name
+        )
     assert int(other.status) == int(run.status)
 
 
@@ -77,7 +100,10 @@ def test_a_real_arm_from_its_file():
 
 
 def test_a_payload_that_the_law_does_not_know():
-    load = '<body pos="{} 0 0"><inertial pos="0 0 0" mass="0.3" diaginertia="1e-12 1e-12 1e-12"/></body>'
+    load = (
+        '<body pos="{} 0 0"><inertial pos="0 0 0" mass="0.3" diaginertia="1e-12 1e-12'
+        ' 1e-12"/></body>'
+    )
     spec = spec_of(PAPER.plant, inside=load.format(float(PAPER.plant.length[1])))
     scenario = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3))
     loaded = ij.simulate(ij.with_parameters(scenario, {"plant.payload": 0.3}), **TIMING)
@@ -98,10 +124,15 @@ def test_a_joint_that_touches_its_stop():
     before = np.argmax(np.asarray(free.q[:, 1]) < stop) - 1
     assert largest_difference(held.q[:before], free.q[:before]) < 1e-12
     # What the law does not know of, the stop's push, is in f.
-    assert float(np.max(np.abs(held.disturbance[before:]))) > 2 * float(np.max(np.abs(free.disturbance[before:])))
+    assert float(np.max(np.abs(held.disturbance[before:]))) > 2 * float(
+        np.max(np.abs(free.disturbance[before:]))
+    )
 
 
-FINGER = '<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/><geom size="0.01" mass="0.2"/></body>'
+FINGER = (
+    '<body name="finger" pos="0.1 0 0"><joint name="grip" type="slide" axis="0 1 0"/><geom'
+    ' size="0.01" mass="0.2"/></body>'
+)
 
 
 def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
@@ -112,7 +143,9 @@ def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
     spec = spec_of(PAPER.plant, inside=FINGER, outside=ball)
     found = ij.cosimulate(scenario, spec, **TIMING)
     assert largest_difference(found.q, expected.q) < 1e-9
-    elsewhere = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore", locked={"grip": 0.2})
+    elsewhere = ij.robots.load(
+        _written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore", locked={"grip": 0.2}
+    )
     away = ij.simulate(ij.with_parts(scenario, plant=elsewhere, model=named), **TIMING)
     found = ij.cosimulate(scenario, spec, locked={"grip": 0.2}, **TIMING)
     assert largest_difference(found.q, away.q) < 1e-9
@@ -120,10 +153,18 @@ def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
 
 
 def test_a_locked_joint_in_a_frame_is_held_where_it_is():
-    inner = '<frame pos="0 0.02 0" euler="0 0 0.4"><body name="palm" pos="0.03 0 0" euler="0 0 -0.3"><joint name="wrist" axis="0 0 1"/>'
-    held = f'<frame pos="0.05 0 0" euler="0 0 0.9">{inner}<geom size="0.02" pos="0.1 0 0" mass="0.2"/>{FINGER}</body></frame></frame>'
+    inner = (
+        '<frame pos="0 0.02 0" euler="0 0 0.4"><body name="palm" pos="0.03 0 0" euler="0 0'
+        ' -0.3"><joint name="wrist" axis="0 0 1"/>'
+    )
+    held = (
+        f'<frame pos="0.05 0 0" euler="0 0 0.9">{inner}<geom size="0.02" pos="0.1 0 0"'
+        f' mass="0.2"/>{FINGER}</body></frame></frame>'
+    )
     locked = {"wrist": 0.7, "grip": 0.1}
-    arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=held)), tip="fore", locked=locked)
+    arm = ij.robots.load(
+        _written("arm.xml", two_link(PAPER.plant, inside=held)), tip="fore", locked=locked
+    )
     scenario = ij.with_parts(PAPER, robot=arm, sampling=ij.Sampling(1e-3))
     found = ij.cosimulate(scenario, "arm.xml", locked=locked, **TIMING)
     expected = ij.simulate(scenario, **TIMING)
@@ -149,13 +190,20 @@ DRIVES = """<tendon><fixed name="wire"><joint joint="elbow" coef="1"/></fixed></
 
 
 def test_a_models_own_drives_are_off():
-    aside = '<body name="table" pos="3 0 0"><joint name="turntable" axis="0 0 1"/><geom size="0.1"/></body>'
+    aside = (
+        '<body name="table" pos="3 0 0"><joint name="turntable" axis="0 0 1"/><geom'
+        ' size="0.1"/></body>'
+    )
     site = '<site name="hand" pos="0.2 0 0"/>'
     arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant)))
     scenario = ij.with_parts(PAPER, robot=arm)
-    text = two_link(PAPER.plant, inside=site, outside=aside).replace("</worldbody>", f"</worldbody>{DRIVES}")
+    text = two_link(PAPER.plant, inside=site, outside=aside).replace(
+        "</worldbody>", f"</worldbody>{DRIVES}"
+    )
     driven = ij.cosimulate(scenario, _written("driven.xml", text), period=1e-3, **TIMING)
-    plain = ij.cosimulate(scenario, _written("plain.xml", two_link(PAPER.plant)), period=1e-3, **TIMING)
+    plain = ij.cosimulate(
+        scenario, _written("plain.xml", two_link(PAPER.plant)), period=1e-3, **TIMING
+    )
     assert largest_difference(driven.q, plain.q) < 1e-12
 
 
@@ -185,7 +233,10 @@ def test_models_stay_as_they_are_and_other_integrators_come_near():
     assert float(found.dt) == 5e-4
     assert model.opt.timestep == 0.0008
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    coarse, fine = (ij.cosimulate(PAPER, model, duration=0.4, period=1e-3, dt=dt, integrator=None) for dt in (5e-4, 2.5e-4))
+    coarse, fine = (
+        ij.cosimulate(PAPER, model, duration=0.4, period=1e-3, dt=dt, integrator=None)
+        for dt in (5e-4, 2.5e-4)
+    )
     errors = [largest_difference(run.q[-1], found.q[-1]) for run in (coarse, fine)]
     assert errors[1] == pytest.approx(0.5 * errors[0], rel=0.1)
 
@@ -217,7 +268,9 @@ def test_records_and_films(tmp_path):
 
     short = {"duration": 0.2, "dt": 1e-3, "period": 1e-3}
     every = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), **short)
-    some = ij.cosimulate(DRIVEN, spec_of(PAPER.plant), record_every=10, film=tmp_path / "arm.gif", **short)
+    some = ij.cosimulate(
+        DRIVEN, spec_of(PAPER.plant), record_every=10, film=tmp_path / "arm.gif", **short
+    )
     assert some.t.shape == (21,)
     np.testing.assert_array_equal(some.q, every.q[::10])
     np.testing.assert_array_equal(some.actuator_state, every.actuator_state[::10])
@@ -242,14 +295,23 @@ def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
 def test_films_may_follow_each_other(tmp_path):
     """Without a display MuJoCo's renderer fails once, and ends the process at the second try."""
     for ending in ("gif", "html"):
-        ij.cosimulate(PAPER, spec_of(PAPER.plant), period=1e-3, duration=0.05, dt=1e-3, film=tmp_path / f"arm.{ending}")
+        ij.cosimulate(
+            PAPER,
+            spec_of(PAPER.plant),
+            period=1e-3,
+            duration=0.05,
+            dt=1e-3,
+            film=tmp_path / f"arm.{ending}",
+        )
         assert (tmp_path / f"arm.{ending}").stat().st_size > 1000
 
 
 def test_a_shorter_period_finds_room_for_its_commands():
     slow = ij.with_parts(PAPER, sampling=ij.Sampling(4e-3, delay=4e-3))
     run = ij.cosimulate(slow, spec_of(PAPER.plant), period=1e-3, duration=0.02, dt=1e-3)
-    expected = ij.simulate(ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, delay=4e-3)), duration=0.02, dt=1e-3)
+    expected = ij.simulate(
+        ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, delay=4e-3)), duration=0.02, dt=1e-3
+    )
     assert largest_difference(run.q, expected.q) < 1e-12
 
 
@@ -259,7 +321,11 @@ BAD = {
     "integrator": ({}, {"period": 1e-3, "integrator": "rk4"}, "RK4"),
     "joints": ({"inside": FINGER}, {"period": 1e-3}, "3 joints that move"),
     "locked": ({}, {"period": 1e-3, "locked": {"wrist": 0.0}}, "wrist.*shoulder"),
-    "floating": ({"outside": ""}, {"period": 1e-3, "locked": {"shoulder": 0.0}}, "1 joints that move"),
+    "floating": (
+        {"outside": ""},
+        {"period": 1e-3, "locked": {"shoulder": 0.0}},
+        "1 joints that move",
+    ),
     "too few": ({}, {"period": 1e-3, "locked": {"elbow": 0.0}}, "1 joints that move.*Only hinges"),
     "film": ({}, {"period": 1e-3, "film": "arm.mp4"}, "film.*gif"),
     "no number": ({}, {"period": 1e-3, "locked": {"elbow": float("nan")}}, "locked"),
@@ -284,7 +350,10 @@ def test_what_is_no_model_or_no_single_scenario_is_named():
 
 
 def test_a_urdf_whose_meshes_are_not_there_touches_nothing():
-    shape = '<collision><geometry><mesh filename="package://nowhere/link.stl"/></geometry></collision></link>'
+    shape = (
+        "<collision><geometry><mesh"
+        ' filename="package://nowhere/link.stl"/></geometry></collision></link>'
+    )
     text = (ARMS / "ur5.urdf").read_text().replace("</link>", shape)
     scenario = ij.with_parts(ij.presets.ur5(), sampling=ij.Sampling(1e-3))
     with pytest.warns(UserWarning, match="shapes are left out"):
@@ -295,14 +364,31 @@ def test_files_and_names_that_do_not_fit():
     with pytest.raises(ValueError, match=r"nowhere\.xml"):
         ij.cosimulate(PAPER, "nowhere.xml", duration=0.1, period=1e-3)
     with pytest.raises(ValueError, match="body"):
-        ij.cosimulate(PAPER, _written("bad.xml", "<mujoco><worldbody><body pos='a'/></worldbody></mujoco>"), duration=0.1, period=1e-3)
+        ij.cosimulate(
+            PAPER,
+            _written("bad.xml", "<mujoco><worldbody><body pos='a'/></worldbody></mujoco>"),
+            duration=0.1,
+            period=1e-3,
+        )
     arm = ij.robots.load(_written("arm.xml", two_link(PAPER.plant)))
     other = _written("other.xml", two_link(PAPER.plant).replace("elbow", "elbows"))
     with pytest.raises(ValueError, match=r"elbow.*elbows"):
         ij.cosimulate(ij.with_parts(PAPER, robot=arm), other, duration=0.1, period=1e-3)
-    floating = two_link(PAPER.plant).replace('<body name="upper">', '<body name="base"><freejoint/><geom size="0.1"/><body name="upper">')
+    floating = two_link(PAPER.plant).replace(
+        '<body name="upper">', '<body name="base"><freejoint/><geom size="0.1"/><body name="upper">'
+    )
     text = floating.replace("</body></body>", "</body></body></body>")
     with pytest.raises(ValueError, match="base that stands still"):
-        ij.cosimulate(ij.with_parts(PAPER, robot=arm), _written("floating.xml", text), duration=0.1, period=1e-3)
+        ij.cosimulate(
+            ij.with_parts(PAPER, robot=arm),
+            _written("floating.xml", text),
+            duration=0.1,
+            period=1e-3,
+        )
     with pytest.raises(ValueError, match="MjModel"):
-        ij.cosimulate(ij.with_parts(PAPER, robot=arm), spec_of(PAPER.plant, inside=FINGER).compile(), duration=0.1, period=1e-3)
+        ij.cosimulate(
+            ij.with_parts(PAPER, robot=arm),
+            spec_of(PAPER.plant, inside=FINGER).compile(),
+            duration=0.1,
+            period=1e-3,
+        )

@@ -1,11 +1,13 @@
-"""What a step of a run costs, and what a first call compiles, in counts: they are exact, where seconds would flicker.
+"""What a step of a run costs, and what a first call compiles, in counts: they are exact, where
+seconds would flicker.
 
 `tests/data/costs.json` holds them.  After a change that is meant to move them,
 
     python tests/test_costs.py
 
-writes the file anew; the difference is what the change costs or gains.  Operations are those of one release of JAX, which the file names:
-another one may write a derivative otherwise (that of a maximum did in 0.12).
+writes the file anew; the difference is what the change costs or gains.  Operations are those of one
+release of JAX, which the file names: another one may write a derivative otherwise (that of a
+  maximum did in 0.12).
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ JAX = ".".join(jax.__version__.split(".")[:2])
 def planar_chain(n: int) -> ij.Scenario:
     """n equal links, each joint with the paper's kind of path and gains."""
     return ij.Scenario(
-        plant=ij.robots.PlanarChain(mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=0.02),
+        plant=ij.robots.PlanarChain(
+            mass=[1.0] * n, length=[0.3] * n, centre=[0.15] * n, inertia=0.02
+        ),
         reference=references.Sinusoid(offset=[0.5] * n, amplitude=0.14, frequency=1.0),
         bounds=bounds.Bounds(lower=bounds.Constant(0.1), upper=bounds.Constant(0.9)),
         controller=controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, barrier=barriers.Integral()),
@@ -47,20 +51,28 @@ def planar_chain(n: int) -> ij.Scenario:
     )
 
 
-SCENARIOS = {f"zhang_yan_2024, {law}": lambda law=law: ij.presets.zhang_yan_2024(law=law) for law in ij.presets.LAWS}
-SCENARIOS |= {name: preset for name, preset in ij.presets.PRESETS.items() if name != "zhang_yan_2024"}
+SCENARIOS = {
+    f"zhang_yan_2024, {law}": lambda law=law: ij.presets.zhang_yan_2024(law=law)
+    for law in ij.presets.LAWS
+}
+SCENARIOS |= {
+    name: preset for name, preset in ij.presets.PRESETS.items() if name != "zhang_yan_2024"
+}
 SCENARIOS["planar chain of 3"] = lambda: planar_chain(3)
 LONG = ("ur5", "iiwa14")
 """Six and seven joints: a count takes seconds."""
 
 
 def step_counts(name: str) -> dict[str, dict[str, int]]:
-    """How often -> operation -> how many in a step of Runge-Kutta with the standard metrics, where runs differ in start and a mass."""
+    """How often -> operation -> how many in a step of Runge-Kutta with the standard metrics, where
+    runs differ in start and a mass."""
     counts = ij.explain(SCENARIOS[name](), varied=["plant.mass[1]"]).counts
     return {often: dict(sorted(counter.items())) for often, counter in counts.items()}
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in SCENARIOS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in SCENARIOS]
+)
 def test_operations_of_a_step(name):
     table = json.loads(FILE.read_text())
     if table["jax"] != JAX:
@@ -69,8 +81,14 @@ def test_operations_of_a_step(name):
     changes = {often: Counter(found[often]) for often in found}
     for often, counter in expected.items():
         changes.setdefault(often, Counter()).subtract(counter)
-    moved = {often: {op: n for op, n in sorted(counter.items()) if n} for often, counter in changes.items()}
-    assert found == expected, f"{name}: {moved} more than in {FILE.name}; if that is meant, `python tests/test_costs.py` writes it anew"
+    moved = {
+        often: {op: n for op, n in sorted(counter.items()) if n}
+        for often, counter in changes.items()
+    }
+    assert found == expected, (
+        f"{name}: {moved} more than in {FILE.name}; if that is meant, `python tests/test_costs.py`"
+        " writes it anew"
+    )
 
 
 # --- a first call ----------------------------------------------------------------------------------------------------------------------
@@ -78,14 +96,28 @@ def test_operations_of_a_step(name):
 CALLS = {
     "simulate": lambda paper: ij.simulate(paper, duration=0.1, dt=1e-3),
     "certify": lambda paper: ij.certify(paper, duration=0.1, dt=1e-3),
-    "monte_carlo": lambda paper: ij.monte_carlo(paper, UNKNOWN, runs=32, duration=0.1, dt=1e-3, progress=False),
-    "tune": lambda paper: ij.tune(paper, ["controller.K2"], ij.objectives.tracking(), iterations=2, progress=False, **SHORT).report,
+    "monte_carlo": lambda paper: ij.monte_carlo(
+        paper, UNKNOWN, runs=32, duration=0.1, dt=1e-3, progress=False
+    ),
+    "tune": (
+        lambda paper: (
+            ij.tune(
+                paper,
+                ["controller.K2"],
+                ij.objectives.tracking(),
+                iterations=2,
+                progress=False,
+                **SHORT,
+            ).report
+        )
+    ),
 }
 SHORT = {"duration": 0.1, "dt": 1e-3}
 UNKNOWN = {"plant.mass[1]": ij.factor(ij.uniform(0.9, 1.1))}
 OPERATION = re.compile(r"^\s*(?:%\S+ = )?\"?(?:stablehlo|chlo|func\.call|call)\b", re.MULTILINE)
 SLACK = 1.02
-"""A bound is what was counted and a little more: a release of JAX may write a function of its own otherwise."""
+"""A bound is what was counted and a little more: a release of JAX may write a function of its own
+otherwise."""
 
 
 def count_of(call: str) -> dict[str, int]:
@@ -117,21 +149,31 @@ def count_of(call: str) -> dict[str, int]:
 
 def in_a_fresh_process(call: str) -> dict[str, int]:
     """`count_of`, in a process that has nothing compiled and nothing traced."""
-    done = subprocess.run([sys.executable, __file__, call], check=True, capture_output=True, text=True, timeout=280)
+    done = subprocess.run(
+        [sys.executable, __file__, call], check=True, capture_output=True, text=True, timeout=280
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize("call", [x if x == "simulate" else pytest.param(x, marks=pytest.mark.slow) for x in CALLS])
+@pytest.mark.parametrize(
+    "call", [x if x == "simulate" else pytest.param(x, marks=pytest.mark.slow) for x in CALLS]
+)
 def test_what_a_first_call_compiles(call):
     found, most = in_a_fresh_process(call), json.loads(FILE.read_text())["a first call"][call]
     over = {what: (n, most[what]) for what, n in found.items() if n > SLACK * most[what]}
     assert not over, f"{call}: {over} (counted, counted in {FILE.name})"
-    assert min(found["mass matrices traced"], found["operations in them"]) > 0, "nothing was counted"
+    assert min(found["mass matrices traced"], found["operations in them"]) > 0, (
+        "nothing was counted"
+    )
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         print(json.dumps(count_of(sys.argv[1])))
     else:
-        table = {"jax": JAX, "a step": {x: step_counts(x) for x in SCENARIOS}, "a first call": {x: in_a_fresh_process(x) for x in CALLS}}
+        table = {
+            "jax": JAX,
+            "a step": {x: step_counts(x) for x in SCENARIOS},
+            "a first call": {x: in_a_fresh_process(x) for x in CALLS},
+        }
         FILE.write_text(json.dumps(table, indent=1) + "\n")

@@ -1,4 +1,5 @@
-"""Several processes on loopback, two CPU devices each: the same bits as one, and a clear end when one is killed."""
+"""Several processes on loopback, two CPU devices each: the same bits as one, and a clear end when
+one is killed."""
 
 from __future__ import annotations
 
@@ -34,15 +35,29 @@ def job(compiled, tmp_path, words, more=((), ()), devices="2"):
     """Starts two processes."""
     address = free_address()
     return [
-        cases.start(compiled, str(tmp_path / f"{i}.npz"), *words, "--devices", devices, "--job", address, "2", str(i), *more[i])
+        cases.start(
+            compiled,
+            str(tmp_path / f"{i}.npz"),
+            *words,
+            "--devices",
+            devices,
+            "--job",
+            address,
+            "2",
+            str(i),
+            *more[i],
+        )
         for i in (0, 1)
     ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("devices", "lost"), [("1", 0), ("2", 1)])
-def test_a_killed_process_ends_the_other_and_what_they_had_is_kept(compiled, tmp_path, devices, lost):
-    """Whether it is the one at whose address they meet or another: exit code 3.  One process goes on with what two had."""
+def test_a_killed_process_ends_the_other_and_what_they_had_is_kept(
+    compiled, tmp_path, devices, lost
+):
+    """Whether it is the one at whose address they meet or another: exit code 3.  One process goes
+    on with what two had."""
     path = tmp_path / "sweep.zarr"
     how = [("--slow", "1.0"), ("--slow", "1.0")]
     how[lost] = ("--die-after", "2")
@@ -79,9 +94,16 @@ def test_slurm_says_where_the_processes_meet(tmp_path, compiled):
     one = cases.arrays(cases.from_file(cases.SWEEP))
     last = 2**16 - 2**12  # JAX takes the port from the number of the job
     port = next(last + i for i in range(2**12) if is_free(last + i))
-    common = {"SLURM_JOB_ID": str(port - last), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
+    common = {
+        "SLURM_JOB_ID": str(port - last),
+        "SLURM_STEP_NODELIST": "localhost",
+        "SLURM_NTASKS": "2",
+    }
     words = ("-m", "iblf_jax", "sweep", str(file), "--store", str(path), "--distributed", "--quiet")
-    both = [cases.start_python(compiled, *words, **common, SLURM_PROCID=i, SLURM_LOCALID=i) for i in "01"]
+    both = [
+        cases.start_python(compiled, *words, **common, SLURM_PROCID=i, SLURM_LOCALID=i)
+        for i in "01"
+    ]
     for rank, process in enumerate(both):
         out, errors = process.communicate(timeout=300)
         assert process.returncode == 1, errors  # some runs leave their bounds
@@ -141,13 +163,17 @@ def test_bad_jobs_are_refused(words, message):
 @pytest.mark.parametrize("seconds", [0, -5, 86401, 99999999999, 1.5, True, "10", None])
 @pytest.mark.parametrize("name", ["heartbeat", "start"])
 def test_seconds_that_the_runtime_cannot_take_are_refused(name, seconds):
-    with pytest.raises(ValueError, match=f"{name}: got .*, expected a whole number of seconds from 1 to 86400"):
+    with pytest.raises(
+        ValueError, match=f"{name}: got .*, expected a whole number of seconds from 1 to 86400"
+    ):
         distributed.initialize("localhost:1", 1, 0, **{name: seconds})
 
 
 def test_a_port_in_use_is_refused():
     """JAX's runtime would end process 0 with a segmentation fault."""
-    in_use = pytest.raises(ValueError, match=r"coordinator: .*a port that is free on process 0 \(.*in use")
+    in_use = pytest.raises(
+        ValueError, match=r"coordinator: .*a port that is free on process 0 \(.*in use"
+    )
     with socket.create_server(("", 0)) as taken, in_use:
         distributed.initialize(f"localhost:{taken.getsockname()[1]}", 1, 0)
 
@@ -174,11 +200,25 @@ def test_nobody_at_the_address_is_a_line_and_an_exit_code(compiled):
     process = cases.start_python(compiled, "-c", START, free_address())
     _, errors = process.communicate(timeout=60)
     assert process.returncode == distributed.LOST
-    assert errors.rstrip().splitlines()[-1].startswith("iblf_jax: not all processes of the job came within 1 s")
+    assert (
+        errors.rstrip()
+        .splitlines()[-1]
+        .startswith("iblf_jax: not all processes of the job came within 1 s")
+    )
 
 
 def test_importing_the_package_starts_no_device(compiled):
-    """Else neither `jax.distributed.initialize` nor the number of CPU devices could come after the import."""
-    code = "import jax, iblf_jax as ij; ij.monte_carlo, ij.sweep; jax.config.update('jax_num_cpu_devices', 3); print(len(jax.devices()))"
-    done = subprocess.run([sys.executable, "-c", code], env=cases.environment(compiled), capture_output=True, text=True, timeout=120)
+    """Else neither `jax.distributed.initialize` nor the number of CPU devices could come after the
+    import."""
+    code = (
+        "import jax, iblf_jax as ij; ij.monte_carlo, ij.sweep;"
+        " jax.config.update('jax_num_cpu_devices', 3); print(len(jax.devices()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=cases.environment(compiled),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.stdout.strip() == "3", done.stderr

@@ -1,4 +1,5 @@
-"""`help(Class)` of every component lists its fields, with what the fields themselves declare: shape, unit, sign and default."""
+"""`help(Class)` of every component lists its fields, with what the fields themselves declare:
+shape, unit, sign and default."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ def components() -> dict[str, type]:
     found = {}
     for path in sorted((ROOT / "iblf_jax").rglob("*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and any(ast.unparse(mark) == "component" for mark in node.decorator_list):
+            if isinstance(node, ast.ClassDef) and any(
+                ast.unparse(mark) == "component" for mark in node.decorator_list
+            ):
                 module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
                 found[f"{module}.{node.name}"] = getattr(importlib.import_module(module), node.name)
     return found
@@ -58,20 +61,26 @@ def lacking(cls: type) -> list[str]:
     """What the docstring of a component does not say of its fields, or says of none."""
     said, problems = arguments(cls), []
     fields = dataclasses.fields(cls)
-    problems += [f"{name} is no field" for name in said if name not in {field.name for field in fields}]
+    problems += [
+        f"{name} is no field" for name in said if name not in {field.name for field in fields}
+    ]
     for field in fields:
         text, declared = said.get(field.name, ""), field.metadata
         if not re.search(r"[A-Za-z]{3}", re.sub(r"\[.*?\]|if not given", "", text)):
             problems.append(f"{field.name} is not explained")
         if declared.get("unit") and f"[{declared['unit']}]" not in text:
             problems.append(f"{field.name} lacks its unit [{declared['unit']}]")
-        shape = {"joint": r"\(n,\)", "scalar": r"\(\)", "any": r"\([\w, ]*\)|same shape"}.get(declared.get("shape", ""), "")
+        shape = {"joint": r"\(n,\)", "scalar": r"\(\)", "any": r"\([\w, ]*\)|same shape"}.get(
+            declared.get("shape", ""), ""
+        )
         if not re.search(shape, text):
             problems.append(f"{field.name} lacks its shape")
         if SIGNS.get(declared.get("sign") or "", "") not in text:
             problems.append(f"{field.name} lacks its sign")
         if default_of(field) not in text or ("if not given" in text) != bool(default_of(field)):
-            problems.append(f"{field.name} lacks its default, or has one too many: {default_of(field)!r}")
+            problems.append(
+                f"{field.name} lacks its default, or has one too many: {default_of(field)!r}"
+            )
     return problems
 
 
@@ -81,10 +90,21 @@ def test_help_lists_the_fields_with_shape_unit_sign_and_default(name):
 
 
 def test_the_members_of_every_family_are_among_them():
-    families = (ij.robots, ij.references, ij.bounds, ij.disturbances, ij.barriers, ij.controllers, ij.observers, ij.metrics)
+    families = (
+        ij.robots,
+        ij.references,
+        ij.bounds,
+        ij.disturbances,
+        ij.barriers,
+        ij.controllers,
+        ij.observers,
+        ij.metrics,
+    )
     for family in families:
         assert set(family.MEMBERS.values()) <= set(COMPONENTS.values())
-    assert {ij.Scenario, ij.Initial, ij.bounds.Bounds, ij.robots.Payload, ij.VectorField} <= set(COMPONENTS.values())
+    assert {ij.Scenario, ij.Initial, ij.bounds.Bounds, ij.robots.Payload, ij.VectorField} <= set(
+        COMPONENTS.values()
+    )
 
 
 def test_this_test_can_fail():

@@ -1,4 +1,5 @@
-"""One time loop for all: the executors and shapes of XLA's loop give the same run, and the plan decides between them."""
+"""One time loop for all: the executors and shapes of XLA's loop give the same run, and the plan
+decides between them."""
 
 from __future__ import annotations
 
@@ -28,8 +29,13 @@ DRAWS = {"controller.Kp": jnp.asarray([[60.0, 60.0], [80.0, 50.0], [40.0, 70.0]]
 
 @pytest.fixture(scope="module")
 def short_loop(paper):
-    """Where only the way counts in which a loop is executed: it compiles sooner than the paper's."""
-    return ij.with_parts(paper, controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0), observer=ij.observers.NoObserver())
+    """Where only the way counts in which a loop is executed: it compiles sooner than the
+    paper's."""
+    return ij.with_parts(
+        paper,
+        controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0),
+        observer=ij.observers.NoObserver(),
+    )
 
 
 def inputs_of(scenario, steps=50, dt=1e-3):
@@ -54,22 +60,40 @@ def assert_same(one, other):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "run", [Run(50, "heun", 7), Run(50, "euler", 1), Run(50, "euler")], ids=lambda run: f"{run.method}-{run.record_every}"
+    "run",
+    [Run(50, "heun", 7), Run(50, "euler", 1), Run(50, "euler")],
+    ids=lambda run: f"{run.method}-{run.record_every}",
 )
 def test_every_shape_is_the_same_run(short_loop, run):
-    """Runs together and in turn, as one machine function, in parts and left to XLA; alone and in a batch.
+    """Runs together and in turn, as one machine function, in parts and left to XLA; alone and in a
+    batch.
 
     Where every step is recorded, which XLA's own loop does, one of these shapes is looked at.
     """
     inputs = inputs_of(ij.with_parameters(short_loop, {"initial.dq": [0.3, -0.2]}))
     alone = outcome(inputs, run)
     together = outcome(inputs, run, varied=DRAWS)
-    first = outcome(inputs._replace(scenario=ij.with_parameters(inputs.scenario, {"controller.Kp": DRAWS["controller.Kp"][0]})), run)
+    first = outcome(
+        inputs._replace(
+            scenario=ij.with_parameters(
+                inputs.scenario, {"controller.Kp": DRAWS["controller.Kp"][0]}
+            )
+        ),
+        run,
+    )
     assert_same(jax.tree.map(lambda x: x[0], together), first)
-    shapes = plan.Shape("in turn", "parts", True), plan.Shape("together", "parts", False), plan.Shape("together", "none", True)
+    shapes = (
+        plan.Shape("in turn", "parts", True),
+        plan.Shape("together", "parts", False),
+        plan.Shape("together", "none", True),
+    )
     for shape in shapes[:1] if run.record_every == 1 else shapes:
         assert_same(outcome(inputs, run, shape, DRAWS), together)
-    whole = jax.jit(lambda inputs: execute._scanned(inputs, None, False, lambda batch: run_all(scan, batch, run)))(inputs)
+    whole = jax.jit(
+        lambda inputs: execute._scanned(
+            inputs, None, False, lambda batch: run_all(scan, batch, run)
+        )
+    )(inputs)
     assert_same(jax.tree.map(np.asarray, whole), alone)
     if run.record_every is None:
         assert_same(outcome(inputs, run, executor=checkpointed), alone)
@@ -77,16 +101,33 @@ def test_every_shape_is_the_same_run(short_loop, run):
 
 @pytest.mark.slow
 def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
-    """Kutta's 3/8 rule, whose last stages look back at all slopes before them: written out, as a loop, and as a scalar program."""
+    """Kutta's 3/8 rule, whose last stages look back at all slopes before them: written out, as a
+    loop, and as a scalar program."""
     rows = ((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0))
-    kutta = Tableau((0.0, 1 / 3, 2 / 3, 1.0), rows, (1 / 8, 3 / 8, 3 / 8, 1 / 8), 4, 2.785, (1.0, -3.0, 3.0, -1.0))
+    kutta = Tableau(
+        (0.0, 1 / 3, 2 / 3, 1.0),
+        rows,
+        (1 / 8, 3 / 8, 3 / 8, 1 / 8),
+        4,
+        2.785,
+        (1.0, -3.0, 3.0, -1.0),
+    )
     monkeypatch.setitem(TABLEAUS, "kutta", kutta)
     inputs, run = inputs_of(short_loop), Run(50, "kutta", 10)
-    written_out, rolled = (outcome(inputs, run, plan.Shape("together", "none", loop)) for loop in (False, True))
-    lowered = outcome(inputs, run, varied={"initial.q": inputs.scenario.initial.q[None]}, executor=execute.executor_named("xla"))
+    written_out, rolled = (
+        outcome(inputs, run, plan.Shape("together", "none", loop)) for loop in (False, True)
+    )
+    lowered = outcome(
+        inputs,
+        run,
+        varied={"initial.q": inputs.scenario.initial.q[None]},
+        executor=execute.executor_named("xla"),
+    )
     assert_same(written_out, rolled)
     assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
-    off = np.max(np.abs(written_out.records[0]["q"] - outcome(inputs, Run(50, "rk4", 10)).records[0]["q"]))
+    off = np.max(
+        np.abs(written_out.records[0]["q"] - outcome(inputs, Run(50, "rk4", 10)).records[0]["q"])
+    )
     assert 0 < off < 1e-6
 
 
@@ -95,7 +136,9 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
     """The step from the last instant, which is not made, says nothing."""
     fast = inputs_of(ij.with_parameters(paper, {"controller.K2": 1e4}), steps=1)
     assert not outcome(fast, Run(1, "euler")).status & Status.NOT_FINITE
-    assert outcome(fast._replace(steps=jnp.asarray(40.0)), Run(40, "euler")).status & Status.NOT_FINITE
+    assert (
+        outcome(fast._replace(steps=jnp.asarray(40.0)), Run(40, "euler")).status & Status.NOT_FINITE
+    )
 
 
 @pytest.mark.slow
@@ -107,7 +150,12 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
     try:
 
         def ise(K2):
-            return ij.simulate(ij.with_parameters(paper, {"controller.K2": K2}), duration=0.011, dt=1e-3, backend="xla").metrics.ise.sum()
+            return ij.simulate(
+                ij.with_parameters(paper, {"controller.K2": K2}),
+                duration=0.011,
+                dt=1e-3,
+                backend="xla",
+            ).metrics.ise.sum()
 
         compact = ij.simulate(paper, duration=0.011, dt=1e-3)
         K2 = jnp.array([20.0, 30.0])
@@ -119,7 +167,9 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
     step = 1e-3
     for i in range(2):
         move = step * np.eye(2)[i]
-        assert float(slope[i]) == pytest.approx(float(ise(K2 + move) - ise(K2 - move)) / (2 * step), rel=1e-5)
+        assert float(slope[i]) == pytest.approx(
+            float(ise(K2 + move) - ise(K2 - move)) / (2 * step), rel=1e-5
+        )
     assert float(values[0]) == pytest.approx(float(before.metrics.ise.sum()), rel=1e-9)
 
 
@@ -140,13 +190,18 @@ def test_stretches_are_whole_records(steps, every):
 
 
 def test_what_the_plan_says():
-    """A short loop alone is one machine function, a long one goes in parts and in turn, and a caller's own batch is XLA's."""
+    """A short loop alone is one machine function, a long one goes in parts and in turn, and a
+    caller's own batch is XLA's."""
     assert plan.scan_shape("cpu", 700, None, False) == ("together", "whole", True)
     assert plan.scan_shape("cpu", 700, 1000, False) == ("together", "none", False)
     assert plan.scan_shape("cpu", 10_000, 1000, False) == ("in turn", "parts", True)
     assert plan.scan_shape("cpu", 700, None, True) == ("together", "none", False)
     assert plan.scan_shape("gpu", 10_000, None, False) == ("together", "none", True)
-    assert plan.executors_for("auto", "cpu") == plan.executors_for("native", "cpu") == ("native", "xla")
+    assert (
+        plan.executors_for("auto", "cpu")
+        == plan.executors_for("native", "cpu")
+        == ("native", "xla")
+    )
     assert plan.executors_for("auto", "gpu") == ("gpu", "xla")
     assert plan.executors_for("auto", "tpu") == plan.executors_for("xla", "cpu") == ("xla",)
     assert plan.executors_for("vmap", "cpu") == ()
@@ -161,7 +216,8 @@ def test_the_length_of_a_function_is_that_of_its_inner_ones():
 
 @pytest.mark.parametrize("size", [40, 63, 64, 72])
 def test_large_sums_are_left_to_loops_of_xla(size):
-    """The map of a sampled loop of six joints has 72 rows: XLA refuses to search as many numbers within a machine function."""
+    """The map of a sampled loop of six joints has 72 rows: XLA refuses to search as many numbers
+    within a machine function."""
     A = np.random.default_rng(size).standard_normal((size, size))
     found = jax.jit(machine_function.machine_function(stability.spectral_radius))(A)
     assert float(found) == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), rel=1e-3)
@@ -191,11 +247,16 @@ print(before, most, low.released, float(value))
 
 
 @pytest.mark.skipif(programs.most_maps() is None, reason="this system has no limit of memory maps")
-@pytest.mark.parametrize(("structures", "room"), [(9, 20), pytest.param(52, 100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("structures", "room"), [(9, 20), pytest.param(52, 100, marks=pytest.mark.slow)]
+)
 def test_programs_are_released_before_the_memory_maps_run_out(structures, room):
-    """Each compiled program takes some, and Linux gives a process 65,530: a process with a few dozen arms ended in a segmentation fault."""
+    """Each compiled program takes some, and Linux gives a process 65,530: a process with a few
+    dozen arms ended in a segmentation fault."""
     code = MANY_STRUCTURES.replace("STRUCTURES", str(structures)).replace("ROOM", str(room))
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=200).stdout
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=200
+    ).stdout
     limit, bound, before, most, released, value = map(float, found.split())
     assert limit == programs.most_maps()
     assert bound < 0.7 * limit

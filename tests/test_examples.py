@@ -1,4 +1,5 @@
-"""The files in examples/ do what they say, through the command line, and what the documentation names is there."""
+"""The files in examples/ do what they say, through the command line, and what the documentation
+names is there."""
 
 from __future__ import annotations
 
@@ -27,7 +28,10 @@ COMMANDS = {
 def test_every_example_is_run_and_names_its_command():
     assert {path.name for path in EXAMPLES.glob("*.toml")} == set(COMMANDS)
     for name, (command, *_) in COMMANDS.items():
-        assert f"python -m iblf_jax {command} examples/{name}" in (EXAMPLES / name).read_text(encoding="utf-8").split("\n", 2)[0] + "\n"
+        assert (
+            f"python -m iblf_jax {command} examples/{name}"
+            in (EXAMPLES / name).read_text(encoding="utf-8").split("\n", 2)[0] + "\n"
+        )
 
 
 @pytest.mark.slow
@@ -41,7 +45,12 @@ def test_examples_run(name, tmp_path, monkeypatch, capsys):
     command, *options = COMMANDS[name]
     assert cli.main([command, str(EXAMPLES / name), *options]) == 0, capsys.readouterr().err
     said = capsys.readouterr().out
-    words = {"arm.toml": "status: ok", "study.toml": "512 runs", "sweep.toml": "768 runs", "tune.toml": "peak torque < 14 N m"}
+    words = {
+        "arm.toml": "status: ok",
+        "study.toml": "512 runs",
+        "sweep.toml": "768 runs",
+        "tune.toml": "peak torque < 14 N m",
+    }
     assert (words | {"identify.toml": "6 of 6 numbers told"})[name] in said
 
 
@@ -65,4 +74,6 @@ def test_files_that_the_documentation_names_are_there():
     named = {name for text in texts for name in re.findall(r"examples/[\w.]+\w", text)}
     assert {f"examples/{name}" for name in (*COMMANDS, "arm.urdf")} - named <= {"examples/arm.toml"}
     assert all((ROOT / name).exists() for name in named)
-    assert not [text for text in texts if re.search(r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\[", text)]
+    assert not [
+        text for text in texts if re.search(r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\[", text)
+    ]

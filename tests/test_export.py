@@ -1,4 +1,5 @@
-"""Laws and closed loops out of Python: the C of every law and observer against JAX, FMUs against FMPy, modules against wasmtime."""
+"""Laws and closed loops out of Python: the C of every law and observer against JAX, FMUs against
+FMPy, modules against wasmtime."""
 
 from __future__ import annotations
 
@@ -61,11 +62,14 @@ def base():
     return scenario
 
 
-CASES = [(law, "momentum") for law in members.LAWS] + [("backstepping", observer) for observer in members.OBSERVERS]
+CASES = [(law, "momentum") for law in members.LAWS] + [
+    ("backstepping", observer) for observer in members.OBSERVERS
+]
 
 
 def against_jax(folder, scenario, *, told_reference=False, dtype="float64"):
-    """Writes a law with its answers to a random walk as vectors, and runs its self-test under the sanitizers."""
+    """Writes a law with its answers to a random walk as vectors, and runs its self-test under the
+    sanitizers."""
     scenario = canonical(ij.astype(scenario, dtype))
     asked, tube = walk(scenario, dtype)
     if told_reference:
@@ -83,7 +87,15 @@ def against_jax(folder, scenario, *, told_reference=False, dtype="float64"):
     rows = [np.asarray(x) for x in asked[1:] if not isinstance(x, tuple)]
     vectors = Vectors(tuple(x[0] for x in rows), rows[0], rows[1], tuple(rows[2:]), tau)
     joints = getattr(scenario.model, "joints", ())
-    law = Law(scenario, control_law(scenario, told_reference), "iblf_law", told_reference, vectors, joints, None)
+    law = Law(
+        scenario,
+        control_law(scenario, told_reference),
+        "iblf_law",
+        told_reference,
+        vectors,
+        joints,
+        None,
+    )
     made = written(law)
     folder.mkdir(exist_ok=True)
     for name, text in made.files.items():
@@ -94,7 +106,10 @@ def against_jax(folder, scenario, *, told_reference=False, dtype="float64"):
 
 @pytest.mark.parametrize(("law", "observer"), CASES)
 def test_every_law_and_observer_gives_in_c_what_it_gives_in_jax(base, tmp_path, law, observer):
-    against_jax(tmp_path, ij.with_parts(base, controller=members.LAWS[law], observer=members.OBSERVERS[observer]))
+    against_jax(
+        tmp_path,
+        ij.with_parts(base, controller=members.LAWS[law], observer=members.OBSERVERS[observer]),
+    )
 
 
 @pytest.mark.parametrize("velocity", members.VELOCITIES)
@@ -110,11 +125,17 @@ def test_velocities_follow_by_the_filter_of_the_scenario(base, tmp_path, velocit
 
 @pytest.mark.parametrize("step", ["euler", "poles"])
 def test_floats_and_every_step_of_an_observer(base, tmp_path, step):
-    lab = ij.with_parts(base, sampling=ij.Sampling(1e-3, observer=step), observer=members.OBSERVERS["momentum"])
+    lab = ij.with_parts(
+        base, sampling=ij.Sampling(1e-3, observer=step), observer=members.OBSERVERS["momentum"]
+    )
     against_jax(tmp_path, lab, dtype="float32")
 
 
-HOSTILE = ("*/ int main(void) { return 7; } /* ???/", 'a\\\n#error no "); system(1); //', "??/\n\u00e9\u2028 $name ${joints} %s")
+HOSTILE = (
+    "*/ int main(void) { return 7; } /* ???/",
+    'a\\\n#error no "); system(1); //',
+    "??/\n\u00e9\u2028 $name ${joints} %s",
+)
 
 
 def test_names_from_files_stay_in_comments(tmp_path):
@@ -161,7 +182,16 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
 
         def command(self, t, q, dq, f_hat, setting, state):
             no = jnp.zeros(q.shape, bool)
-            return ij.controllers.Command(self.gain * jnp.abs((9.0 * q).astype(jnp.int32)).astype(q.dtype), dq, 0 * q, no, no), ()
+            return (
+                ij.controllers.Command(
+                    self.gain * jnp.abs((9.0 * q).astype(jnp.int32)).astype(q.dtype),
+                    dq,
+                    0 * q,
+                    no,
+                    no,
+                ),
+                (),
+            )
 
     with pytest.raises(ValueError, match="no fixed length"):
         ij.export(ij.with_parts(base, controller=Endless(1.0)), tmp_path)
@@ -202,7 +232,12 @@ def test_a_users_law_goes_out_without_a_name_in_files(base, tmp_path):
         def command(self, t, q, dq, f_hat, setting, state):
             tube = setting.tube(t)
             no = jnp.zeros(q.shape, bool)
-            return ij.controllers.Command(setting.model.gravity(q) + self.gain * (tube.q_d - q) - dq, dq, 0 * q, no, no), ()
+            return (
+                ij.controllers.Command(
+                    setting.model.gravity(q) + self.gain * (tube.q_d - q) - dq, dq, 0 * q, no, no
+                ),
+                (),
+            )
 
     made = against_jax(tmp_path, ij.with_parts(base, controller=Proportional([30.0, 20.0])))
     assert "scenario.toml" not in made.files and "scenario.toml" not in made.files["README.md"]
@@ -228,7 +263,9 @@ def test_memories_may_hold_whole_numbers_and_flags(base, tmp_path):
         def advance(self, t, q, dq, tau, model, state, period):
             return state[0] + self.kf * period * tau, state[1] + 1, state[1] > 1
 
-    against_jax(tmp_path, ij.with_parts(base, observer=Counting(0.1), controller=members.LAWS["pd_gravity"]))
+    against_jax(
+        tmp_path, ij.with_parts(base, observer=Counting(0.1), controller=members.LAWS["pd_gravity"])
+    )
 
 
 MAIN = """
@@ -258,22 +295,48 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
     folder = tmp_path / "moved"
     assert sorted(x.name for x in folder.iterdir()) == sorted(made.files)
     assert "ok: torque within" in built_and_run(folder, "-O2", name="arm_law")
-    assert "ok: torque within" in built_and_run(folder, "-O2", name="arm_law", compiler=(sys.executable, "-m", "ziglang", "cc"))
+    assert "ok: torque within" in built_and_run(
+        folder, "-O2", name="arm_law", compiler=(sys.executable, "-m", "ziglang", "cc")
+    )
     if shutil.which("cmake"):
-        for command in (["cmake", "-B", "build"], ["cmake", "--build", "build"], ["build/selftest"]):
+        for command in (
+            ["cmake", "-B", "build"],
+            ["cmake", "--build", "build"],
+            ["build/selftest"],
+        ):
             subprocess.run(command, cwd=folder, check=True, capture_output=True)
 
-    subprocess.run(["gcc", "-std=c99", "-O0", "-fstack-usage", "-c", "arm_law.c"], cwd=folder, check=True)
-    frames = {row.split()[0].split(":")[-1]: int(row.split()[1]) for row in (folder / "arm_law.su").read_text().splitlines()}
-    assert frames["arm_law_step"] + frames["arm_law_sample"] < made.sizes["stack, without optimisation"] < 2 * sum(frames.values())
+    subprocess.run(
+        ["gcc", "-std=c99", "-O0", "-fstack-usage", "-c", "arm_law.c"], cwd=folder, check=True
+    )
+    frames = {
+        row.split()[0].split(":")[-1]: int(row.split()[1])
+        for row in (folder / "arm_law.su").read_text().splitlines()
+    }
+    assert (
+        frames["arm_law_step"] + frames["arm_law_sample"]
+        < made.sizes["stack, without optimisation"]
+        < 2 * sum(frames.values())
+    )
 
     (folder / "main.c").write_text(MAIN)
-    subprocess.run(["gcc", "-std=c99", "-O1", "arm_law.c", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
-    *tau, status = map(float, subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True).stdout.split())
+    subprocess.run(
+        ["gcc", "-std=c99", "-O1", "arm_law.c", "main.c", "-lm", "-o", "main"],
+        cwd=folder,
+        check=True,
+    )
+    *tau, status = map(
+        float,
+        subprocess.run(
+            ["./main"], cwd=folder, check=True, capture_output=True, text=True
+        ).stdout.split(),
+    )
     assert int(status) & 2, "the second bound was put below the position"
 
     lab = canonical(ij.load_scenario(folder / "scenario.toml"))
-    lab = ij.with_parameters(lab, {"controller.K2[0]": 33.0, "model.mass[1]": 1.5, "bounds.upper.offset[0]": 0.6})
+    lab = ij.with_parameters(
+        lab, {"controller.K2[0]": 33.0, "model.mass[1]": 1.5, "bounds.upper.offset[0]": 0.6}
+    )
     told = Told(jnp.zeros(()), jnp.asarray([0.75, 0.7]), jnp.asarray([0.1, -0.2]))
     memory = start(lab, told)[0]
     for k in range(3):
@@ -288,14 +351,18 @@ def test_a_law_that_does_not_hold_is_told(tmp_path):
 
 LAB = {
     "sampling": lambda: ij.Sampling(2e-3, delay=5e-4),
-    "sensor": lambda: ij.sensors.Encoder(ij.sensors.FilteredDifference(300.0), counts=8192, noise=1e-4),
+    "sensor": lambda: ij.sensors.Encoder(
+        ij.sensors.FilteredDifference(300.0), counts=8192, noise=1e-4
+    ),
     "actuator": lambda: ij.actuators.Motor(bandwidth=300.0, limit=60.0),
 }
 
 
 @pytest.fixture(scope="module")
 def lab():
-    gains = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
+    gains = ij.with_parameters(
+        ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0}
+    )
     return ij.with_parts(gains, **{name: make() for name, make in LAB.items()})
 
 
@@ -305,11 +372,25 @@ def test_a_closed_loop_as_an_fmu_is_simulate(lab, tmp_path):
     assert validate_fmu(file) == []
     run = ij.simulate(lab, duration=1.0, dt=1e-3, seed=4, record_every=10)
     names = {"q": run.q, "tau": run.tau, "f_hat": run.disturbance_estimate, "lower": run.lower}
-    found = fmpy.simulate_fmu(file, stop_time=1.0, step_size=1e-3, output_interval=1e-2, output=[*names, "status"])
+    found = fmpy.simulate_fmu(
+        file, stop_time=1.0, step_size=1e-3, output_interval=1e-2, output=[*names, "status"]
+    )
     for name, expected in names.items():
         np.testing.assert_allclose(found[name], expected, atol=1e-10, err_msg=name)
-    changed = fmpy.simulate_fmu(file, stop_time=1.0, output_interval=1e-2, output=["q"], start_values={"controller.K2": [5.0, 4.0]})
-    other = ij.simulate(ij.with_parameters(lab, {"controller.K2": [5.0, 4.0]}), duration=1.0, dt=1e-3, seed=4, record_every=10)
+    changed = fmpy.simulate_fmu(
+        file,
+        stop_time=1.0,
+        output_interval=1e-2,
+        output=["q"],
+        start_values={"controller.K2": [5.0, 4.0]},
+    )
+    other = ij.simulate(
+        ij.with_parameters(lab, {"controller.K2": [5.0, 4.0]}),
+        duration=1.0,
+        dt=1e-3,
+        seed=4,
+        record_every=10,
+    )
     np.testing.assert_allclose(changed["q"], other.q, atol=1e-10)
     with pytest.raises(Exception, match=r"fmi3DoStep|error"):
         fmpy.simulate_fmu(file, stop_time=0.01, step_size=1e-3, output_interval=1.5e-3)
@@ -319,7 +400,13 @@ def test_a_sampled_loop_without_noise_as_an_fmu_is_simulate(tmp_path):
     lab = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
     ij.export(lab, tmp_path, target="fmu-loop")
     run = ij.simulate(lab, duration=0.2, dt=1e-3, record_every=10)
-    found = fmpy.simulate_fmu(str(tmp_path / "iblf_loop.fmu"), stop_time=0.2, step_size=1e-3, output_interval=1e-2, output=["q", "tau"])
+    found = fmpy.simulate_fmu(
+        str(tmp_path / "iblf_loop.fmu"),
+        stop_time=0.2,
+        step_size=1e-3,
+        output_interval=1e-2,
+        output=["q", "tau"],
+    )
     for name in ("q", "tau"):
         np.testing.assert_allclose(found[name], getattr(run, name), atol=1e-10, err_msg=name)
 
@@ -334,12 +421,23 @@ def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     run = ij.simulate(lab, duration=0.5, dt=2e-3)
     told = np.zeros(run.t.size, [("time", float), ("q", float, (2,)), ("dq", float, (2,))])
     told["time"], told["q"], told["dq"] = run.t, run.measured.q, run.measured.dq
-    found = fmpy.simulate_fmu(file, stop_time=0.5, step_size=2e-3, output_interval=2e-3, output=["tau", "f_hat"], input=told)
+    found = fmpy.simulate_fmu(
+        file,
+        stop_time=0.5,
+        step_size=2e-3,
+        output_interval=2e-3,
+        output=["tau", "f_hat"],
+        input=told,
+    )
     np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
 
     about = fmpy.read_model_description(file)
     places = {v.name: [v.valueReference] for v in about.modelVariables}
-    fmu = FMU3Slave(guid=about.guid, unzipDirectory=fmpy.extract(file, str(tmp_path / "unzipped")), modelIdentifier="iblf_law")
+    fmu = FMU3Slave(
+        guid=about.guid,
+        unzipDirectory=fmpy.extract(file, str(tmp_path / "unzipped")),
+        modelIdentifier="iblf_law",
+    )
     fmu.instantiate()
     fmu.enterInitializationMode()
     fmu.setFloat64(places["q"], [0.7, 0.75])
@@ -348,10 +446,14 @@ def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     fmu.exitInitializationMode()
     fmu.setFloat64(places["q"], [np.nan, 0.75])
     fmu.doStep(0.0, 2e-3)
-    assert fmu.getFloat64(places["tau"], nValues=2) == still and fmu.getFloat64(places["status"]) == [1.0]
+    assert fmu.getFloat64(places["tau"], nValues=2) == still and fmu.getFloat64(
+        places["status"]
+    ) == [1.0]
     fmu.setFloat64(places["q"], [0.7, 0.75])
     fmu.doStep(2e-3, 2e-3)
-    assert fmu.getFloat64(places["tau"], nValues=2) != still and fmu.getFloat64(places["status"]) == [0.0]
+    assert fmu.getFloat64(places["tau"], nValues=2) != still and fmu.getFloat64(
+        places["status"]
+    ) == [0.0]
     fmu.freeInstance()
 
 
@@ -374,8 +476,12 @@ def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
         loop["start"](store)
         rows = loop["run"](store, 1001, 10)
         place = loop["records"](store)
-        numbers = np.frombuffer(loop["memory"].read(store, place, place + 8 * rows * table["record"]), float).reshape(rows, -1)
-        return {x["name"]: numbers[:, x["offset"] : x["offset"] + x["size"]] for x in table["records"]}
+        numbers = np.frombuffer(
+            loop["memory"].read(store, place, place + 8 * rows * table["record"]), float
+        ).reshape(rows, -1)
+        return {
+            x["name"]: numbers[:, x["offset"] : x["offset"] + x["size"]] for x in table["records"]
+        }
 
     expected = ij.simulate(lab, duration=1.0, dt=1e-3, seed=4, record_every=10)
     found = run()
@@ -388,14 +494,36 @@ def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
 
     k1 = next(x for x in table["parameters"] if x["path"] == "controller.k1")
     put(loop["parameters"](store) + 8 * k1["offset"], [3.0, 1.5])
-    slower = ij.simulate(ij.with_parameters(lab, {"controller.k1": [3.0, 1.5]}), duration=1.0, dt=1e-3, seed=4, record_every=10)
+    slower = ij.simulate(
+        ij.with_parameters(lab, {"controller.k1": [3.0, 1.5]}),
+        duration=1.0,
+        dt=1e-3,
+        seed=4,
+        record_every=10,
+    )
     np.testing.assert_allclose(run()["q"], slower.q, atol=1e-10)
 
 
 def test_the_command_line_exports(tmp_path, capsys):
     from iblf_jax.cli import main
 
-    assert main(["export", "zhang_yan_2024", "--out", str(tmp_path), "--period", "0.002", "--dtype", "float", "--reference", "told"]) == 0
+    assert (
+        main(
+            [
+                "export",
+                "zhang_yan_2024",
+                "--out",
+                str(tmp_path),
+                "--period",
+                "0.002",
+                "--dtype",
+                "float",
+                "--reference",
+                "told",
+            ]
+        )
+        == 0
+    )
     assert re.search(r"stack, without optimisation: \d+ bytes", capsys.readouterr().out)
     assert "ok: torque within" in built_and_run(tmp_path, "-O2")
     assert main(["export", "zhang_yan_2024", "--out", str(tmp_path), "--target", "exe"]) == 2
@@ -420,7 +548,9 @@ def test_a_law_that_yields_no_numbers_is_refused(tmp_path, monkeypatch, path, si
     """Its self-test would hold `nan`, which no compiler of C takes."""
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
     scenario = ij.with_parameters(ij.presets.zhang_yan_2024(), {path: size})
-    expected = rf"{path}: got .*e\+3.*finite numbers\. With it the torque tau\[.\] is (nan|-?inf) at t = "
+    expected = (
+        rf"{path}: got .*e\+3.*finite numbers\. With it the torque tau\[.\] is (nan|-?inf) at t = "
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match=expected):
@@ -442,7 +572,10 @@ def test_a_parameter_of_ordinary_size_is_not_blamed(tmp_path, monkeypatch):
     law = ij.presets.zhang_yan_2024().controller
     broken = ij.component(Broken)(law.k1, law.K2, law.o)
     scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=broken)
-    with pytest.raises(ValueError, match=r"scenario: got .*yields no numbers: the torque tau\[0\] is -?inf at t = 0\.006 s"):
+    with pytest.raises(
+        ValueError,
+        match=r"scenario: got .*yields no numbers: the torque tau\[0\] is -?inf at t = 0\.006 s",
+    ):
         ij.export(scenario, tmp_path, period=2e-3)
 
 

@@ -1,4 +1,5 @@
-"""The law that keeps positions and velocities: its formulas beside independent ones, its inequality, its certificate."""
+"""The law that keeps positions and velocities: its formulas beside independent ones, its
+inequality, its certificate."""
 
 import dataclasses
 
@@ -32,14 +33,25 @@ class FullLoop(Loop):
     """A constant torque that the law does not know."""
 
     def full(self, t, x, above=None):
-        """The rate of (q, q', eta), the torque, V1 + phi of each joint (for integral barriers), and e2.
+        """The rate of (q, q', eta), the torque, V1 + phi of each joint (for integral barriers), and
+        e2.
 
-        `above`: on which side of e2 = 0 the torque is evaluated, joint by joint; the state's own if not given.
+        `above`: on which side of e2 = 0 the torque is evaluated, joint by joint; the state's own if
+          not given.
         """
         q, v, eta = x[:2], x[2:4], x[4:]
         M, C, G, dM = self.arm(q)
-        (xd, dxd, ddxd), (lo, dlo, ddlo), (up, dup, ddup) = (sine(*s)(t) for s in (self.reference, self.lower, self.upper))
-        kl, dkl, ddkl, ku, dku, ddku = xd - lo, dxd - dlo, ddxd - ddlo, up - xd, dup - dxd, ddup - ddxd
+        (xd, dxd, ddxd), (lo, dlo, ddlo), (up, dup, ddup) = (
+            sine(*s)(t) for s in (self.reference, self.lower, self.upper)
+        )
+        kl, dkl, ddkl, ku, dku, ddku = (
+            xd - lo,
+            dxd - dlo,
+            ddxd - ddlo,
+            up - xd,
+            dup - dxd,
+            ddup - ddxd,
+        )
         e1, ru, rl = q - xd, dku / ku, dkl / kl
         kappa = np.sqrt(ru**2 + rl**2 + self.o)
         dkappa = (ru * (ddku / ku - ru**2) + rl * (ddkl / kl - rl**2)) / kappa
@@ -50,35 +62,64 @@ class FullLoop(Loop):
         (vl, dvl, _), (vu, dvu, _) = sine(*self.slowest)(t), sine(*self.fastest)(t)
         Ku, Kl = vu - alpha, alpha - vl
         K = np.where(e2 > 0 if above is None else above, Ku, Kl)
-        s2, kappa2 = self.factor * e2 / (K**2 - e2**2), np.sqrt(((dvu - dalpha) / Ku) ** 2 + ((dalpha - dvl) / Kl) ** 2 + self.o)
+        s2, kappa2 = (
+            self.factor * e2 / (K**2 - e2**2),
+            np.sqrt(((dvu - dalpha) / Ku) ** 2 + ((dalpha - dvl) / Kl) ** 2 + self.o),
+        )
         w = -(self.K2 + kappa2) * e2 - s1 * (K**2 - e2**2) / self.factor - self.c * s2
         f_hat = eta + self.kf * (M @ v)
         tau = C(v) @ v + G + M @ (dalpha + w) - f_hat
         f = M @ sine(*self.force_a)(t)[0] + C(v) @ sine(*self.force_b)(t)[0] + self.push
         ddq = np.linalg.solve(M, tau + f - C(v) @ v - G)
         deta = -self.kf * (f_hat + tau - C(v) @ v - G + dM * v[1] @ v)
-        return np.concatenate([v, ddq, deta]), tau, -np.log(1 - (e1 / k) ** 2) - np.log(1 - (e2 / K) ** 2), e2
+        return (
+            np.concatenate([v, ddq, deta]),
+            tau,
+            -np.log(1 - (e1 / k) ** 2) - np.log(1 - (e2 / K) ** 2),
+            e2,
+        )
 
     @classmethod
     def random(cls, rng, **given):
         """Gains and bounds at random, around the paper's."""
-        gains = {name: rng.uniform(low, high, 2) for name, low, high in (("k1", 1, 3), ("K2", 8, 25), ("c", 0.3, 2), ("o", 0.05, 0.3))}
-        slowest = (-rng.uniform(1.5, 2.0, 2), rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 2.0), rng.uniform(0, 6, 2))
+        gains = {
+            name: rng.uniform(low, high, 2)
+            for name, low, high in (("k1", 1, 3), ("K2", 8, 25), ("c", 0.3, 2), ("o", 0.05, 0.3))
+        }
+        slowest = (
+            -rng.uniform(1.5, 2.0, 2),
+            rng.uniform(-0.1, 0.1, 2),
+            rng.uniform(0.5, 2.0),
+            rng.uniform(0, 6, 2),
+        )
         fastest = (rng.uniform(0.9, 1.5, 2), rng.uniform(-0.1, 0.1, 2), 1.0, rng.uniform(0, 6, 2))
         lower = (rng.uniform(0.1, 0.2, 2), 0.14, 1.0, (H, 0.0))
-        return cls(**gains, kf=rng.uniform(10, 25, 2), slowest=slowest, fastest=fastest, lower=lower, **given)
+        return cls(
+            **gains,
+            kf=rng.uniform(10, 25, 2),
+            slowest=slowest,
+            fastest=fastest,
+            lower=lower,
+            **given,
+        )
 
     @property
     def scenario(self):
         """The same in the package."""
         barrier = barriers.Integral() if self.factor == 2.0 else barriers.Log()
-        law = controllers.FullState(k1=self.k1, K2=self.K2, c=self.c, o=self.o, barrier=barrier, velocity_barrier=barrier)
+        law = controllers.FullState(
+            k1=self.k1, K2=self.K2, c=self.c, o=self.o, barrier=barrier, velocity_barrier=barrier
+        )
         return dataclasses.replace(
             ij.presets.zhang_yan_2024(reading="corrected"),
             controller=law,
             observer=ij.observers.Momentum(kf=self.kf),
-            bounds=bounds.Bounds(lower=bounds.Sinusoid(*self.lower), upper=bounds.Sinusoid(*self.upper)),
-            velocity_bounds=bounds.Bounds(lower=bounds.Sinusoid(*self.slowest), upper=bounds.Sinusoid(*self.fastest)),
+            bounds=bounds.Bounds(
+                lower=bounds.Sinusoid(*self.lower), upper=bounds.Sinusoid(*self.upper)
+            ),
+            velocity_bounds=bounds.Bounds(
+                lower=bounds.Sinusoid(*self.slowest), upper=bounds.Sinusoid(*self.fastest)
+            ),
             initial=ij.Initial(self.q0, self.dq0),
         )
 
@@ -92,9 +133,15 @@ def random_states(scenario, count=64, seed=0):
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
         inner = law.tubes(t, q, jnp.zeros(2), setting)[1]  # alpha and K do not depend on q'
         dq = inner.q_d + xi2 * jnp.where(xi2 > 0, inner.k_u, inner.k_l)
-        return initial_state(scenario)._replace(q=q, dq=dq, observer=eta), jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+        return initial_state(scenario)._replace(q=q, dq=dq, observer=eta), jnp.minimum(
+            inner.q_d - inner.lower, inner.upper - inner.q_d
+        )
 
-    t, xi, xi2 = rng.uniform(0, 10, count), rng.uniform(-0.95, 0.95, (count, 2)), rng.uniform(-0.95, 0.95, (count, 2))
+    t, xi, xi2 = (
+        rng.uniform(0, 10, count),
+        rng.uniform(-0.95, 0.95, (count, 2)),
+        rng.uniform(-0.95, 0.95, (count, 2)),
+    )
     states, room = jax.vmap(state)(t, xi, xi2, rng.normal(size=(count, 2)))
     keep = np.min(room, axis=1) > 0.05
     return jnp.asarray(t[keep]), jax.tree.map(lambda x: x[keep], states)
@@ -108,22 +155,47 @@ def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng
 
         def torque(t, state, scenario=scenario):
             f_hat = scenario.observer.estimate(t, state.q, state.dq, scenario.model, state.observer)
-            command = scenario.controller.command(t, state.q, state.dq, f_hat, scenario.setting, ())[0]
+            command = scenario.controller.command(
+                t, state.q, state.dq, f_hat, scenario.setting, ()
+            )[0]
             return command.tau, command.V1
 
         tau, V1 = jax.jit(jax.vmap(torque))(t, states)
-        others = [loop.full(*x) for x in zip(np.asarray(t), np.hstack([states.q, states.dq, states.observer]), strict=True)]
+        others = [
+            loop.full(*x)
+            for x in zip(
+                np.asarray(t), np.hstack([states.q, states.dq, states.observer]), strict=True
+            )
+        ]
         np.testing.assert_allclose(tau, [x[1] for x in others], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(V1, [x[2] for x in others], rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_the_run_is_that_of_an_independent_program():
-    # From here e2 keeps its sign for a second: where it changes, the torque jumps, and steps of a fixed size are of the first order.
+    # From here e2 keeps its sign for a second: where it changes, the torque jumps, and steps of a
+    # fixed size are of the first order.
     loop = FullLoop(q0=(0.7, 0.7), dq0=(-0.8, -0.5))
-    t, start = np.linspace(0.0, 1.0, 101), [*loop.q0, *loop.dq0, *(-loop.kf * (loop.arm(loop.q0)[0] @ loop.dq0))]
-    found = solve_ivp(lambda t, x: loop.full(t, x)[0], (0.0, 1.0), start, "DOP853", t_eval=t, rtol=1e-10, atol=1e-12)
-    scenario = ij.with_parts(loop.scenario, observer=ij.observers.Momentum(kf=loop.kf, start="matched"))
+    t, start = (
+        np.linspace(0.0, 1.0, 101),
+        [
+            *loop.q0,
+            *loop.dq0,
+            *(-loop.kf * (loop.arm(loop.q0)[0] @ loop.dq0)),
+        ],
+    )
+    found = solve_ivp(
+        lambda t, x: loop.full(t, x)[0],
+        (0.0, 1.0),
+        start,
+        "DOP853",
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    scenario = ij.with_parts(
+        loop.scenario, observer=ij.observers.Momentum(kf=loop.kf, start="matched")
+    )
     run = ij.simulate(scenario, duration=1.0, dt=2.5e-4, record_every=40)
     assert np.all(run.e2 < 0)
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-9)
@@ -136,7 +208,13 @@ FAMILY = {name: cls() for name, cls in barriers.MEMBERS.items()}
 @pytest.mark.parametrize("first", ["integral", "tan"])
 def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
     """(F.2), with the exact rates of the whole loop."""
-    law = controllers.FullState(k1=[2.0, 1.5], K2=[20.0, 12.0], c=[1.0, 0.3], barrier=FAMILY[first], velocity_barrier=FAMILY[second])
+    law = controllers.FullState(
+        k1=[2.0, 1.5],
+        K2=[20.0, 12.0],
+        c=[1.0, 0.3],
+        barrier=FAMILY[first],
+        velocity_barrier=FAMILY[second],
+    )
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
@@ -150,7 +228,12 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
 def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, second):
     """(F.2) with V1 = sum w_i V1_i."""
     law = controllers.FullState(
-        k1=[2.0, 1.5], K2=[20.0, 12.0], c=[1.0, 0.3], barrier=FAMILY[first], velocity_barrier=FAMILY[second], weight=[0.2, 6.0]
+        k1=[2.0, 1.5],
+        K2=[20.0, 12.0],
+        c=[1.0, 0.3],
+        barrier=FAMILY[first],
+        velocity_barrier=FAMILY[second],
+        weight=[0.2, 6.0],
     )
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
     t, states = random_states(scenario)
@@ -158,7 +241,9 @@ def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, 
     assert not np.any(proof.held)
     assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.terms))
     V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.setting.tube(t), q))(t, states.q)
-    phi = jax.vmap(lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.setting)[1], dq))(t, states.q, states.dq)
+    phi = jax.vmap(
+        lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.setting)[1], dq)
+    )(t, states.q, states.dq)
     expected = np.sum(V1 * np.array([0.2, 6.0]) + phi + 0.5 * proof.f_tilde**2, axis=1)
     np.testing.assert_allclose(proof.V, expected, rtol=1e-9)
 
@@ -186,16 +271,31 @@ class _WithoutCrossTerm(controllers.FullState):
 
 
 def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
-    """V = 1/2 sum ln(k^2/(k^2 - z^2)) with slope z/(k^2 - z^2) on both errors; He, Chen, Yin 2016."""
+    """V = 1/2 sum ln(k^2/(k^2 - z^2)) with slope z/(k^2 - z^2) on both errors; He, Chen, Yin
+    2016."""
     base = ij.presets.zhang_yan_2024_full_state()
-    law = controllers.FullState(k1=2.0, K2=20.0, c=1.0, barrier=barriers.Log(), velocity_barrier=barriers.Log())
+    law = controllers.FullState(
+        k1=2.0, K2=20.0, c=1.0, barrier=barriers.Log(), velocity_barrier=barriers.Log()
+    )
     rest = ij.references.Sinusoid(offset=0.5, amplitude=0.0)
-    walls, speeds = (bounds.Bounds(lower=bounds.Constant(x - w), upper=bounds.Constant(x + w)) for x, w in ((0.5, 0.4), (0.0, 0.8)))
-    scenario = dataclasses.replace(base, controller=law, reference=rest, bounds=walls, velocity_bounds=speeds)
-    t, q, dq, f_hat = jnp.zeros(()), jnp.array([0.5, 0.5]), jnp.array([0.3, -0.6]), jnp.array([0.2, 0.1])
+    walls, speeds = (
+        bounds.Bounds(lower=bounds.Constant(x - w), upper=bounds.Constant(x + w))
+        for x, w in ((0.5, 0.4), (0.0, 0.8))
+    )
+    scenario = dataclasses.replace(
+        base, controller=law, reference=rest, bounds=walls, velocity_bounds=speeds
+    )
+    t, q, dq, f_hat = (
+        jnp.zeros(()),
+        jnp.array([0.5, 0.5]),
+        jnp.array([0.3, -0.6]),
+        jnp.array([0.2, 0.1]),
+    )
     command = law.command(t, q, dq, f_hat, scenario.setting, ())[0]
     z2, kb, model = np.asarray(dq), 0.8, scenario.model
-    np.testing.assert_allclose(command.alpha, 0.0, atol=1e-15)  # z1 = 0, so z2 = q' and its bounds are symmetric
+    np.testing.assert_allclose(
+        command.alpha, 0.0, atol=1e-15
+    )  # z1 = 0, so z2 = q' and its bounds are symmetric
     np.testing.assert_allclose(command.V1, 0.5 * np.log(kb**2 / (kb**2 - z2**2)), rtol=1e-12)
     gain = 2.0 + np.sqrt(0.1)
     kappa2 = np.sqrt(2 * (gain * z2 / kb) ** 2 + 0.1)
@@ -242,46 +342,68 @@ def test_the_envelope_is_the_one_that_the_inequality_gives(certificate):
 
 def test_without_disturbance_case_1_counts():
     quiet = {"disturbance.acceleration_amplitude": 0.0, "disturbance.velocity_amplitude": 0.0}
-    certificate = ij.certify(ij.with_parameters(ij.presets.zhang_yan_2024_full_state(), quiet), duration=0.5, dt=5e-4)
+    certificate = ij.certify(
+        ij.with_parameters(ij.presets.zhang_yan_2024_full_state(), quiet), duration=0.5, dt=5e-4
+    )
     lines = {line.name: line for line in certificate.lines}
     assert certificate.verdict == "holds"
     assert lines["inequality, case 1"].verdict == lines["envelope, case 1"].verdict == "holds"
 
 
 def test_too_small_a_c_is_told_with_the_one_that_would_do():
-    certificate = ij.certify(ij.presets.zhang_yan_2024_full_state(kf=20.0, c=1.0), duration=0.3, dt=1e-3)
+    certificate = ij.certify(
+        ij.presets.zhang_yan_2024_full_state(kf=20.0, c=1.0), duration=0.3, dt=1e-3
+    )
     lines = {line.name: line for line in certificate.lines}
     assert lines["kf and c, case 2"].verdict == "fails"
     assert "would do" in lines["kf and c, case 2"].note
     assert lines["barriers"].verdict == "holds"
-    assert lines["envelope, case 2"].verdict == lines["velocities inside"].verdict == "not applicable"
+    assert (
+        lines["envelope, case 2"].verdict == lines["velocities inside"].verdict == "not applicable"
+    )
 
 
-@pytest.mark.parametrize("starts", [pytest.param(1_000, marks=pytest.mark.slow), pytest.param(10_000, marks=pytest.mark.release)])
+@pytest.mark.parametrize(
+    "starts",
+    [pytest.param(1_000, marks=pytest.mark.slow), pytest.param(10_000, marks=pytest.mark.release)],
+)
 def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
     scenario = ij.presets.zhang_yan_2024_full_state()
     perturbations = {
         "initial.q": ij.value(ij.uniform([0.36, 0.22], [1.02, 0.88])),
         "initial.dq": ij.value(ij.uniform([-1.55, -1.35], [0.65, 0.45])),
     }
-    with pytest.warns(UserWarning, match="inaccurate"):  # the torque jumps where e2 changes its sign; what is judged is no trajectory
-        study = ij.monte_carlo(scenario, perturbations, runs=28 * starts // 10, duration=2.0, dt=2.5e-4, progress=False)
+    with pytest.warns(
+        UserWarning, match="inaccurate"
+    ):  # the torque jumps where e2 changes its sign; what is judged is no trajectory
+        study = ij.monte_carlo(
+            scenario, perturbations, runs=28 * starts // 10, duration=2.0, dt=2.5e-4, progress=False
+        )
     law, setting, zero = scenario.controller, scenario.setting, jnp.zeros(())
 
     def start(q, dq):
         inner = law.tubes(zero, q, dq, setting)[1]
-        return jnp.min(jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)), jnp.max(jnp.abs(inner.xi(dq)))
+        return jnp.min(jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)), jnp.max(
+            jnp.abs(inner.xi(dq))
+        )
 
-    room, xi2 = (np.asarray(x) for x in jax.vmap(start)(study.samples["initial.q"], study.samples["initial.dq"]))
+    room, xi2 = (
+        np.asarray(x)
+        for x in jax.vmap(start)(study.samples["initial.q"], study.samples["initial.dq"])
+    )
     feasible = (room > 0.05) & (xi2 < 0.95)
     assert feasible.sum() >= starts
     status = np.asarray(study.status)[feasible]
-    assert not np.any(status & int(ij.Status.VELOCITY_VIOLATED | ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE))
+    assert not np.any(
+        status & int(ij.Status.VELOCITY_VIOLATED | ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE)
+    )
     assert np.min(np.asarray(study.metrics["velocity_margin"])[feasible]) > 0
 
 
 def test_a_gradient_is_the_difference():
-    smooth = controllers.FullState(k1=2.0, K2=20.0, c=8.0, o=0.1, velocity_barrier=barriers.Mapping())
+    smooth = controllers.FullState(
+        k1=2.0, K2=20.0, c=8.0, o=0.1, velocity_barrier=barriers.Mapping()
+    )
 
     def loss(K2):
         scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=smooth)
@@ -289,11 +411,14 @@ def test_a_gradient_is_the_difference():
         return jnp.sum(ij.simulate(scenario, duration=0.1, dt=5e-4, record_every=200).metrics.ise)
 
     found, h = jax.grad(loss)(20.0), 1e-4
-    assert float(found) == pytest.approx((float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5)
+    assert float(found) == pytest.approx(
+        (float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5
+    )
 
 
 class Pieces:
-    """The independent loop from event to event of e2_i = 0: each joint above 0, below it, or (None) sliding along it."""
+    """The independent loop from event to event of e2_i = 0: each joint above 0, below it, or (None)
+    sliding along it."""
 
     def __init__(self, loop, duration, push=None):
         """`push`: time and size of a torque that appears during the run."""
@@ -323,7 +448,8 @@ class Pieces:
         return (self.e2(t + h, x + h * rate) - self.e2(t - h, x - h * rate)) / (2 * h)
 
     def rate(self, t, x, mode):
-        """The rate in a mode, and of a sliding joint how much of the rate is that from above (Filippov)."""
+        """The rate in a mode, and of a sliding joint how much of the rate is that from above
+        (Filippov)."""
         above = np.array([side is True for side in mode])
         below = self.at(t, x, above)
         if None not in mode:
@@ -349,7 +475,14 @@ class Pieces:
             else:
                 event(lambda t, x, i=joint: self.e2(t, x)[i], -1 if side else 1, joint, not side)
         how = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
-        found = solve_ivp(lambda t, x: self.rate(t, x, mode)[0], (t, duration), x, events=[e[0] for e in events], max_step=0.02, **how)
+        found = solve_ivp(
+            lambda t, x: self.rate(t, x, mode)[0],
+            (t, duration),
+            x,
+            events=[e[0] for e in events],
+            max_step=0.02,
+            **how,
+        )
         t, x = found.t[-1], found.y[:, -1]
         if t == duration:
             return t, x
@@ -357,7 +490,11 @@ class Pieces:
             if len(times):
                 after = [*mode[:joint], new, *mode[joint + 1 :]]
                 onwards = self.approach(t, x, self.rate(t, x, after)[0])[joint]
-                self.mode = after if mode[joint] is None or (onwards > 0) == new else [*mode[:joint], None, *mode[joint + 1 :]]
+                self.mode = (
+                    after
+                    if mode[joint] is None or (onwards > 0) == new
+                    else [*mode[:joint], None, *mode[joint + 1 :]]
+                )
                 self.passed.append((joint, self.mode[joint]))
         beyond = min(t + 1e-7, duration)  # off the surface, where the event would be found again
         return beyond, x + (beyond - t) * self.rate(t, x, self.mode)[0]
@@ -374,7 +511,8 @@ def pieces(duration, factor=2.0, **gains):
 
 
 def slopes_in_pieces(duration, factor=2.0, **gains):
-    """Central differences of runs in pieces by k1, K2, c and kf; of |e1|^2's integral, |tau|^2's, and q at the end."""
+    """Central differences of runs in pieces by k1, K2, c and kf; of |e1|^2's integral, |tau|^2's,
+    and q at the end."""
     found = []
     for name, x in (GAINS | gains).items():
         ends = [pieces(duration, factor, **gains | {name: x + h}) for h in (1e-3 * x, -1e-3 * x)]
@@ -390,15 +528,22 @@ def outcome_by(duration, dt, factor=2.0, backend="auto"):
 
     def outcome(gains):
         values = {path: jnp.full(2, x) for path, x in zip(PATHS.values(), gains, strict=True)}
-        run = ij.simulate(ij.with_parameters(scenario, values), duration=duration, dt=dt, backend=backend)
-        return jnp.array([jnp.trapezoid(jnp.sum(run.e1**2, axis=1), dx=dt), run.metrics["effort"], *run.q[-1]])
+        run = ij.simulate(
+            ij.with_parameters(scenario, values), duration=duration, dt=dt, backend=backend
+        )
+        return jnp.array(
+            [jnp.trapezoid(jnp.sum(run.e1**2, axis=1), dx=dt), run.metrics["effort"], *run.q[-1]]
+        )
 
     return outcome
 
 
 @pytest.mark.parametrize("factor", [2.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces(factor):
-    assert pieces(0.2, factor).passed == [(0, True), (1, True), (0, False)][: 3 if factor == 2.0 else 2]
+    assert (
+        pieces(0.2, factor).passed
+        == [(0, True), (1, True), (0, False)][: 3 if factor == 2.0 else 2]
+    )
     true, gains = slopes_in_pieces(0.2, factor), jnp.array([*GAINS.values()])
     outcome = outcome_by(0.2, 1e-3, factor)
     found = np.asarray(jax.jacfwd(outcome)(gains))
@@ -411,10 +556,16 @@ def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces(factor):
 @pytest.mark.slow
 @pytest.mark.parametrize("time", [0.0031, 0.00366], ids=["before", "behind"])
 def test_a_disturbance_and_the_command_jump_in_one_step(time):
-    """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears: derivatives by its time and by k1."""
-    size, loop = (3.0, -1.0), FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), K2=np.full(2, 12.0), kf=np.full(2, 100.0))
+    """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears:
+    derivatives by its time and by k1."""
+    size, loop = (
+        (3.0, -1.0),
+        FullLoop(q0=(0.62, 0.55), dq0=(-0.3, 0.2), K2=np.full(2, 12.0), kf=np.full(2, 100.0)),
+    )
     step = ij.disturbances.Step(size=list(size), time=time)
-    scenario = dataclasses.replace(loop.scenario, disturbance=ij.disturbances.Sum((loop.scenario.disturbance, step)))
+    scenario = dataclasses.replace(
+        loop.scenario, disturbance=ij.disturbances.Sum((loop.scenario.disturbance, step))
+    )
 
     def integrals(values):
         changed = {"disturbance.parts[1].time": values[0], "controller.k1": jnp.full(2, values[1])}
@@ -436,7 +587,9 @@ def test_a_disturbance_and_the_command_jump_in_one_step(time):
 def test_every_mode_and_executor_has_the_same_derivative_across_the_jumps():
     gains = jnp.array([*GAINS.values()])
     native = jax.jacfwd(outcome_by(0.12, 2e-3))(gains)[0]
-    forward = jax.jvp(lambda x: outcome_by(0.12, 2e-3, backend="xla")(gains * x)[0], (1.0,), (1.0,))[1]
+    forward = jax.jvp(
+        lambda x: outcome_by(0.12, 2e-3, backend="xla")(gains * x)[0], (1.0,), (1.0,)
+    )[1]
     reverse = jax.grad(lambda x: outcome_by(0.12, 2e-3, backend="xla")(x)[0])(gains)
     assert float(forward) == pytest.approx(float(native @ gains), rel=1e-9)
     np.testing.assert_allclose(reverse, native, rtol=1e-9)
@@ -465,19 +618,25 @@ def test_a_sampled_loop_needs_no_term():
         return jnp.sum(ij.simulate(scenario, duration=0.1, dt=1e-3, record_every=100).metrics.ise)
 
     found, h = jax.grad(loss)(20.0), 1e-4
-    assert float(found) == pytest.approx((float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5)
+    assert float(found) == pytest.approx(
+        (float(loss(20.0 + h)) - float(loss(20.0 - h))) / (2 * h), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILY if name != "quadratic"])
 def test_a_barrier_states_whether_its_ratio_jumps(name):
-    tube = bounds.Tube(jnp.zeros(1), jnp.zeros(1), -jnp.ones(1), 2.0 * jnp.ones(1), jnp.zeros(1), jnp.zeros(1))
+    tube = bounds.Tube(
+        jnp.zeros(1), jnp.zeros(1), -jnp.ones(1), 2.0 * jnp.ones(1), jnp.zeros(1), jnp.zeros(1)
+    )
     left, right = (FAMILY[name].error_over_slope(tube, jnp.array([e])) for e in (-1e-9, 1e-9))
     assert bool(abs(left - right)[0] > 1e-6) == ratio_jumps(FAMILY[name])
     law = controllers.FullState(k1=2.0, K2=20.0, c=1.0, velocity_barrier=FAMILY[name])
     scenario = ij.with_parts(ij.presets.zhang_yan_2024_full_state(), controller=law)
     wrapped = controllers.Saturated(law=law, limit=50.0)
     for each in (law, wrapped):
-        found = switching_functions(each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.setting, ())
+        found = switching_functions(
+            each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.setting, ()
+        )
         assert (found is not None) == ratio_jumps(FAMILY[name])
 
 
@@ -486,7 +645,10 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
     [
         ({"velocity_barrier": barriers.Log(p=2)}, "falls with the error itself"),
         ({"velocity_barrier": 3.0}, "FullState.velocity_barrier"),
-        ({"o": 0.1, "barrier": barriers.Tan(), "velocity_barrier": barriers.Tan()}, "Neither has a kappa"),
+        (
+            {"o": 0.1, "barrier": barriers.Tan(), "velocity_barrier": barriers.Tan()},
+            "Neither has a kappa",
+        ),
         ({"c": -1.0}, "> 0"),
     ],
 )
@@ -499,17 +661,27 @@ def test_it_needs_bounds_to_keep():
     with pytest.raises(ValueError, match="the bounds that FullState keeps"):
         ij.with_parts(ij.presets.zhang_yan_2024_full_state(), velocity_bounds=None)
     with pytest.raises(ValueError, match="Q is Theorem 2's"):
-        ij.certificates.counterexample(ij.presets.zhang_yan_2024_full_state(), {"controller.k1": ij.value(ij.uniform(1.0, 3.0))})
+        ij.certificates.counterexample(
+            ij.presets.zhang_yan_2024_full_state(),
+            {"controller.k1": ij.value(ij.uniform(1.0, 3.0))},
+        )
 
 
 def test_it_stands_beside_other_laws_with_the_margin_of_the_velocities():
     scenario = ij.presets.zhang_yan_2024_full_state()
     plain = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, reading="corrected")
     filtered = controllers.SafetyFilter(law=plain, nearest="acceleration")
-    compared = ij.compare(scenario, {"full state": scenario.controller, "plain": plain, "filter": filtered}, duration=0.5, dt=5e-4)
+    compared = ij.compare(
+        scenario,
+        {"full state": scenario.controller, "plain": plain, "filter": filtered},
+        duration=0.5,
+        dt=5e-4,
+    )
     rows = {row.law: row for row in compared.table["gains"]}
     for name, run in compared.rollouts.items():
-        assert rows[name].velocity_margin == pytest.approx(float(jnp.min(run.metrics.velocity_margin)))
+        assert rows[name].velocity_margin == pytest.approx(
+            float(jnp.min(run.metrics.velocity_margin))
+        )
     assert "velocity margin" in repr(compared)
     assert "velocity_margin" in compared.to_pandas()
     free = ij.compare(ij.presets.zhang_yan_2024(), ["integral"], duration=0.1)

@@ -1,4 +1,5 @@
-"""Seven joints that MuJoCo moved: an engine that shares nothing with the package, under a computed torque with wrong masses."""
+"""Seven joints that MuJoCo moved: an engine that shares nothing with the package, under a computed
+torque with wrong masses."""
 
 from __future__ import annotations
 
@@ -9,9 +10,13 @@ import iblf_jax as ij
 from iblf_jax import disturbances
 
 COUNT = 2.0 * np.pi / 2**14
-DAMPING, ARMATURE = np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2]), np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+DAMPING, ARMATURE = (
+    np.array([1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2]),
+    np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05]),
+)
 DRY = np.array([2.0, 2.0, 1.5, 1.5, 0.6, 0.6, 0.3])
-"""Dry friction, which MuJoCo solves for as a soft constraint: a joint sticks, and gives way slowly [N m]."""
+"""Dry friction, which MuJoCo solves for as a soft constraint: a joint sticks, and gives way slowly
+[N m]."""
 FACTOR = np.array([1.0, 1.1, 0.9, 1.08, 0.93, 1.05, 1.4])
 """True masses by those of the file."""
 MIDDLE = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0])
@@ -23,9 +28,15 @@ def described(arm, mass, dry):
     def words(x):
         return " ".join(f"{float(y):.17g}" for y in np.ravel(x))
 
-    text = '<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="RK4" gravity="0 0 -9.81"/><worldbody>'
+    text = (
+        '<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="RK4" gravity="0 0'
+        ' -9.81"/><worldbody>'
+    )
     for i in range(arm.n):
-        text += f'<body pos="{words(arm.position[i])}" quat="{words(arm.rotation[i])}"><joint axis="{words(arm.axis[i])}" '
+        text += (
+            f'<body pos="{words(arm.position[i])}" quat="{words(arm.rotation[i])}"><joint'
+            f' axis="{words(arm.axis[i])}" '
+        )
         text += f'damping="{DAMPING[i]}" armature="{ARMATURE[i]}" frictionloss="{dry[i]}"/>'
         text += f'<inertial pos="{words(arm.centre[i])}" mass="{mass[i]:.17g}" '
         text += f'fullinertia="{words(arm.inertia[i])}"/>'
@@ -40,18 +51,31 @@ def logged(arm, duration, dry, seed=0, step=2e-3):
     A, P = rng.uniform(0.1, 0.3, (3, 7)), rng.uniform(0, 6.28, (3, 7))
     W = np.array([[1.0], [2.2], [4.0]]) * rng.uniform(0.8, 1.2, (3, 7))
     nominal = np.asarray(arm.mass)
-    true, known = (mujoco.MjModel.from_xml_string(described(arm, *x)) for x in ((nominal * FACTOR, dry), (nominal, 0 * dry)))
+    true, known = (
+        mujoco.MjModel.from_xml_string(described(arm, *x))
+        for x in ((nominal * FACTOR, dry), (nominal, 0 * dry))
+    )
     moving, thinking = mujoco.MjData(true), mujoco.MjData(known)
-    moving.qpos[:], moving.qvel[:] = MIDDLE + np.sum(A * np.sin(P), axis=0), np.sum(A * W * np.cos(P), axis=0)
+    moving.qpos[:], moving.qvel[:] = (
+        MIDDLE + np.sum(A * np.sin(P), axis=0),
+        np.sum(A * W * np.cos(P), axis=0),
+    )
     before, speed, M, rows = None, moving.qvel.copy(), np.zeros((7, 7)), []
     for k in range(round(duration / step)):
         t, y = k * step, COUNT * np.round(moving.qpos / COUNT)
         speed, before = speed if before is None else 0.7 * speed + 0.3 * (y - before) / step, y
-        wanted = [MIDDLE + np.sum(A * np.sin(W * t + P), axis=0), np.sum(A * W * np.cos(W * t + P), axis=0)]
+        wanted = [
+            MIDDLE + np.sum(A * np.sin(W * t + P), axis=0),
+            np.sum(A * W * np.cos(W * t + P), axis=0),
+        ]
         thinking.qpos[:], thinking.qvel[:] = y, speed
         mujoco.mj_forward(known, thinking)
         mujoco.mj_fullM(known, thinking, M)
-        push = -np.sum(A * W**2 * np.sin(W * t + P), axis=0) + 100.0 * (wanted[0] - y) + 20.0 * (wanted[1] - speed)
+        push = (
+            -np.sum(A * W**2 * np.sin(W * t + P), axis=0)
+            + 100.0 * (wanted[0] - y)
+            + 20.0 * (wanted[1] - speed)
+        )
         tau = M @ push + thinking.qfrc_bias + DAMPING * wanted[1]
         rows.append((t, y, tau))
         moving.qfrc_applied[:] = tau
@@ -62,16 +86,25 @@ def logged(arm, duration, dry, seed=0, step=2e-3):
 @pytest.mark.release
 @pytest.mark.parametrize("dry", [0.0 * DRY, DRY], ids=["viscous", "dry"])
 def test_seven_joints_of_mujoco(dry):
-    """All numbers within their errors, masses within a percent, also with dry friction; the first link's mass and armature are one."""
+    """All numbers within their errors, masses within a percent, also with dry friction; the first
+    link's mass and armature are one."""
     pytest.importorskip("mujoco")
     scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=disturbances.Nothing())
     start = ij.with_parameters(scenario, {"robot.damping": 0.5, "robot.armature": 0.05})
-    truth = {"robot.mass": np.asarray(scenario.plant.mass) * FACTOR, "robot.damping": DAMPING, "robot.armature": ARMATURE}
+    truth = {
+        "robot.mass": np.asarray(scenario.plant.mass) * FACTOR,
+        "robot.damping": DAMPING,
+        "robot.armature": ARMATURE,
+    }
     truth |= {"robot.friction": dry} if dry.any() else {}
     known = ij.identify(start, logged(scenario.plant, 12.0, dry), list(truth))
-    z = np.concatenate([(known.values[path] - x) / known.standard_errors[path] for path, x in truth.items()])
+    z = np.concatenate(
+        [(known.values[path] - x) / known.standard_errors[path] for path, x in truth.items()]
+    )
     untold = {number.name for number in known.numbers if number.verdict == "cannot be told"}
-    assert {number.name for number in known.numbers if number.verdict == "left free"} == set(known.names[21 + np.sum(dry > 0) :])
+    assert {number.name for number in known.numbers if number.verdict == "left free"} == set(
+        known.names[21 + np.sum(dry > 0) :]
+    )
     assert untold == {"robot.mass[0]", "robot.armature[0]"}
     assert np.nanmax(np.abs(z)) < 4.0 and np.mean(np.abs(z[np.isfinite(z)]) < 3.0) > 0.9
     assert np.nanmax(np.abs(known.values["robot.mass"] / truth["robot.mass"] - 1.0)) < 0.01

@@ -17,7 +17,8 @@ methods = pytest.mark.parametrize("method", TABLEAUS)
 
 @methods
 def test_order_conditions(method):
-    """Butcher's conditions up to the order that the table claims, and the first one beyond it fails."""
+    """Butcher's conditions up to the order that the table claims, and the first one beyond it
+    fails."""
     table = tableau(method)
     s = len(table.b)
     a, b, c = np.zeros((s, s)), np.asarray(table.b), np.asarray(table.c)
@@ -28,7 +29,12 @@ def test_order_conditions(method):
         1: [b.sum() - 1],
         2: [b @ c - 1 / 2],
         3: [b @ c**2 - 1 / 3, b @ a @ c - 1 / 6],
-        4: [b @ c**3 - 1 / 4, (b * c) @ a @ c - 1 / 8, b @ a @ c**2 - 1 / 12, b @ a @ a @ c - 1 / 24],
+        4: [
+            b @ c**3 - 1 / 4,
+            (b * c) @ a @ c - 1 / 8,
+            b @ a @ c**2 - 1 / 12,
+            b @ a @ a @ c - 1 / 24,
+        ],
         5: [b @ c**4 - 1 / 5],
     }
     for order in range(1, table.order + 1):
@@ -48,7 +54,8 @@ def test_stability_limit(method):
 
 
 def order_of(method, slope, x0, exact, end, counts):
-    """The slope of log error over log dt, the number of steps being traced so that it compiles once."""
+    """The slope of log error over log dt, the number of steps being traced so that it compiles
+    once."""
 
     @jax.jit
     def solve(count):
@@ -84,7 +91,10 @@ def test_order_on_a_nonlinear_problem_in_time(method):
 @methods
 def test_order_on_the_closed_loop(method):
     """Softer gains and a short stretch on which e1 keeps its sign, so that the loop is smooth."""
-    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 1.0, "observer.kf": 2.0, "initial.q": [0.8, 0.85]})
+    scenario = ij.with_parameters(
+        ij.presets.zhang_yan_2024(),
+        {"controller.K2": 1.0, "observer.kf": 2.0, "initial.q": [0.8, 0.85]},
+    )
     x0, end = initial_state(scenario), 0.05
     exact = _exact(scenario, x0, end)
     counts = [16, 32, 64, 128] if method == "rk4" else [200, 400, 800, 1600]
@@ -96,14 +106,20 @@ _EXACT = {}
 
 
 def _exact(scenario, x0, end):
-    """The state at the end by RK4 with 20,000 steps: its error is far below those that are measured."""
+    """The state at the end by RK4 with 20,000 steps: its error is far below those that are
+    measured."""
     if not _EXACT:
 
         @jax.jit
         def solve():
             dt = end / 20_000
             slope = lambda t, x: rate(scenario, t, x)  # noqa: E731
-            return jax.lax.fori_loop(0, 20_000, lambda i, x: step("rk4", lambda t, x: (slope(t, x), None), i * dt, x, dt).state, x0)
+            return jax.lax.fori_loop(
+                0,
+                20_000,
+                lambda i, x: step("rk4", lambda t, x: (slope(t, x), None), i * dt, x, dt).state,
+                x0,
+            )
 
         _EXACT["x"] = solve()
     return _EXACT["x"]

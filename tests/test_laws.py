@@ -1,4 +1,5 @@
-"""The laws beside the paper's: what each does, what saturation leaves of the claims, and paths through a wrapper."""
+"""The laws beside the paper's: what each does, what saturation leaves of the claims, and paths
+through a wrapper."""
 
 import dataclasses
 
@@ -19,7 +20,8 @@ Q, DQ = jnp.array([0.7, 0.6]), jnp.array([0.4, -0.3])
 
 @pytest.fixture(scope="module")
 def saturated_runs():
-    """The saturated preset at several limits, and without one; one structure, so one compilation."""
+    """The saturated preset at several limits, and without one; one structure, so one
+    compilation."""
     scenario = ij.presets.zhang_yan_2024_saturated()
     limits = {"free": 100.0, "preset": scenario.controller.limit, "below_gravity": (6.0, 2.0)}
     runs = {}
@@ -55,7 +57,10 @@ def test_the_funnel_is_kept_by_its_own_law():
     assert float(jnp.max(jnp.abs(run.e1[run.t >= 1.0]))) < 0.12
     # and it lies inside the paper's bounds
     paper = ij.presets.zhang_yan_2024()
-    tubes = [jax.vmap(scenario.setting.tube)(jnp.linspace(0.0, 20.0, 2001)) for scenario in (run.scenario, paper)]
+    tubes = [
+        jax.vmap(scenario.setting.tube)(jnp.linspace(0.0, 20.0, 2001))
+        for scenario in (run.scenario, paper)
+    ]
     assert bool(jnp.all(tubes[0].lower >= tubes[1].lower))
     assert bool(jnp.all(tubes[0].upper <= tubes[1].upper))
 
@@ -65,19 +70,33 @@ NO_DISTURBANCE = {"disturbance.acceleration_amplitude": 0.0, "disturbance.veloci
 
 
 def walls(lower, upper):
-    return {"bounds.lower.offset": lower, "bounds.upper.offset": upper, "bounds.lower.amplitude": 0.0, "bounds.upper.amplitude": 0.0}
+    return {
+        "bounds.lower.offset": lower,
+        "bounds.upper.offset": upper,
+        "bounds.lower.amplitude": 0.0,
+        "bounds.upper.amplitude": 0.0,
+    }
 
 
 def test_computed_torque_gives_the_error_equation_that_it_promises():
     blind = NO_DISTURBANCE | {"observer.kf": 1e-12}
-    run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="computed_torque"), blind), **PAPER)
+    run = ij.simulate(
+        ij.with_parameters(ij.presets.zhang_yan_2024(law="computed_torque"), blind), **PAPER
+    )
     w, t = 5.0, run.t[:, None]  # Kp = 25, Kd = 10: double pole at -5
     e0, de0 = run.e1[0], run.dq[0] - run.dq_d[0]
     np.testing.assert_allclose(run.e1, (e0 + (de0 + w * e0) * t) * jnp.exp(-w * t), atol=1e-9)
 
 
 def test_pd_holds_a_reference_at_rest():
-    rest = NO_DISTURBANCE | walls(0.1, 1.0) | {"reference.offset": [0.5, 0.6], "reference.amplitude": 0.0}
+    rest = (
+        NO_DISTURBANCE
+        | walls(0.1, 1.0)
+        | {
+            "reference.offset": [0.5, 0.6],
+            "reference.amplitude": 0.0,
+        }
+    )
     run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="pd"), rest), **PAPER)
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 1e-8
     np.testing.assert_allclose(run.tau[-1], run.scenario.model.gravity(run.q[-1]), atol=1e-6)
@@ -87,7 +106,10 @@ def test_pd_holds_a_reference_at_rest():
 def test_backstepping_without_barrier_is_the_limit_of_state_and_mapping():
     wide = walls(-1e5, 1e5 + 1.0)
     laws = ("backstepping", "state", "mapping")
-    runs = [ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law=law), wide), **PAPER) for law in laws]
+    runs = [
+        ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law=law), wide), **PAPER)
+        for law in laws
+    ]
     for run in runs[1:]:
         np.testing.assert_allclose(run.q, runs[0].q, atol=2e-5)
 
@@ -96,7 +118,9 @@ def test_backstepping_without_barrier_is_the_limit_of_state_and_mapping():
 def test_every_system_goes_through_a_scenario_file(law, tmp_path):
     scenario = ij.presets.zhang_yan_2024(law=law, reading="corrected")
     limited = controllers.Saturated(law=scenario.controller, limit=[7.2, 1.5], edge="smooth")
-    scenario = dataclasses.replace(scenario, controller=limited, observer=observers.ExtendedState(bandwidth=30.0))
+    scenario = dataclasses.replace(
+        scenario, controller=limited, observer=observers.ExtendedState(bandwidth=30.0)
+    )
     ij.save_scenario(scenario, tmp_path / "scenario.toml")
     again = ij.load_scenario(tmp_path / "scenario.toml")
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
@@ -106,14 +130,18 @@ def test_every_system_goes_through_a_scenario_file(law, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ij.presets.LAWS)
 def test_a_start_at_the_wall_stays_finite_in_float32(law):
-    scenario = ij.with_parameters(ij.presets.zhang_yan_2024(law=law), {"initial.q": [1.0399, 0.8999], "initial.dq": 1.0})
+    scenario = ij.with_parameters(
+        ij.presets.zhang_yan_2024(law=law), {"initial.q": [1.0399, 0.8999], "initial.dq": 1.0}
+    )
     scenario = ij.astype(scenario, "float32")
 
     def speed(scenario):
         state = initial_state(scenario)
         return evaluate(scenario, jnp.zeros((), jnp.float32), state)
 
-    (slope, sample), tangent = jax.jit(lambda s: jax.jvp(speed, (s,), (jax.tree.map(jnp.ones_like, s),)))(scenario)
+    (slope, sample), tangent = jax.jit(
+        lambda s: jax.jvp(speed, (s,), (jax.tree.map(jnp.ones_like, s),))
+    )(scenario)
     for part in jax.tree.leaves((slope, sample, tangent)):
         assert part.dtype in (jnp.float32, bool, jax.dtypes.float0)
         assert part.dtype == jax.dtypes.float0 or bool(jnp.all(jnp.isfinite(part)))
@@ -138,8 +166,14 @@ def test_adaptive_weights_stay_below_their_bound():
 
 @pytest.mark.slow
 def test_adaptive_weights_are_bounded_under_a_large_disturbance():
-    strong = {"disturbance.acceleration_amplitude": 20.0, "disturbance.acceleration_frequency": 5.0, "controller.sigma": 0.5}
-    run = ij.simulate(ij.with_parameters(ij.presets.zhang_yan_2024(law="adaptive_rbf"), strong), **PAPER)
+    strong = {
+        "disturbance.acceleration_amplitude": 20.0,
+        "disturbance.acceleration_frequency": 5.0,
+        "controller.sigma": 0.5,
+    }
+    run = ij.simulate(
+        ij.with_parameters(ij.presets.zhang_yan_2024(law="adaptive_rbf"), strong), **PAPER
+    )
     norms = jnp.sqrt(jnp.sum(run.controller_state**2, axis=1))
     assert bool(jnp.all(norms <= 8.0 * jnp.max(jnp.abs(run.e2), axis=0) / 0.5))
 
@@ -161,13 +195,25 @@ def test_adaptation_descends_the_lyapunov_function():
     weights, ideal = jax.random.normal(jax.random.PRNGKey(1), (2, law.nodes, 2))
     command, dweights = law.command(t, Q, DQ, jnp.zeros(2), scenario.setting, weights)
     e2 = DQ - command.alpha
-    S = jnp.linalg.lstsq(weights.T, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q))[0]
-    np.testing.assert_allclose(weights.T @ S, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q), atol=1e-9)
+    S = jnp.linalg.lstsq(
+        weights.T, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q)
+    )[0]
+    np.testing.assert_allclose(
+        weights.T @ S,
+        command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q),
+        atol=1e-9,
+    )
     S = -(dweights / law.Gamma + law.sigma * weights)[:, 0] / e2[0]
-    np.testing.assert_allclose(weights.T @ S, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q), atol=1e-9)
+    np.testing.assert_allclose(
+        weights.T @ S,
+        command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q),
+        atol=1e-9,
+    )
     error = weights - ideal
     storage_rate = jnp.sum(error * dweights / law.Gamma)
-    np.testing.assert_allclose(storage_rate, -e2 @ (error.T @ S) - jnp.sum(law.sigma * weights * error), rtol=1e-9)
+    np.testing.assert_allclose(
+        storage_rate, -e2 @ (error.T @ S) - jnp.sum(law.sigma * weights * error), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(("nodes", "dimensions"), [(1, 4), (7, 8), (64, 8), (64, 28)])
@@ -191,16 +237,20 @@ def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold(saturate
     assert free.ok
     np.testing.assert_allclose(run.metrics.peak_torque, limit, rtol=1e-12)
     assert bool(jnp.all(run.metrics.saturated_share > 0))
-    assert 0.35 < float(jnp.min(run.metrics.xi_margin)) < 0.38  # less than the start's: it came nearer
+    assert (
+        0.35 < float(jnp.min(run.metrics.xi_margin)) < 0.38
+    )  # less than the start's: it came nearer
     assert float(jnp.max(run.metrics.settling_time)) < 1.05
     np.testing.assert_allclose(run.e1[1000:], free.e1[1000:], atol=1e-6)
-    # The observer is told the torque that was applied, so it does not take the cut for a disturbance.
+    # The observer is told the torque that was applied, so it does not take the cut for a
+    # disturbance.
     error = [jnp.max(jnp.abs(x.disturbance - x.disturbance_estimate)) for x in (run, free)]
     np.testing.assert_allclose(error[0], error[1], rtol=0.1)
 
 
 def inequality_excess(run):
-    """V2' + rho V2 - |f'|^2 / 2 at the recorded samples, with Theorem 2's rho at that mass matrix (case 2)."""
+    """V2' + rho V2 - |f'|^2 / 2 at the recorded samples, with Theorem 2's rho at that mass matrix
+    (case 2)."""
     scenario = run.scenario
 
     def at(t, state):
@@ -208,8 +258,12 @@ def inequality_excess(run):
             sample = evaluate(scenario, t, state)[1]
             return sample.V, sample.disturbance
 
-        (V, _), (dV, df) = jax.jvp(of_interest, (t, state), (jnp.ones(()), rate(scenario, t, state)))
-        rho = jnp.minimum(4.0, 2 * 19.5 / jnp.linalg.eigvalsh(scenario.model.mass_matrix(state.q))[-1])
+        (V, _), (dV, df) = jax.jvp(
+            of_interest, (t, state), (jnp.ones(()), rate(scenario, t, state))
+        )
+        rho = jnp.minimum(
+            4.0, 2 * 19.5 / jnp.linalg.eigvalsh(scenario.model.mass_matrix(state.q))[-1]
+        )
         return dV + rho * V - 0.5 * jnp.sum(df**2)
 
     states = LoopState(run.q, run.dq, run.controller_state, run.observer_state)
@@ -219,7 +273,10 @@ def inequality_excess(run):
 def test_the_inequality_of_theorem_2_fails_only_while_the_torque_is_cut(saturated_runs):
     run = saturated_runs["preset"]
     assert float(jnp.max(inequality_excess(saturated_runs["free"]))) < 1e-9
-    excess, cut = inequality_excess(run), jnp.any(jnp.abs(run.tau) >= run.scenario.controller.limit, axis=1)
+    excess, cut = (
+        inequality_excess(run),
+        jnp.any(jnp.abs(run.tau) >= run.scenario.controller.limit, axis=1),
+    )
     assert float(jnp.max(excess[cut])) > 1.0
     assert float(jnp.max(excess[~cut])) < 1e-9
 
@@ -242,14 +299,26 @@ def test_smooth_limit(dtype):
     def limited(x):
         fixed = _Fixed(tau=jnp.stack([x, -x]))
         wrapped = controllers.Saturated(law=fixed, limit=jnp.ones(2, dtype), edge="smooth")
-        return wrapped.command(jnp.zeros((), dtype), Q.astype(dtype), DQ.astype(dtype), jnp.zeros(2, dtype), scenario.setting, ())[0].tau
+        return wrapped.command(
+            jnp.zeros((), dtype),
+            Q.astype(dtype),
+            DQ.astype(dtype),
+            jnp.zeros(2, dtype),
+            scenario.setting,
+            (),
+        )[0].tau
 
     value, slope = jax.vmap(limited)(tau), jax.vmap(jax.jacfwd(limited))(tau)
     assert value.dtype == dtype
     np.testing.assert_allclose(value[:, 0], -value[:, 1])
     exact = np.asarray(tau, np.longdouble) / (1 + np.asarray(tau, np.longdouble) ** 8) ** 0.125
     np.testing.assert_allclose(value[:, 0], exact.astype(float), rtol=1e-6)
-    np.testing.assert_allclose(slope[:, 0], ((1 + np.asarray(tau, np.longdouble) ** 8) ** -1.125).astype(float), rtol=1e-5, atol=1e-30)
+    np.testing.assert_allclose(
+        slope[:, 0],
+        ((1 + np.asarray(tau, np.longdouble) ** 8) ** -1.125).astype(float),
+        rtol=1e-5,
+        atol=1e-30,
+    )
     assert bool(jnp.all(jnp.isfinite(jax.vmap(jax.jacrev(limited))(tau))))
     assert bool(jnp.all(jnp.abs(value) <= 1.0))
     assert law.edge == "smooth"
@@ -291,7 +360,10 @@ def test_paths_reach_through_a_wrapper():
 
 def test_a_wrapper_in_a_wrapper_keeps_both_fields_apart():
     scenario = ij.presets.zhang_yan_2024_saturated()
-    twice = dataclasses.replace(scenario, controller=controllers.Saturated(law=scenario.controller, limit=50.0, edge="smooth"))
+    twice = dataclasses.replace(
+        scenario,
+        controller=controllers.Saturated(law=scenario.controller, limit=50.0, edge="smooth"),
+    )
     values = {p.path: p.value for p in ij.parameters(twice)}
     np.testing.assert_array_equal(values["controller.limit"], [50.0, 50.0])
     np.testing.assert_array_equal(values["controller.law.limit"], [7.2, 1.5])
@@ -332,7 +404,9 @@ def test_saturation_says_what_is_wrong():
 @pytest.mark.slow
 def test_extended_state_observer_obeys_its_error_equation():
     scenario = dataclasses.replace(
-        ij.presets.zhang_yan_2024(reading="corrected"), observer=observers.ExtendedState(bandwidth=30.0), initial=ij.Initial(Q, DQ)
+        ij.presets.zhang_yan_2024(reading="corrected"),
+        observer=observers.ExtendedState(bandwidth=30.0),
+        initial=ij.Initial(Q, DQ),
     )
 
     def f_tilde(t, state):
@@ -346,9 +420,19 @@ def test_extended_state_observer_obeys_its_error_equation():
         return lambda t, state: jax.jvp(g, (t, state), (jnp.ones(()), rate(scenario, t, state)))[1]
 
     t, state = jnp.asarray(0.4), initial_state(scenario)
-    state = state._replace(observer=state.observer._replace(f_hat=jnp.array([0.3, -0.2]), p_hat=state.observer.p_hat + 0.01))
-    left = along(along(f_tilde))(t, state) + 60.0 * along(f_tilde)(t, state) + 900.0 * f_tilde(t, state)
-    np.testing.assert_allclose(left, along(along(f))(t, state) + 60.0 * along(f)(t, state), rtol=1e-8)
+    state = state._replace(
+        observer=state.observer._replace(
+            f_hat=jnp.array([0.3, -0.2]), p_hat=state.observer.p_hat + 0.01
+        )
+    )
+    left = (
+        along(along(f_tilde))(t, state)
+        + 60.0 * along(f_tilde)(t, state)
+        + 900.0 * f_tilde(t, state)
+    )
+    np.testing.assert_allclose(
+        left, along(along(f))(t, state) + 60.0 * along(f)(t, state), rtol=1e-8
+    )
 
 
 @pytest.mark.slow
@@ -359,7 +443,10 @@ def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_
     one, other = (dataclasses.replace(scenario, disturbance=push, observer=form) for form in forms)
     run = ij.simulate(one, duration=2.0, dt=1e-3)
     np.testing.assert_allclose(run.disturbance_estimate[-1], [1.0, -0.5], atol=1e-8)
-    states = [initial_state(s)._replace(observer=observers.extended_state.ExtendedStateValues(Q, DQ)) for s in (one, other)]
+    states = [
+        initial_state(s)._replace(observer=observers.extended_state.ExtendedStateValues(Q, DQ))
+        for s in (one, other)
+    ]
     rates = [rate(s, jnp.zeros(()), state) for s, state in zip((one, other), states, strict=True)]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), *rates)
     assert "observer.bandwidth" in [p.path for p in ij.parameters(one)]
@@ -373,12 +460,15 @@ def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_
 
 
 def _constrained(name):
-    """The paper's arm under one of the laws that know of other constraints, or keep bounds in another way."""
+    """The paper's arm under one of the laws that know of other constraints, or keep bounds in
+    another way."""
     full = ij.presets.zhang_yan_2024_full_state()
     pd = controllers.PDGravity(Kp=60.0, Kd=20.0)
     law = {
         "full_state": full.controller,
-        "full_state_smooth": controllers.FullState(k1=2.0, K2=20.0, c=1.0, velocity_barrier=ij.barriers.Tan()),
+        "full_state_smooth": controllers.FullState(
+            k1=2.0, K2=20.0, c=1.0, velocity_barrier=ij.barriers.Tan()
+        ),
         "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
         "reference_governor": controllers.ReferenceGovernor(law=pd),
         "safety_filter": controllers.SafetyFilter(law=pd, nearest="acceleration"),
@@ -386,19 +476,36 @@ def _constrained(name):
     return ij.with_parts(full, controller=law)
 
 
-CONSTRAINED = ("full_state", "full_state_smooth", "dynamic_surface", "reference_governor", "safety_filter")
+CONSTRAINED = (
+    "full_state",
+    "full_state_smooth",
+    "dynamic_surface",
+    "reference_governor",
+    "safety_filter",
+)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_backends_agree_on_them_and_a_run_alone_is_that_of_a_batch(name):
     scenario, spread = _constrained(name), {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}
-    options = {"runs": 5, "duration": 0.1, "dt": 5e-4, "progress": False, "seed": 3, "method": "rk4" if name == "full_state" else "euler"}
-    studies = {b: ij.monte_carlo(scenario, spread, backend=b, **options) for b in ("native", "xla", "vmap")}
+    options = {
+        "runs": 5,
+        "duration": 0.1,
+        "dt": 5e-4,
+        "progress": False,
+        "seed": 3,
+        "method": "rk4" if name == "full_state" else "euler",
+    }
+    studies = {
+        b: ij.monte_carlo(scenario, spread, backend=b, **options) for b in ("native", "xla", "vmap")
+    }
     for other in ("xla", "vmap"):
         for metric in ("ise", "margin", "velocity_margin", "alpha_margin", "peak_torque"):
             found, expected = (np.asarray(studies[b].metrics[metric]) for b in (other, "native"))
-            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12, err_msg=f"{other}: {metric}")
+            np.testing.assert_allclose(
+                found, expected, rtol=1e-9, atol=1e-12, err_msg=f"{other}: {metric}"
+            )
         np.testing.assert_array_equal(studies[other].status, studies["native"].status)
     alone = studies["native"].replay(2)
     for metric in ("ise", "velocity_margin"):
@@ -407,12 +514,23 @@ def test_backends_agree_on_them_and_a_run_alone_is_that_of_a_batch(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "path"), [("full_state", "controller.c"), ("dynamic_surface", "controller.filter"), ("safety_filter", "controller.a1")]
+    ("name", "path"),
+    [
+        ("full_state", "controller.c"),
+        ("dynamic_surface", "controller.filter"),
+        ("safety_filter", "controller.a1"),
+    ],
 )
 def test_their_gains_can_be_tuned(name, path):
     scenario = _constrained(name)
-    objective = ij.objectives.tracking() + 0.1 * ij.objectives.effort() + ij.objectives.velocity_margin_above(0.05)
-    result = ij.tune(scenario, [path], objective, duration=0.2, dt=5e-4, iterations=4, progress=False)
+    objective = (
+        ij.objectives.tracking()
+        + 0.1 * ij.objectives.effort()
+        + ij.objectives.velocity_margin_above(0.05)
+    )
+    result = ij.tune(
+        scenario, [path], objective, duration=0.2, dt=5e-4, iterations=4, progress=False
+    )
     assert result.report.verdicts[0].verdict == "pass"
     assert result.history["objective"][-1, 0] <= result.history["objective"][0, 0]
 
@@ -421,7 +539,9 @@ def test_their_gains_can_be_tuned(name, path):
 
 WEIGHTED = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0),
-    "corrected_mapping": controllers.Backstepping(k1=2.0, K2=20.0, barrier=ij.barriers.Mapping(), reading="corrected"),
+    "corrected_mapping": controllers.Backstepping(
+        k1=2.0, K2=20.0, barrier=ij.barriers.Mapping(), reading="corrected"
+    ),
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
     "full_state": controllers.FullState(k1=2.0, K2=20.0, c=1.0),
@@ -433,24 +553,34 @@ def weighted(name, weight=None):
     """The paper's scenario under one of these laws, its weight given to the constructor."""
     law = dataclasses.replace(WEIGHTED[name], weight=weight)
     velocities = ij.bounds.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
-    return dataclasses.replace(ij.presets.zhang_yan_2024(), controller=law, velocity_bounds=velocities)
+    return dataclasses.replace(
+        ij.presets.zhang_yan_2024(), controller=law, velocity_bounds=velocities
+    )
 
 
 def commanded(scenario):
     """What its law commands at one state."""
     law, setting = scenario.controller, scenario.setting
-    return law.command(jnp.asarray(0.3), Q, DQ, jnp.array([0.5, -0.2]), setting, law.init(Q, DQ, setting))[0]
+    return law.command(
+        jnp.asarray(0.3), Q, DQ, jnp.array([0.5, -0.2]), setting, law.init(Q, DQ, setting)
+    )[0]
 
 
 @pytest.mark.parametrize("name", WEIGHTED)
 def test_the_weight_multiplies_slope_and_value_of_the_barrier(name):
     plain, other = (commanded(weighted(name, weight)) for weight in (None, WEIGHT))
     scenario = weighted(name)
-    tube, barrier, model = scenario.setting.tube(jnp.asarray(0.3)), scenario.controller.barrier, scenario.model
+    tube, barrier, model = (
+        scenario.setting.tube(jnp.asarray(0.3)),
+        scenario.controller.barrier,
+        scenario.model,
+    )
     added, first = (WEIGHT - 1.0) * barrier.slope(tube, Q), 0.0
     if name == "full_state":
         inner = scenario.controller.tubes(jnp.asarray(0.3), Q, DQ, scenario.setting)[1]
-        added = model.mass_matrix(Q) @ (added * scenario.controller.velocity_barrier.error_over_slope(inner, DQ))
+        added = model.mass_matrix(Q) @ (
+            added * scenario.controller.velocity_barrier.error_over_slope(inner, DQ)
+        )
         first = scenario.controller.velocity_barrier.value(inner, DQ)
     np.testing.assert_allclose(other.tau, plain.tau - added, rtol=1e-12)
     np.testing.assert_allclose(other.V1 - first, WEIGHT * (plain.V1 - first), rtol=1e-9)
@@ -465,33 +595,47 @@ def test_the_weight_is_a_leaf_with_the_unit_that_its_barrier_gives_it(name):
     assert (found.shape, found.unit) == ((2,), units.get(name, "N m rad"))
     assert ij.simulation.paths.unit_at(weighted(name), "controller.weight[1]") == found.unit
     limited = controllers.Saturated(law=WEIGHTED[name], limit=30.0)
-    inside = ij.with_parameters(dataclasses.replace(weighted(name), controller=limited), {"controller.weight": WEIGHT})
+    inside = ij.with_parameters(
+        dataclasses.replace(weighted(name), controller=limited), {"controller.weight": WEIGHT}
+    )
     np.testing.assert_array_equal(inside.controller.law.weight, WEIGHT)
     with pytest.raises(ValueError, match=r"weight.*> 0"):
         ij.with_parameters(weighted(name), {"controller.weight": [1.0, 0.0]})
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "unit"), [("Integral", "Tan", "rad^2/s^2"), ("Tan", "Integral", "1/rad^2"), ("State", "Tan", "1/s^2")]
+    ("first", "second", "unit"),
+    [("Integral", "Tan", "rad^2/s^2"), ("Tan", "Integral", "1/rad^2"), ("State", "Tan", "1/s^2")],
 )
 def test_the_weight_of_a_full_state_law_has_the_unit_of_phi_over_that_of_V1(first, second, unit):
-    barriers = {"barrier": getattr(ij.barriers, first)(), "velocity_barrier": getattr(ij.barriers, second)()}
-    assert controllers.FullState(k1=2.0, K2=20.0, c=1.0, **barriers).leaf_units() == {"weight": unit}
+    barriers = {
+        "barrier": getattr(ij.barriers, first)(),
+        "velocity_barrier": getattr(ij.barriers, second)(),
+    }
+    assert controllers.FullState(k1=2.0, K2=20.0, c=1.0, **barriers).leaf_units() == {
+        "weight": unit
+    }
 
 
 def test_files_without_a_weight_have_the_papers_and_others_keep_theirs(tmp_path):
     ij.save_scenario(weighted("backstepping", WEIGHT), tmp_path / "scenario.toml")
     text = (tmp_path / "scenario.toml").read_text()
-    np.testing.assert_array_equal(ij.load_scenario(tmp_path / "scenario.toml").controller.weight, WEIGHT)
+    np.testing.assert_array_equal(
+        ij.load_scenario(tmp_path / "scenario.toml").controller.weight, WEIGHT
+    )
     old = "\n".join(line for line in text.splitlines() if not line.startswith("weight"))
     assert old != text.rstrip("\n")
     (tmp_path / "old.toml").write_text(old)
-    np.testing.assert_array_equal(ij.load_scenario(tmp_path / "old.toml").controller.weight, [1.0, 1.0])
+    np.testing.assert_array_equal(
+        ij.load_scenario(tmp_path / "old.toml").controller.weight, [1.0, 1.0]
+    )
 
 
 def test_a_weight_of_one_costs_no_operation_and_another_one_a_joint():
     paper = ij.presets.zhang_yan_2024()
-    one, other = (ij.explain(ij.with_parameters(paper, {"controller.weight": w})) for w in (1.0, 0.5))
+    one, other = (
+        ij.explain(ij.with_parameters(paper, {"controller.weight": w})) for w in (1.0, 0.5)
+    )
     products = [sum(counter["mul"] for counter in found.counts.values()) for found in (one, other)]
     # Four slopes of a step of Runge-Kutta, the value and its rate: one product a joint each.
     assert 0 < products[1] - products[0] <= 2 * 8
@@ -513,7 +657,9 @@ def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
     paper = ij.presets.zhang_yan_2024()
 
     def margin(w):
-        return ij.simulate(ij.with_parameters(paper, {"controller.weight": w}), duration=0.05, dt=1e-3).q[-1, 0]
+        return ij.simulate(
+            ij.with_parameters(paper, {"controller.weight": w}), duration=0.05, dt=1e-3
+        ).q[-1, 0]
 
     for w in (1.0, 0.7):
         difference = (margin(w + 1e-4) - margin(w - 1e-4)) / 2e-4
@@ -522,5 +668,13 @@ def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
 
 def test_weights_are_tuned():
     goal = ij.objectives.tracking() + 0.1 * ij.objectives.effort()
-    found = ij.tune(ij.presets.zhang_yan_2024(), ["controller.weight"], goal, duration=0.1, dt=1e-3, iterations=3, progress=False)
+    found = ij.tune(
+        ij.presets.zhang_yan_2024(),
+        ["controller.weight"],
+        goal,
+        duration=0.1,
+        dt=1e-3,
+        iterations=3,
+        progress=False,
+    )
     assert np.any(np.abs(np.asarray(found.scenario.controller.weight) - 1.0) > 1e-3)

@@ -1,4 +1,5 @@
-"""The layers of the package, held by its imports: they go down only.  The table of layers is CONTRIBUTING.md's."""
+"""The layers of the package, held by its imports: they go down only.  The table of layers is
+CONTRIBUTING.md's."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ PACKAGE = ROOT / "iblf_jax"
 
 LAYER_OF = {
     name.rstrip("/"): int(layer)
-    for layer, names in re.findall(r"^\| (\d) [\w ]+\| (`.*) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    for layer, names in re.findall(
+        r"^\| (\d) [\w ]+\| (`.*) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE
+    )
     for name in re.findall(r"`([\w/]+)`", names)
 }
 """Module or folder at the root of the package -> its layer."""
@@ -28,7 +31,8 @@ UPWARD = {
     "tuning/_pareto.py": {"plotting"},
     "tuning/result.py": {"files", "plotting", "reports"},
 }
-"""File -> the higher modules that it imports inside a method: `.plot()`, `.save()`, `.to_xarray()`, `_repr_html_()`.  No others do."""
+"""File -> the higher modules that it imports inside a method: `.plot()`, `.save()`, `.to_xarray()`,
+`_repr_html_()`.  No others do."""
 
 ONLY_IN = {
     "matplotlib": ("plotting",),
@@ -50,7 +54,8 @@ def module_of(path: Path) -> str:
 
 
 def imports(source: str, *, at_the_top: bool) -> set[str]:
-    """Full names of what a file imports, at its top only or anywhere; not what only type checkers see."""
+    """Full names of what a file imports, at its top only or anywhere; not what only type checkers
+    see."""
     found: set[str] = set()
 
     def visit(node):
@@ -60,7 +65,9 @@ def imports(source: str, *, at_the_top: bool) -> set[str]:
             assert node.level == 0, "imports name the package in full"
             found.update(f"{node.module}.{alias.name}" for alias in node.names)
         for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        if for_types or (at_the_top and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)):
+        if for_types or (
+            at_the_top and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        ):
             return
         for child in ast.iter_child_nodes(node):
             visit(child)
@@ -77,25 +84,39 @@ def edges(source: str, *, at_the_top: bool = True) -> set[str]:
 
 def upward(module: str, source: str, *, at_the_top: bool = True) -> set[str]:
     """The modules of a higher layer that a file of `module` imports."""
-    return {name for name in edges(source, at_the_top=at_the_top) if LAYER_OF.get(name, -1) > LAYER_OF[module]}
+    return {
+        name
+        for name in edges(source, at_the_top=at_the_top)
+        if LAYER_OF.get(name, -1) > LAYER_OF[module]
+    }
 
 
 def test_every_module_has_a_layer():
     unknown = {module_of(path) for path in FILES} - set(LAYER_OF) - {""}
     assert not unknown, f"say in which layer {unknown} belongs: CONTRIBUTING.md"
-    gone = {name for name in LAYER_OF if not (PACKAGE / name).exists() and not (PACKAGE / f"{name}.py").exists()}
+    gone = {
+        name
+        for name in LAYER_OF
+        if not (PACKAGE / name).exists() and not (PACKAGE / f"{name}.py").exists()
+    }
     assert not gone, f"CONTRIBUTING.md has layers for {gone}, which are not there"
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if module_of(p)], ids=lambda p: str(p.relative_to(PACKAGE)))
+@pytest.mark.parametrize(
+    "path", [p for p in FILES if module_of(p)], ids=lambda p: str(p.relative_to(PACKAGE))
+)
 def test_imports_go_down_only(path):
     up = upward(module_of(path), SOURCES[path])
-    assert not up, f"{path.name} is in layer {LAYER_OF[module_of(path)]} and imports {up} from above"
+    assert not up, (
+        f"{path.name} is in layer {LAYER_OF[module_of(path)]} and imports {up} from above"
+    )
 
 
 def test_results_alone_go_up_when_asked():
     found = {
-        str(path.relative_to(PACKAGE)): upward(module_of(path), text, at_the_top=False) for path, text in SOURCES.items() if module_of(path)
+        str(path.relative_to(PACKAGE)): upward(module_of(path), text, at_the_top=False)
+        for path, text in SOURCES.items()
+        if module_of(path)
     }
     assert {path: names for path, names in found.items() if names} == UPWARD
 
@@ -104,7 +125,9 @@ def test_no_cycle_between_modules():
     graph: dict[str, set[str]] = {}
     for path in FILES:
         if module_of(path):
-            graph.setdefault(module_of(path), set()).update(edges(SOURCES[path]) & set(LAYER_OF) - {module_of(path)})
+            graph.setdefault(module_of(path), set()).update(
+                edges(SOURCES[path]) & set(LAYER_OF) - {module_of(path)}
+            )
 
     def reach(module, seen=()):
         assert module not in seen, f"a cycle: {' -> '.join([*seen, module])}"
@@ -117,28 +140,47 @@ def test_no_cycle_between_modules():
 
 @pytest.mark.parametrize("library", ONLY_IN)
 def test_libraries_stay_in_their_place(library):
-    users = {module_of(p) for p, text in SOURCES.items() if any(x.split(".")[0] == library for x in imports(text, at_the_top=False))}
-    assert users <= set(ONLY_IN[library]), f"{library} belongs to {ONLY_IN[library]}, not to {users - set(ONLY_IN[library])}"
+    users = {
+        module_of(p)
+        for p, text in SOURCES.items()
+        if any(x.split(".")[0] == library for x in imports(text, at_the_top=False))
+    }
+    assert users <= set(ONLY_IN[library]), (
+        f"{library} belongs to {ONLY_IN[library]}, not to {users - set(ONLY_IN[library])}"
+    )
 
 
 def calls(source: str, name: str) -> list[int]:
     """Lines that use an attribute chain such as jax.lax.scan or jax.config.update."""
-    return [node.lineno for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute) and ast.unparse(node) == name]
+    return [
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute) and ast.unparse(node) == name
+    ]
 
 
 def test_time_is_scanned_in_one_place():
-    """lax.scan is a loop over time, which is the engine's; stages of an integrator, iterations, the samples that an exported law is tested
-    with and checkers' loops are no runs."""
+    """lax.scan is a loop over time, which is the engine's; stages of an integrator, iterations, the
+    samples that an exported law is tested with and checkers' loops are no runs."""
     allowed = {"simulation/integrators.py", "core/linalg.py", "core/qp.py", "deployment/export.py"}
-    users = {str(p.relative_to(PACKAGE)) for p, text in SOURCES.items() if calls(text, "jax.lax.scan") or calls(text, "lax.scan")}
+    users = {
+        str(p.relative_to(PACKAGE))
+        for p, text in SOURCES.items()
+        if calls(text, "jax.lax.scan") or calls(text, "lax.scan")
+    }
     assert {p for p in users if not p.startswith(("engine/", "testing/"))} == allowed
 
 
 def test_the_session_is_left_alone():
-    """jax.config belongs to the user: the command line, a program of its own, sets it, and the cache of compiled programs its fields; which
-    device is the default is read."""
-    users = {p.relative_to(PACKAGE): text for p, text in SOURCES.items() if calls(text, "jax.config")}
-    assert {p for p in users if p.parts[0] != "cli"} == {Path("core/cache.py"), Path("core/devices.py")}
+    """jax.config belongs to the user: the command line, a program of its own, sets it, and the
+    cache of compiled programs its fields; which device is the default is read."""
+    users = {
+        p.relative_to(PACKAGE): text for p, text in SOURCES.items() if calls(text, "jax.config")
+    }
+    assert {p for p in users if p.parts[0] != "cli"} == {
+        Path("core/cache.py"),
+        Path("core/devices.py"),
+    }
     assert not calls(users[Path("core/devices.py")], "jax.config.update")
 
 
@@ -147,7 +189,9 @@ def test_no_prints_and_no_star_imports():
         assert "import *" not in text, path
         if module_of(path) != "cli":
             tree = ast.walk(ast.parse(text))
-            assert not [n for n in tree if isinstance(n, ast.Call) and ast.unparse(n.func) == "print"], path
+            assert not [
+                n for n in tree if isinstance(n, ast.Call) and ast.unparse(n.func) == "print"
+            ], path
 
 
 def test_files_open_with_what_they_are_for():
@@ -170,8 +214,17 @@ def test_these_tests_can_fail():
     plot = "def plot(self):\n    from iblf_jax import plotting"
     assert upward("simulation", plot) == set()
     assert upward("simulation", plot, at_the_top=False) == {"plotting"}
-    assert upward("simulation", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from iblf_jax import plotting") == set()
+    assert (
+        upward(
+            "simulation",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from iblf_jax import"
+            " plotting",
+        )
+        == set()
+    )
     assert upward("engine", "from iblf_jax.bounds import Tube") == set()
     assert imports("def f():\n    import optax.losses", at_the_top=False) == {"optax.losses"}
-    assert calls("import jax\nx = jax.lax.scan(f, 0, None)\njax.config.update('a', 1)", "jax.lax.scan") == [2]
+    assert calls(
+        "import jax\nx = jax.lax.scan(f, 0, None)\njax.config.update('a', 1)", "jax.lax.scan"
+    ) == [2]
     assert calls("import jax\njax.config.update('a', 1)", "jax.config") == [2]

@@ -1,4 +1,5 @@
-"""The live page: its sliders, and its curves against `simulate`, in Node.js and in a browser where there is one."""
+"""The live page: its sliders, and its curves against `simulate`, in Node.js and in a browser where
+there is one."""
 
 from __future__ import annotations
 
@@ -17,7 +18,14 @@ import iblf_jax as ij
 from iblf_jax.deployment import live
 from iblf_jax.kernels.toolchain import ToolchainError
 
-BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+BROWSER = next(
+    (
+        path
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (path := shutil.which(name))
+    ),
+    None,
+)
 NODE = shutil.which("node")
 LAWS = {"integral": {"K2": 20.0}, "log": {"K2": 12.0, "q": 0.6}}
 """Law -> where it starts on the page with two laws."""
@@ -36,7 +44,10 @@ def page():
 def two_laws():
     """A page with two laws of the same names of parameters, with other numbers."""
     changed = {"controller.K2": 12.0, "initial.q[0]": 0.6}
-    laws = {"integral": ij.presets.zhang_yan_2024(), "log": ij.with_parameters(ij.presets.zhang_yan_2024(law="log"), changed)}
+    laws = {
+        "integral": ij.presets.zhang_yan_2024(),
+        "log": ij.with_parameters(ij.presets.zhang_yan_2024(law="log"), changed),
+    }
     return ij.explore(laws, duration=0.25, dt=5e-4)
 
 
@@ -46,10 +57,20 @@ def in_node(page, tmp_path: Path, actions: list, address: str = "") -> list[dict
         pytest.skip("Node.js is not installed")
     (tmp_path / "page.html").write_text(page.text, encoding="utf-8")
     (tmp_path / "actions.json").write_text(json.dumps(actions), encoding="utf-8")
-    command = [NODE, str(Path(__file__).with_name("live_page.js")), "page.html", "actions.json", address]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    command = [
+        NODE,
+        str(Path(__file__).with_name("live_page.js")),
+        "page.html",
+        "actions.json",
+        address,
+    ]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.strip().split("\n")]  # not splitlines: a name may hold U+2028
+    return [
+        json.loads(line) for line in done.stdout.strip().split("\n")
+    ]  # not splitlines: a name may hold U+2028
 
 
 def simulated(law: str, **changed: float):
@@ -85,15 +106,21 @@ def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
 
 def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_path):
     address = "?law=log&controller.K2=130&initial.q[0]=0.55&observer.kf=many&initial.q[1]="
-    begin, other, back = in_node(two_laws, tmp_path, [{}, {"law": "integral"}, {"law": "log"}], address)
+    begin, other, back = in_node(
+        two_laws, tmp_path, [{}, {"law": "integral"}, {"law": "log"}], address
+    )
     assert (begin["law"], other["law"]) == ("log", "integral")
     for one in (begin, other, back):
-        np.testing.assert_allclose(np.exp(one["places"]["controller.K2"]), 130.0)  # beyond the usual end of the slider
+        np.testing.assert_allclose(
+            np.exp(one["places"]["controller.K2"]), 130.0
+        )  # beyond the usual end of the slider
         assert one["shown"]["controller.K2"].startswith("130 ")
         assert one["q"][0][0] == 0.55
         assert "NaN" not in str(one["shown"])
     np.testing.assert_array_equal(begin["q"], back["q"])
-    np.testing.assert_allclose(begin["q"], simulated("log", **{"controller.K2": 130.0, "initial.q[0]": 0.55}), atol=1e-9)
+    np.testing.assert_allclose(
+        begin["q"], simulated("log", **{"controller.K2": 130.0, "initial.q[0]": 0.55}), atol=1e-9
+    )
     assert in_node(two_laws, tmp_path, [{}], "?law=constructor")[0]["law"] == "integral"
 
 
@@ -122,7 +149,13 @@ class Scripts(HTMLParser):
         self.comments.append(data)
 
 
-NAMES = ["<!--<script>", "</script><img src=x> & b", "\u2028\u2029", "constructor", 'say "no" \\u003c $x ${y} `z`']
+NAMES = [
+    "<!--<script>",
+    "</script><img src=x> & b",
+    "\u2028\u2029",
+    "constructor",
+    'say "no" \\u003c $x ${y} `z`',
+]
 
 
 def test_names_cannot_end_or_change_the_script_of_a_page(two_laws, tmp_path):
@@ -140,7 +173,15 @@ def test_names_cannot_end_or_change_the_script_of_a_page(two_laws, tmp_path):
 def test_names_of_scenarios_are_words(monkeypatch):
     monkeypatch.setattr(live, "export", None)  # nothing is built before the names are checked
     scenario = ij.presets.zhang_yan_2024()
-    for bad in ({}, {1: scenario}, {"__proto__": scenario}, {"a": 3}, {"a": scenario, "b": None}, [scenario], None):
+    for bad in (
+        {},
+        {1: scenario},
+        {"__proto__": scenario},
+        {"a": 3},
+        {"a": scenario, "b": None},
+        [scenario],
+        None,
+    ):
         with pytest.raises(ValueError, match=r"scenario: got .*, expected .*cenario"):
             ij.explore(bad)
 
@@ -148,8 +189,17 @@ def test_names_of_scenarios_are_words(monkeypatch):
 def test_gains_starts_and_bounds_have_sliders(page):
     table = json.loads(re.search(r"const LOOPS = (.*);", page.text)[1])[""]["table"]
     sliders = {p["path"]: p for p in table["parameters"] if "slider" in p}
-    assert {"controller.k1", "controller.K2", "observer.kf", "initial.q", "bounds.upper.offset"} <= set(sliders)
-    assert sliders["controller.K2"]["slider"] == [[4.0, 100.0]] and not sliders["controller.K2"]["each"]
+    assert {
+        "controller.k1",
+        "controller.K2",
+        "observer.kf",
+        "initial.q",
+        "bounds.upper.offset",
+    } <= set(sliders)
+    assert (
+        sliders["controller.K2"]["slider"] == [[4.0, 100.0]]
+        and not sliders["controller.K2"]["each"]
+    )
     assert not re.search(r'(?:src|href)="(?!data:)', page.text)
 
 
@@ -171,15 +221,33 @@ def test_a_slider_that_is_moved_changes_the_curve_to_what_simulate_gives(page, t
     found = {}
     for name, text in {"before": page.text, "after": page.text.replace("</body>", MOVE)}.items():
         path.write_text(text, encoding="utf-8")
-        command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}", "--dump-dom", path.as_uri()]
-        dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+        command = [
+            BROWSER,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={tmp_path}",
+            "--dump-dom",
+            path.as_uri(),
+        ]
+        dom = subprocess.run(
+            command, capture_output=True, text=True, timeout=120, check=True
+        ).stdout
         found[name] = json.loads(html.unescape(re.search(r'data-run="([^"]*)"', dom)[1]))
     for name, K2, tolerance in (("before", 20.0, 1e-9), ("after", 30.0, 1e-6)):
         scenario = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": K2})
         run = ij.simulate(scenario, duration=2.0, dt=1e-3, record_every=4)
         # A slider has 400 places: the nearest to 30 is not 30.
-        place = np.exp(np.log(4.0) + np.round((np.log(30.0) - np.log(4.0)) / (np.log(25.0) / 400)) * np.log(25.0) / 400)
+        place = np.exp(
+            np.log(4.0)
+            + np.round((np.log(30.0) - np.log(4.0)) / (np.log(25.0) / 400)) * np.log(25.0) / 400
+        )
         if name == "after":
-            run = ij.simulate(ij.with_parameters(scenario, {"controller.K2": place}), duration=2.0, dt=1e-3, record_every=4)
+            run = ij.simulate(
+                ij.with_parameters(scenario, {"controller.K2": place}),
+                duration=2.0,
+                dt=1e-3,
+                record_every=4,
+            )
         np.testing.assert_allclose(np.asarray(found[name]["q"]).T, run.q, atol=tolerance)
     assert np.abs(np.subtract(found["before"]["q"], found["after"]["q"])).max() > 1e-4

@@ -1,4 +1,5 @@
-"""Arms from files: what is read, which chain is picked, and that no file, however bad, does more than raise a ValueError."""
+"""Arms from files: what is read, which chain is picked, and that no file, however bad, does more
+than raise a ValueError."""
 
 from __future__ import annotations
 
@@ -23,7 +24,10 @@ import iblf_jax as ij
 
 mujoco = pytest.importorskip("mujoco")
 
-SOLID = '<inertial><origin xyz="0 0 0.1"/><mass value="1.5"/><inertia ixx="0.02" iyy="0.03" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+SOLID = (
+    '<inertial><origin xyz="0 0 0.1"/><mass value="1.5"/><inertia ixx="0.02" iyy="0.03" izz="0.01"'
+    ' ixy="0" ixz="0" iyz="0"/></inertial>'
+)
 LIMIT = '<limit lower="-1" upper="2" effort="7" velocity="1"/>'
 
 
@@ -33,7 +37,10 @@ def link(name: str, inside: str = SOLID) -> str:
 
 def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT) -> str:
     ends = f'<parent link="{parent}"/><child link="{child}"/>'
-    return f'<joint name="{name}" type="{kind}">{ends}<origin xyz="0 0 0.2" rpy="0.3 0 0"/><axis xyz="0 1 0"/>{inside}</joint>'
+    return (
+        f'<joint name="{name}" type="{kind}">{ends}<origin xyz="0 0 0.2" rpy="0.3 0 0"/><axis'
+        f' xyz="0 1 0"/>{inside}</joint>'
+    )
 
 
 def robot(*parts: str) -> str:
@@ -45,13 +52,20 @@ GRIPPER = (
     joint("shoulder", "base", "upper", inside=LIMIT + '<dynamics damping="0.4" friction="0.2"/>'),
     joint("elbow", "upper", "fore", "continuous", ""),
     joint("flange", "fore", "tool", "fixed", ""),
-    joint("finger", "tool", "left", "prismatic", '<limit lower="0" upper="0.04" effort="3" velocity="1"/>'),
+    joint(
+        "finger",
+        "tool",
+        "left",
+        "prismatic",
+        '<limit lower="0" upper="0.04" effort="3" velocity="1"/>',
+    ),
     joint(
         "other",
         "tool",
         "right",
         "prismatic",
-        '<limit lower="0" upper="0.04" effort="3" velocity="1"/><mimic joint="finger" multiplier="2"/>',
+        '<limit lower="0" upper="0.04" effort="3" velocity="1"/><mimic joint="finger"'
+        ' multiplier="2"/>',
     ),
 )
 """Two joints, and a gripper with a finger that follows the other."""
@@ -93,7 +107,8 @@ def test_seven_joints_without_a_tip():
 
 
 def test_locked_joints_keep_their_links(file):
-    """A mimic follows the joint that is locked, and the whole has the dynamics of a file with that joint fixed there."""
+    """A mimic follows the joint that is locked, and the whole has the dynamics of a file with that
+    joint fixed there."""
     arm = ij.robots.load(file(robot(*GRIPPER)), tip="tool", locked={"finger": 0.03})
     fixed = []
     for name, child, along in (("finger", "left", 0.03), ("other", "right", 0.06)):
@@ -121,7 +136,9 @@ def test_the_base_is_the_world_and_gravity_turns_with_it(file):
 
 
 def test_gravity_can_be_given(file):
-    np.testing.assert_allclose(ij.robots.load(file(robot(*GRIPPER)), tip="tool", gravity=[1.62, 0, 0]).g, [1.62, 0, 0])
+    np.testing.assert_allclose(
+        ij.robots.load(file(robot(*GRIPPER)), tip="tool", gravity=[1.62, 0, 0]).g, [1.62, 0, 0]
+    )
 
 
 @pytest.mark.slow
@@ -171,7 +188,20 @@ def test_mjcf_without_gravity(file):
 
 CORNERS = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (0.0, 0.3)])
 FACES = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    [
+        (0, 1, 3),
+        (0, 3, 2),
+        (4, 6, 7),
+        (4, 7, 5),
+        (0, 4, 5),
+        (0, 5, 1),
+        (2, 3, 7),
+        (2, 7, 6),
+        (0, 2, 6),
+        (0, 6, 4),
+        (1, 5, 7),
+        (1, 7, 3),
+    ]
 )
 """A box, its corners [m] and its triangles."""
 MESHED = """<mujoco><compiler meshdir="meshes"/><default><mesh scale="0.5 0.5 0.5"/></default>
@@ -189,12 +219,15 @@ MESHED = """<mujoco><compiler meshdir="meshes"/><default><mesh scale="0.5 0.5 0.
 
 @pytest.fixture
 def meshed(file, tmp_path):
-    """An MJCF whose chain to "c" is weighed by meshes, and whose other body would be by one that is not there."""
+    """An MJCF whose chain to "c" is weighed by meshes, and whose other body would be by one that is
+    not there."""
     (tmp_path / "meshes" / "deep").mkdir(parents=True)
     lines = [f"v {x} {y} {z}" for x, y, z in CORNERS] + [f"f {i} {j} {k}" for i, j, k in FACES + 1]
     file("\n".join(lines), "meshes/box.obj")
     triangles = b"".join(struct.pack("<12fH", 0, 0, 0, *CORNERS[face].ravel(), 0) for face in FACES)
-    (tmp_path / "meshes" / "deep" / "box.stl").write_bytes(bytes(80) + struct.pack("<I", len(FACES)) + triangles)
+    (tmp_path / "meshes" / "deep" / "box.stl").write_bytes(
+        bytes(80) + struct.pack("<I", len(FACES)) + triangles
+    )
     return file(MESHED)
 
 
@@ -216,17 +249,24 @@ def test_meshes_weigh_what_they_weigh_in_mujoco(meshed):
     ("damage", "message"),
     [
         (lambda path: path.unlink(), "got '.*deep/box.stl'.*Nothing is there.*<inertial>"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-1]), "box.stl, expected a surface around a volume.*wrong size.*<inertial>"),
+        (
+            lambda path: path.write_bytes(path.read_bytes()[:-1]),
+            "box.stl, expected a surface around a volume.*wrong size.*<inertial>",
+        ),
         (lambda path: path.write_bytes(b""), "empty"),
         (lambda path: (path.unlink(), os.mkfifo(path)), "not a file"),
         (lambda path: (path.unlink(), path.mkdir()), "a directory"),
     ],
 )
-def test_a_mesh_that_cannot_be_weighed_is_a_fault_of_its_body_alone(meshed, tmp_path, damage, message):
+def test_a_mesh_that_cannot_be_weighed_is_a_fault_of_its_body_alone(
+    meshed, tmp_path, damage, message
+):
     damage(tmp_path / "meshes" / "deep" / "box.stl")
     with pytest.raises(ValueError, match=f"body 'b': mesh 'cube': .*{message}"):
         ij.robots.load(meshed, tip="c")
-    with pytest.raises(ValueError, match=r"body 'other': mesh 'unused': got .*nowhere.stl', .*Nothing is there"):
+    with pytest.raises(
+        ValueError, match=r"body 'other': mesh 'unused': got .*nowhere.stl', .*Nothing is there"
+    ):
         ij.robots.load(meshed, tip="other")
 
 
@@ -261,7 +301,9 @@ def including(name: str) -> str:
 
 def test_an_include_in_a_folder_below_is_read(file, tmp_path):
     (tmp_path / "parts").mkdir()
-    file("<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>", "parts/more.xml")
+    file(
+        "<mujoco><worldbody><body name='table' pos='1 0 0'/></worldbody></mujoco>", "parts/more.xml"
+    )
     assert ij.robots.load(file(including("parts/more.xml")), tip="ee").n == 3
     assert ij.robots.load(file(including("./parts/../parts/more.xml")), tip="ee").n == 3
 
@@ -282,7 +324,10 @@ def test_an_include_outside_the_folder_of_the_file_is_refused(leads, tmp_path):
     }[leads]
     path = tmp_path / "arm" / "arm.xml"
     path.write_text(including(name))
-    with pytest.raises(ValueError, match=r"arm\.xml: <include>: file: got .*, expected a file in the folder of the.*Copy"):
+    with pytest.raises(
+        ValueError,
+        match=r"arm\.xml: <include>: file: got .*, expected a file in the folder of the.*Copy",
+    ):
         ij.robots.load(path, tip="ee")
 
 
@@ -295,7 +340,11 @@ WEIGHTLESS = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1"/></ine
 
 
 def bad_inertia(text: str) -> str:
-    return robot(link("base", ""), link("a", SOLID.replace('ixx="0.02" iyy="0.03" izz="0.01"', text)), joint("ja", "base", "a"))
+    return robot(
+        link("base", ""),
+        link("a", SOLID.replace('ixx="0.02" iyy="0.03" izz="0.01"', text)),
+        joint("ja", "base", "a"),
+    )
 
 
 BAD = {
@@ -346,29 +395,65 @@ SPHERE = '<geom size="0.1" mass="1"/>'
 
 
 def mjcf(inside: str, outside: str = "") -> str:
-    return f'<mujoco><worldbody><body name="a"><joint name="ja"/>{SPHERE}{inside}</body></worldbody>{outside}</mujoco>'
+    return (
+        '<mujoco><worldbody><body name="a"><joint'
+        f' name="ja"/>{SPHERE}{inside}</body></worldbody>{outside}</mujoco>'
+    )
 
 
 BAD_MJCF = {
     "no bodies": ("<mujoco/>", "no <body>"),
-    "ball": (mjcf(f'<body name="b"><joint name="jb" type="ball"/>{SPHERE}</body>'), "joint 'jb'.*ball"),
-    "free": (f'<mujoco><worldbody><body name="a"><freejoint name="f"/>{SPHERE}</body></worldbody></mujoco>', "joint 'f'.*free"),
+    "ball": (
+        mjcf(f'<body name="b"><joint name="jb" type="ball"/>{SPHERE}</body>'),
+        "joint 'jb'.*ball",
+    ),
+    "free": (
+        (
+            '<mujoco><worldbody><body name="a"><freejoint'
+            f' name="f"/>{SPHERE}</body></worldbody></mujoco>'
+        ),
+        "joint 'f'.*free",
+    ),
     "mesh": (mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>'), "body 'b'.*mesh"),
     "missing mesh": (
-        mjcf('<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'),
+        mjcf(
+            '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>',
+            '<asset><mesh name="m" file="m.stl"/></asset>',
+        ),
         "body 'b': mesh 'm': got .*m.stl'.*Nothing is there.*<inertial>",
     ),
-    "height field": (mjcf('<body name="b"><joint/><geom type="hfield" hfield="h"/></body>'), "body 'b'.*height field 'h'"),
-    "compensated gravity": (mjcf(f'<body name="b" gravcomp="1"><joint/>{SPHERE}</body>'), "body 'b': gravcomp: got 1.0.*repair=True"),
+    "height field": (
+        mjcf('<body name="b"><joint/><geom type="hfield" hfield="h"/></body>'),
+        "body 'b'.*height field 'h'",
+    ),
+    "compensated gravity": (
+        mjcf(f'<body name="b" gravcomp="1"><joint/>{SPHERE}</body>'),
+        "body 'b': gravcomp: got 1.0.*repair=True",
+    ),
     "no mass": (mjcf('<body name="b"><joint/></body>'), "'b'"),
-    "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness"),
+    "spring": (
+        mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'),
+        "joint 'jb': stiffness",
+    ),
     "connect": (
-        mjcf(f'<body name="b"><joint/>{SPHERE}</body>', '<equality><connect name="c" body1="a" body2="b" anchor="0 0 0"/></equality>'),
+        mjcf(
+            f'<body name="b"><joint/>{SPHERE}</body>',
+            '<equality><connect name="c" body1="a" body2="b" anchor="0 0 0"/></equality>',
+        ),
         "equality 'c'.*tied together",
     ),
-    "weld": (mjcf("", '<equality><weld name="c" body1="a"/></equality>'), "equality 'c'.*tied together"),
-    "coupled": (mjcf("", '<equality><joint name="c" joint1="ja"/></equality>'), "equality 'c'.*'ja' tied"),
-    "replicate": ('<mujoco><worldbody><replicate count="1000000000"><body/></replicate></worldbody></mujoco>', "replicate"),
+    "weld": (
+        mjcf("", '<equality><weld name="c" body1="a"/></equality>'),
+        "equality 'c'.*tied together",
+    ),
+    "coupled": (
+        mjcf("", '<equality><joint name="c" joint1="ja"/></equality>'),
+        "equality 'c'.*'ja' tied",
+    ),
+    "replicate": (
+        '<mujoco><worldbody><replicate count="1000000000"><body/></replicate></worldbody></mujoco>',
+        "replicate",
+    ),
     "repeated": (mjcf(f'<body name="a">{SPHERE}</body>'), "repeated name 'a'"),
     "infinite": (mjcf(f'<body name="b" pos="0 inf 0">{SPHERE}</body>'), "body 'b': pos.*finite"),
     "no such include": ('<mujoco><include file="nowhere.xml"/></mujoco>', "nowhere.xml"),
@@ -399,11 +484,21 @@ PLACES = {
 @pytest.mark.parametrize("text", STRANGE_NUMBERS)
 def test_numbers_that_are_not_decimal_are_refused_with_file_element_and_attribute(text, file):
     for place, inside in PLACES.items():
-        path = file(robot(link("base", ""), link("a", inside.format(text)), joint("ja", "base", "a")))
+        path = file(
+            robot(link("base", ""), link("a", inside.format(text)), joint("ja", "base", "a"))
+        )
         with pytest.raises(ValueError, match=f"arm.urdf: {place}: got .*, expected .*finite"):
             ij.robots.load(path)
-    path = file(robot(link("base", ""), link("a"), joint("ja", "base", "a", inside=LIMIT.replace('"2"', f'"{text}"'))))
-    with pytest.raises(ValueError, match=r"arm.urdf: joint 'ja': limit upper: got .*, expected .*finite"):
+    path = file(
+        robot(
+            link("base", ""),
+            link("a"),
+            joint("ja", "base", "a", inside=LIMIT.replace('"2"', f'"{text}"')),
+        )
+    )
+    with pytest.raises(
+        ValueError, match=r"arm.urdf: joint 'ja': limit upper: got .*, expected .*finite"
+    ):
         ij.robots.load(path)
     path = file(mjcf(f'<body name="b" pos="0 {text} 0">{SPHERE}</body>'))
     with pytest.raises(ValueError, match=r"arm.urdf: body 'b': pos: got .*, expected .*finite"):
@@ -412,7 +507,15 @@ def test_numbers_that_are_not_decimal_are_refused_with_file_element_and_attribut
 
 @pytest.mark.parametrize("text", ["2.5", "+2.5", "25e-1", "2.5E+0", ".25e1", "\n\t2.5 "])
 def test_decimal_numbers_are_read(text, file):
-    arm = ij.robots.load(file(robot(link("base", ""), link("a", SOLID.replace('"1.5"', f'"{text}"')), joint("ja", "base", "a"))))
+    arm = ij.robots.load(
+        file(
+            robot(
+                link("base", ""),
+                link("a", SOLID.replace('"1.5"', f'"{text}"')),
+                joint("ja", "base", "a"),
+            )
+        )
+    )
     np.testing.assert_array_equal(arm.mass, [2.5])
 
 
@@ -422,8 +525,14 @@ def test_every_refusal_of_a_field_names_the_file(file):
         with pytest.raises(ValueError, match=r"arm\.urdf") as caught:
             ij.robots.load(path)
         assert str(caught.value).count(str(path)) == 1, name
-    for arguments in ({"base": "bases"}, {"tip": "tool", "gravity": 9.81}, {"tip": "tool", "locked": {"elbows": 0.0}}):
-        with pytest.raises(ValueError, match=rf"^{list(arguments)[-1]}: got .* The file is .*arm\.urdf"):
+    for arguments in (
+        {"base": "bases"},
+        {"tip": "tool", "gravity": 9.81},
+        {"tip": "tool", "locked": {"elbows": 0.0}},
+    ):
+        with pytest.raises(
+            ValueError, match=rf"^{list(arguments)[-1]}: got .* The file is .*arm\.urdf"
+        ):
             ij.robots.load(file(robot(*GRIPPER)), **arguments)
 
 
@@ -485,9 +594,29 @@ def test_without_the_extra_the_message_says_how(monkeypatch, file):
 
 # ------------------------------------------------------------------------------------------------------------- mutated files
 
-SOURCES = [(ARMS / "ur5.urdf").read_text(), robot(*GRIPPER), MJCF.format(finger='<joint name="jf" axis="1 0 0"/>')]
+SOURCES = [
+    (ARMS / "ur5.urdf").read_text(),
+    robot(*GRIPPER),
+    MJCF.format(finger='<joint name="jf" axis="1 0 0"/>'),
+]
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
-VALUES = ["nan", "inf", "-1", "0", "1e308", "1e-308", "1e400", "", "abc", "0 0", "1 2 3 4 5", "9" * 400, "1e9", "-1e-3", "true"]
+VALUES = [
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1e308",
+    "1e-308",
+    "1e400",
+    "",
+    "abc",
+    "0 0",
+    "1 2 3 4 5",
+    "9" * 400,
+    "1e9",
+    "-1e-3",
+    "true",
+]
 
 
 @st.composite
@@ -495,7 +624,10 @@ def mutated(draw) -> bytes:
     """A description with bytes, numbers, passages or elements changed, lost, doubled or moved."""
     text = draw(st.sampled_from(SOURCES))
     for _ in range(draw(st.integers(1, 3))):
-        kind, place = draw(st.sampled_from(["bytes", "number", "passage", "element"])), draw(st.integers(0, len(text) - 1))
+        kind, place = (
+            draw(st.sampled_from(["bytes", "number", "passage", "element"])),
+            draw(st.integers(0, len(text) - 1)),
+        )
         if kind == "bytes":
             text = text[:place] + draw(st.text(max_size=3)) + text[place + 1 :]
         elif kind == "number":
@@ -506,7 +638,11 @@ def mutated(draw) -> bytes:
         elif kind == "passage":
             passage = text[place : place + draw(st.integers(1, 200))]
             target = draw(st.integers(0, len(text) - 1))
-            text = text.replace(passage, "", 1) if draw(st.booleans()) else text[:target] + passage + text[target:]
+            text = (
+                text.replace(passage, "", 1)
+                if draw(st.booleans())
+                else text[:target] + passage + text[target:]
+            )
         else:
             text = _element_changed(draw, text, place)
         text = text or " "
@@ -572,22 +708,47 @@ def weighing(inertia: str, mass: str = "1.5", place: str = "0 0 0.1", also: str 
 
 def arm_with(*more: str, a: str = SOLID, ja: str = LIMIT) -> str:
     """A chain base - a - b, and what is to hang on it."""
-    return robot(link("base", ""), link("a", a), link("b"), joint("ja", "base", "a", inside=ja), joint("jb", "a", "b"), *more)
+    return robot(
+        link("base", ""),
+        link("a", a),
+        link("b"),
+        joint("ja", "base", "a", inside=ja),
+        joint("jb", "a", "b"),
+        *more,
+    )
 
 
-NO_INERTIA, NEGATIVE, IMPOSSIBLE = weighing("0 0 0"), weighing("0.02 -0.03 0.01"), weighing("0.02 0.09 0.01")
+NO_INERTIA, NEGATIVE, IMPOSSIBLE = (
+    weighing("0 0 0"),
+    weighing("0.02 -0.03 0.01"),
+    weighing("0.02 0.09 0.01"),
+)
 
 NO_MATTER = {
-    "inertia of what the base carries": arm_with(link("x", IMPOSSIBLE), joint("jx", "base", "x", "fixed", "")),
+    "inertia of what the base carries": arm_with(
+        link("x", IMPOSSIBLE), joint("jx", "base", "x", "fixed", "")
+    ),
     "inertia on another branch": arm_with(link("x", NEGATIVE), joint("jx", "base", "x")),
-    "numbers on another branch": arm_with(link("x", SOLID.replace("0.02", "nan")), joint("jx", "base", "x").replace("0.3 0 0", "$(x)")),
-    "no range on another branch": arm_with(link("x"), joint("jx", "base", "x", inside='<limit lower="0" upper="0" effort="-1"/>')),
+    "numbers on another branch": arm_with(
+        link("x", SOLID.replace("0.02", "nan")), joint("jx", "base", "x").replace("0.3 0 0", "$(x)")
+    ),
+    "no range on another branch": arm_with(
+        link("x"), joint("jx", "base", "x", inside='<limit lower="0" upper="0" effort="-1"/>')
+    ),
     "a free body on another branch": arm_with(link("x"), joint("jx", "base", "x", "floating", "")),
-    "no range of a finger": arm_with(link("x", weighing("0 0 0", "0")), joint("jx", "b", "x", "prismatic", "")),
-    "a point welded on": arm_with(link("x", NO_INERTIA.replace("1.5", "0.2")), joint("jx", "b", "x", "fixed", "")),
-    "a moment of rounding": arm_with(link("x", weighing("-2e-35 0.01 0.01")), joint("jx", "b", "x", "fixed", "")),
+    "no range of a finger": arm_with(
+        link("x", weighing("0 0 0", "0")), joint("jx", "b", "x", "prismatic", "")
+    ),
+    "a point welded on": arm_with(
+        link("x", NO_INERTIA.replace("1.5", "0.2")), joint("jx", "b", "x", "fixed", "")
+    ),
+    "a moment of rounding": arm_with(
+        link("x", weighing("-2e-35 0.01 0.01")), joint("jx", "b", "x", "fixed", "")
+    ),
     "a rod that moves": arm_with(a=weighing("-2e-35 0.01 0.01")),
-    "a speck": arm_with(link("x", weighing("1e-22 1e-22 1e-22", "1e-18")), joint("jx", "b", "x", "fixed", "")),
+    "a speck": arm_with(
+        link("x", weighing("1e-22 1e-22 1e-22", "1e-18")), joint("jx", "b", "x", "fixed", "")
+    ),
     "an endless wheel": arm_with(ja='<limit lower="-1e16" upper="1e16" effort="7"/>'),
 }
 
@@ -598,47 +759,91 @@ def test_what_does_not_matter_refuses_no_file(name, file, recwarn):
     arm = ij.robots.load(file(NO_MATTER[name]), tip="b")
     assert not recwarn.list
     assert arm.repaired == ()
-    if "point" not in name and "moment" not in name and "rod" not in name:  # these have a weight, and it counts
+    if (
+        "point" not in name and "moment" not in name and "rod" not in name
+    ):  # these have a weight, and it counts
         np.testing.assert_allclose(arm.mass, plain.mass, rtol=1e-15)
         np.testing.assert_allclose(arm.inertia, plain.inertia, rtol=0, atol=1e-17)
 
 
 def test_a_point_that_is_welded_on_counts(file):
     arm = ij.robots.load(file(NO_MATTER["a point welded on"]), tip="b")
-    c, s = np.cos(0.3), np.sin(0.3)  # in the frame of b: the joint's place, then the point's in the frame of x
+    c, s = (
+        np.cos(0.3),
+        np.sin(0.3),
+    )  # in the frame of b: the joint's place, then the point's in the frame of x
     point, own = np.array([0, -0.1 * s, 0.2 + 0.1 * c]), np.array([0, 0, 0.1])
     centre = (0.2 * point + 1.5 * own) / 1.7
     d, e = point - centre, own - centre
-    J = np.diag([0.02, 0.03, 0.01]) + sum(m * (x @ x * np.eye(3) - np.outer(x, x)) for m, x in ((0.2, d), (1.5, e)))
+    J = np.diag([0.02, 0.03, 0.01]) + sum(
+        m * (x @ x * np.eye(3) - np.outer(x, x)) for m, x in ((0.2, d), (1.5, e))
+    )
     np.testing.assert_allclose(arm.mass[1], 1.7, rtol=1e-15)
     np.testing.assert_allclose(arm.centre[1], centre, atol=1e-15)
-    np.testing.assert_allclose(arm.inertia[1], [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        arm.inertia[1],
+        [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]],
+        rtol=1e-12,
+        atol=1e-15,
+    )
 
 
 WITH_REPAIR = {
-    "impossible inertia": (arm_with(a=IMPOSSIBLE), r"link 'a': inertia: from principal moments 0.01, 0.02, 0.09 to"),
-    "negative inertia": (arm_with(a=NEGATIVE), "link 'a': inertia: from principal moments -0.03, 0.01, 0.02 to"),
+    "impossible inertia": (
+        arm_with(a=IMPOSSIBLE),
+        r"link 'a': inertia: from principal moments 0.01, 0.02, 0.09 to",
+    ),
+    "negative inertia": (
+        arm_with(a=NEGATIVE),
+        "link 'a': inertia: from principal moments -0.03, 0.01, 0.02 to",
+    ),
     "no inertia": (arm_with(a=NO_INERTIA), "link 'a': inertia: from principal moments 0, 0, 0 to"),
     "no <inertia>": (
         arm_with(link("x", MASS_ONLY), joint("jx", "b", "x", "fixed", "")),
         "link 'x': inertia: from nothing to that of a point",
     ),
-    "inertia without mass": (arm_with(link("x", WEIGHTLESS), joint("jx", "b", "x", "fixed", "")), "link 'x'.*without a mass to"),
-    "no mass between": (arm_with(a="").replace('"0 1 0"', '"1 0 0"', 1), "link 'a': from no mass to no mass, as it is"),
-    "no range": (arm_with(ja='<limit lower="0" upper="0"/>'), r"joint 'ja': limit: from \(0.0, 0.0\) to no limits"),
+    "inertia without mass": (
+        arm_with(link("x", WEIGHTLESS), joint("jx", "b", "x", "fixed", "")),
+        "link 'x'.*without a mass to",
+    ),
+    "no mass between": (
+        arm_with(a="").replace('"0 1 0"', '"1 0 0"', 1),
+        "link 'a': from no mass to no mass, as it is",
+    ),
+    "no range": (
+        arm_with(ja='<limit lower="0" upper="0"/>'),
+        r"joint 'ja': limit: from \(0.0, 0.0\) to no limits",
+    ),
     "no <limit>": (arm_with(ja=""), "joint 'ja': limit: from nothing to no limits"),
-    "negative torque": (arm_with(ja=LIMIT.replace("7", "-1")), "joint 'ja': effort: from -1.0 to no limit"),
-    "negative speed": (arm_with(ja=LIMIT.replace('velocity="1"', 'velocity="-1"')), "joint 'ja': velocity: from -1.0 to no limit"),
+    "negative torque": (
+        arm_with(ja=LIMIT.replace("7", "-1")),
+        "joint 'ja': effort: from -1.0 to no limit",
+    ),
+    "negative speed": (
+        arm_with(ja=LIMIT.replace('velocity="1"', 'velocity="-1"')),
+        "joint 'ja': velocity: from -1.0 to no limit",
+    ),
     "mimic of nothing": (
         arm_with(ja=LIMIT + '<mimic joint="x"/>'),
         "joint 'ja': from a mimic of 'x' in the chain to one that moves by itself",
     ),
-    "mimic": (arm_with(ja=LIMIT + '<mimic joint="jb"/>'), "joint 'ja': from a mimic of 'jb' in the chain to one that moves by itself"),
-    "spring": (mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'), "joint 'jb': stiffness: from 3.0 to 0"),
-    "coupled": (BAD_MJCF["coupled"][0], "joint 'ja': from one tied to another by equality 'c' to one that moves by itself"),
+    "mimic": (
+        arm_with(ja=LIMIT + '<mimic joint="jb"/>'),
+        "joint 'ja': from a mimic of 'jb' in the chain to one that moves by itself",
+    ),
+    "spring": (
+        mjcf(f'<body name="b"><joint name="jb" stiffness="3"/>{SPHERE}</body>'),
+        "joint 'jb': stiffness: from 3.0 to 0",
+    ),
+    "coupled": (
+        BAD_MJCF["coupled"][0],
+        "joint 'ja': from one tied to another by equality 'c' to one that moves by itself",
+    ),
     "tendon": (
         mjcf(
-            "", '<tendon><fixed name="t"><joint joint="ja" coef="1"/></fixed></tendon><equality><tendon name="e" tendon1="t"/></equality>'
+            "",
+            '<tendon><fixed name="t"><joint joint="ja" coef="1"/></fixed></tendon><equality><tendon'
+            ' name="e" tendon1="t"/></equality>',
         ),
         "joint 'ja': from one tied to another by tendon 'e' to one that moves by itself",
     ),
@@ -649,8 +854,14 @@ WITH_REPAIR = {
         "equality 'w': from 'm' and 'a' tied together to no tie",
     ),
     "mjcf inertia": (
-        mjcf('<body name="b"><joint/><inertial pos="0 0 .1" euler="0 30 0" mass="1" diaginertia=".01 .01 .03"/></body>'),
-        "body 'b': inertia: from principal moments 0.01, 0.01, 0.03 to principal moments 0.015, 0.015, 0.03",
+        mjcf(
+            '<body name="b"><joint/><inertial pos="0 0 .1" euler="0 30 0" mass="1" diaginertia=".01'
+            ' .01 .03"/></body>'
+        ),
+        (
+            "body 'b': inertia: from principal moments 0.01, 0.01, 0.03 to principal moments 0.015,"
+            " 0.015, 0.03"
+        ),
     ),
 }
 
@@ -674,12 +885,17 @@ def test_the_change_is_the_smallest(inertia, also, file):
     """No positive matrix is nearer to the second moments of the file, and mass and centre stay."""
     solid = weighing(inertia, also=also)
     with pytest.warns(UserWarning, match="repaired"):
-        arm = ij.robots.load(file(arm_with(link("x", solid), joint("jx", "b", "x", "fixed", ""))), tip="b", repair=True)
+        arm = ij.robots.load(
+            file(arm_with(link("x", solid), joint("jx", "b", "x", "fixed", ""))),
+            tip="b",
+            repair=True,
+        )
     assert len(arm.repaired) == 1
     plain = ij.robots.load(file(arm_with()), tip="b")
     numbers = ("mass", "centre", "inertia")
     gained = sum(
-        sign * np.asarray(ij.robots.spatial.pseudo_inertia(*(getattr(x, name)[1] for name in numbers)))
+        sign
+        * np.asarray(ij.robots.spatial.pseudo_inertia(*(getattr(x, name)[1] for name in numbers)))
         for sign, x in ((1, arm), (-1, plain))
     )
     turned, place = np.eye(4), np.eye(4)
@@ -691,7 +907,8 @@ def test_the_change_is_the_smallest(inertia, also, file):
     (xx, yy, zz), (xy, xz, yz) = (map(float, x.split()) for x in (inertia, also))
     J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     S, mended = 0.5 * np.trace(J) * np.eye(3) - J, P[:3, :3]
-    # the nearest point X of a convex cone to S: X in it, X - S in its dual (here the same cone), and the two orthogonal
+    # the nearest point X of a convex cone to S: X in it, X - S in its dual (here the same cone),
+    # and the two orthogonal
     assert np.linalg.eigvalsh(mended)[0] > -1e-14
     assert np.linalg.eigvalsh(mended - S)[0] > -1e-14
     assert abs(np.sum(mended * (mended - S))) < 1e-14
@@ -711,7 +928,11 @@ def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
         arm_with(a=SOLID.replace("1.5", "-1.5")),
         arm_with(ja='<limit lower="nan" upper="0"/>'),
         robot(link("base", ""), link("a"), link("b", ""), *CHAIN),
-        robot(link("base", ""), link("a", weighing("0 0 0", place="0 0 0")), joint("ja", "base", "a").replace("0 0 0.2", "0 0 0")),
+        robot(
+            link("base", ""),
+            link("a", weighing("0 0 0", place="0 0 0")),
+            joint("ja", "base", "a").replace("0 0 0.2", "0 0 0"),
+        ),
         arm_with(a="").replace("0.3 0 0", "0 0 0").replace("0 0 0.2", "0 0 0"),
         BAD_MJCF["connect"][0],
         BAD_MJCF["mesh"][0],
@@ -726,21 +947,51 @@ def test_what_no_rule_mends_is_refused(text, file):
 
 
 def test_mjcf_what_is_not_on_the_chain_refuses_no_file(file, recwarn):
-    """Weights of meshes, springs, actuators without a joint, ties of tendons, bodies without weight: all beside the chain."""
-    beside = '<body name="x"><joint name="jx" stiffness="3" damping="1e11"/><geom type="mesh" mesh="m"/></body>'
-    beside += '<body name="y"><joint name="jy" type="ball"/><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'
-    beside += '<body name="z"><joint name="jz"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/><geom type="mesh" mesh="m"/></body>'
-    outside = '<tendon><fixed name="t"><joint joint="jx" coef="1"/><joint joint="jz" coef="1"/></fixed></tendon>'
-    outside += '<equality><tendon tendon1="t"/></equality><actuator><motor tendon="t"/><motor joint="ja" ctrlrange="-2 2"/></actuator>'
+    """Weights of meshes, springs, actuators without a joint, ties of tendons, bodies without
+    weight: all beside the chain."""
+    beside = (
+        '<body name="x"><joint name="jx" stiffness="3" damping="1e11"/><geom type="mesh"'
+        ' mesh="m"/></body>'
+    )
+    beside += (
+        '<body name="y"><joint name="jy" type="ball"/><inertial pos="0 0 0" mass="0" diaginertia="0'
+        ' 0 0"/></body>'
+    )
+    beside += (
+        '<body name="z"><joint name="jz"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/><geom'
+        ' type="mesh" mesh="m"/></body>'
+    )
+    outside = (
+        '<tendon><fixed name="t"><joint joint="jx" coef="1"/><joint joint="jz"'
+        ' coef="1"/></fixed></tendon>'
+    )
+    outside += (
+        '<equality><tendon tendon1="t"/></equality><actuator><motor tendon="t"/><motor joint="ja"'
+        ' ctrlrange="-2 2"/></actuator>'
+    )
     outside += '<default><default class="seen"><geom type="mesh" density="0"/></default>'
-    outside += '<default class="drawn"><geom type="capsule" fromto="0 0 0 0 0 1" size="0.1" mass="0"/></default></default>'
-    seen = '<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen" mesh="m"/><geom size="0.2" pos="0 0 1"/>{}</body>'
+    outside += (
+        '<default class="drawn"><geom type="capsule" fromto="0 0 0 0 0 1" size="0.1"'
+        ' mass="0"/></default></default>'
+    )
+    seen = (
+        '<body name="b"><joint name="jb" axis="0 1 0" range="-1 1"/><geom class="seen"'
+        ' mesh="m"/><geom size="0.2" pos="0 0 1"/>{}</body>'
+    )
     drawn = seen.format('<geom class="drawn"/>')
-    arm = ij.robots.load(file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="b")
-    plain = ij.robots.load(file(mjcf(seen.format("").replace('<geom class="seen" mesh="m"/>', ""))), tip="b")
+    arm = ij.robots.load(
+        file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="b"
+    )
+    plain = ij.robots.load(
+        file(mjcf(seen.format("").replace('<geom class="seen" mesh="m"/>', ""))), tip="b"
+    )
     assert not recwarn.list
     np.testing.assert_array_equal(arm.mass, plain.mass)
     np.testing.assert_array_equal(arm.inertia, plain.inertia)
     np.testing.assert_allclose(arm.effort, [2.0, np.inf])
     with pytest.raises(ValueError, match=r"body 'x'.*mesh"):
-        ij.robots.load(file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")), tip="x", repair=True)
+        ij.robots.load(
+            file(mjcf(drawn, outside).replace("<worldbody>", f"<worldbody>{beside}")),
+            tip="x",
+            repair=True,
+        )

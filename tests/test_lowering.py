@@ -1,4 +1,5 @@
-"""Scalar programs: every member of every family lowers, and a program does what the step that it came from does."""
+"""Scalar programs: every member of every family lowers, and a program does what the step that it
+came from does."""
 
 from __future__ import annotations
 
@@ -32,15 +33,25 @@ DT = 1e-3
 STANDARD = standard()
 SPECIAL = {
     "arm": lambda cls: random_arm(2, seed=0, prismatic=0.0),
-    "planar_chain": lambda cls: cls(mass=[2.0, 0.85], length=[0.35, 0.31], centre=0.16, inertia=0.03),
-    "waypoint_spline": lambda cls: cls(times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]),
+    "planar_chain": lambda cls: cls(
+        mass=[2.0, 0.85], length=[0.35, 0.31], centre=0.16, inertia=0.03
+    ),
+    "waypoint_spline": lambda cls: cls(
+        times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]
+    ),
     "quintic": lambda cls: cls(start=0.5, end=0.6, duration=2.0),
-    "sum": lambda cls: cls((ij.disturbances.Friction(viscous=0.1, coulomb=0.2), ij.disturbances.Step(1.0, 0.0))),
+    "sum": lambda cls: cls(
+        (ij.disturbances.Friction(viscous=0.1, coulomb=0.2), ij.disturbances.Step(1.0, 0.0))
+    ),
     "tip_force": lambda cls: cls(amplitude=[1.0, 2.0], frequency=2.0),
     "funnel": lambda cls: cls(initial=0.4, final=0.2, rate=1.0),
     "constant": lambda cls: cls(0.95),
     "reference_governor": lambda cls: cls(ij.controllers.PDGravity(Kp=60.0, Kd=20.0)),
-    "surface_barrier": lambda cls: cls(a=2.0, K=5.0, surface=ij.Bounds(ij.bounds.Funnel(-9.0, -0.5, 1.5), ij.bounds.Constant([8.0, 6.0]))),
+    "surface_barrier": lambda cls: cls(
+        a=2.0,
+        K=5.0,
+        surface=ij.Bounds(ij.bounds.Funnel(-9.0, -0.5, 1.5), ij.bounds.Constant([8.0, 6.0])),
+    ),
     "safety_filter": lambda cls: cls(PRESET.controller, nearest="acceleration"),
     "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
     "extended_state": lambda cls: cls(bandwidth=40.0),
@@ -52,7 +63,11 @@ def example(name: str, cls):
     """A member with plausible numbers."""
     if name in SPECIAL:
         return SPECIAL[name](cls)
-    needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING]
+    needed = [
+        f
+        for f in dataclasses.fields(cls)
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    ]
     return cls(**{f.name: 0.3 + 0.1 * i for i, f in enumerate(needed)})
 
 
@@ -62,28 +77,47 @@ def with_member(family: str, name: str, cls):
         law = PRESET.controller
         barrier = cls()
         o = law.o if getattr(barrier, "uses_o", True) else None
-        return dataclasses.replace(PRESET, controller=ij.controllers.Backstepping(law.k1, law.K2, o, barrier))
+        return dataclasses.replace(
+            PRESET, controller=ij.controllers.Backstepping(law.k1, law.K2, o, barrier)
+        )
     kept = {"two_link": PRESET.plant, "backstepping": PRESET.controller}
-    part = kept.get(name) or (PRESET.reference if (family, name) == ("references", "sinusoid") else example(name, cls))
+    part = kept.get(name) or (
+        PRESET.reference if (family, name) == ("references", "sinusoid") else example(name, cls)
+    )
     if family == "bounds":
         upper = PRESET.bounds.upper if name == "sinusoid" else part
         return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(PRESET.bounds.lower, upper))
     fields = {"robots": ("plant", "model")}.get(family, (family[:-1],))
-    speeds = ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.0)) if getattr(part, "needs_velocity_bounds", False) else None
+    speeds = (
+        ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.0))
+        if getattr(part, "needs_velocity_bounds", False)
+        else None
+    )
     return dataclasses.replace(PRESET, velocity_bounds=speeds, **dict.fromkeys(fields, part))
 
 
-FAMILIES = ("barriers", "bounds", "controllers", "disturbances", "observers", "references", "robots")
+FAMILIES = (
+    "barriers",
+    "bounds",
+    "controllers",
+    "disturbances",
+    "observers",
+    "references",
+    "robots",
+)
 MEMBERS = [(f, n) for f in FAMILIES for n in sorted(getattr(getattr(ij, f), "MEMBERS", {}))]
 
 
 @partial(jax.jit, static_argnames="method")
 def carry_of(inputs, varied, method):
-    """The carry before the first step; its Jacobian is made up, as the closed loop's is found by programs of their own."""
+    """The carry before the first step; its Jacobian is made up, as the closed loop's is found by
+    programs of their own."""
 
     def one(inputs):
         size = accuracy.places(initial_state(inputs.scenario)).size
-        jacobian = 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + size * size, dtype=inputs.dt.dtype)).reshape(size, size)
+        jacobian = 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + size * size, dtype=inputs.dt.dtype)).reshape(
+            size, size
+        )
         return start(inputs, method, jacobian - jnp.eye(size, dtype=inputs.dt.dtype))
 
     return Batch.of(inputs, varied).each(one)
@@ -103,9 +137,13 @@ def evaluate(p: program.Program, shared, lane, carry, index):
             elif node.op in inputs:
                 known.append(inputs[node.op][node.value])
             elif node.op == "convert":
-                known.append(np.asarray(args[0]).astype({"f": p.dtype, "i": int, "b": bool}[node.kind]))
+                known.append(
+                    np.asarray(args[0]).astype({"f": p.dtype, "i": int, "b": bool}[node.kind])
+                )
             elif node.op == "lookup":
-                known.append(np.asarray(node.value, p.dtype)[np.clip(args[0], 0, len(node.value) - 1)])
+                known.append(
+                    np.asarray(node.value, p.dtype)[np.clip(args[0], 0, len(node.value) - 1)]
+                )
             else:
                 known.append(OPERATIONS[node.op].numpy(*args))
     return [known[o] for _, o in p.carry]
@@ -125,16 +163,24 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
     carry = jax.tree.map(lambda x: x[0], carries)
     inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.lane])
     p, _ = program_of(step, run, carries)
-    expected = numbers(jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, Form(rolled=True))[0])(carry)))
+    expected = numbers(
+        jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, Form(rolled=True))[0])(carry))
+    )
     monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
     called, _ = program_of(step, run, carries)
     # One for each stage, and one for the further piece of a step that a jump time divides.
     assert sum(node.op == "call" for node in called.nodes) == 2 + scenario.jump_times().size
     for each in (p, called):
         found = evaluate(
-            written_out(each), numbers(run.leaves.shared), numbers(x[0] for x in run.leaves.lane), numbers(jax.tree.leaves(carry)), index
+            written_out(each),
+            numbers(run.leaves.shared),
+            numbers(x[0] for x in run.leaves.lane),
+            numbers(jax.tree.leaves(carry)),
+            index,
         )
-        np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(
+            np.asarray(found, float), np.asarray(expected, float), rtol=1e-11, atol=1e-12
+        )
 
 
 def lowered_function(f, *arrays):
@@ -144,42 +190,106 @@ def lowered_function(f, *arrays):
     operands, values = [], []
     for x in arrays:
         kind = "f" if np.issubdtype(x.dtype, np.floating) else "i"
-        operands.append(np.asarray([b.input("carry", len(values) + i, kind) for i in range(x.size)]).reshape(x.shape))
+        operands.append(
+            np.asarray([b.input("carry", len(values) + i, kind) for i in range(x.size)]).reshape(
+                x.shape
+            )
+        )
         values += x.ravel().tolist()
     (out,) = closed(b, jaxpr, operands)
-    p = program.finished(b, [], [], [])._replace(nodes=tuple(b.nodes), carry=tuple((-1, int(i)) for i in out.ravel()))
+    p = program.finished(b, [], [], [])._replace(
+        nodes=tuple(b.nodes), carry=tuple((-1, int(i)) for i in out.ravel())
+    )
     return np.asarray(evaluate(p, [], [], [np.asarray(v) for v in values], 0)).reshape(out.shape)
 
 
-X, Y, K = np.linspace(-1.4, 1.3, 6).reshape(2, 3), np.linspace(0.2, 0.9, 6).reshape(3, 2), np.arange(3)
+X, Y, K = (
+    np.linspace(-1.4, 1.3, 6).reshape(2, 3),
+    np.linspace(0.2, 0.9, 6).reshape(3, 2),
+    np.arange(3),
+)
 TABLE = np.linspace(3.0, 4.0, 400).reshape(2, 200)
 CASES = {
     "matmul": (lambda x, y: x @ y, X, Y),
     "einsum": (lambda x, y: jnp.einsum("ij,jk->ki", x, y), X, Y),
     "cumsum": (lambda x: jnp.cumsum(x[:, ::-1], axis=1), X),
-    "reductions": (lambda x: jnp.stack([x.sum(), x.max(), x.min(), x.prod(), jnp.abs(x).mean()]), X),
+    "reductions": (
+        lambda x: jnp.stack([x.sum(), x.max(), x.min(), x.prod(), jnp.abs(x).mean()]),
+        X,
+    ),
     "argmin": (lambda x: jnp.argmin(x, axis=0) + jnp.argmax(x, axis=0), X),
     "argmin of nan": (lambda x: jnp.argmin(x.at[1, 1].set(jnp.nan), axis=1), X),
     "updates": (lambda x: x.at[1, 0].set(7.0).at[0, 1:].add(2.0).at[1].mul(3.0), X),
     "powers": (lambda x: x**7 + x**-2 + jnp.abs(x) ** 1.5 + jnp.float_power(2.0, x), X),
-    "elementary": (lambda y: jnp.tanh(y) + jnp.arctan2(y, 1 - y) + jnp.log1p(y) + jax.scipy.special.erf(y) + jax.nn.sigmoid(y), Y),
+    "elementary": (
+        lambda y: (
+            jnp.tanh(y)
+            + jnp.arctan2(y, 1 - y)
+            + jnp.log1p(y)
+            + jax.scipy.special.erf(y)
+            + jax.nn.sigmoid(y)
+        ),
+        Y,
+    ),
     "derivatives": (
-        lambda y: jax.jvp(lambda y: jnp.tanh(y) + jnp.arcsin(y) + jnp.arctanh(y) + jnp.log2(y), (y,), (y,))[1] + jnp.log2(y),
+        lambda y: (
+            jax.jvp(
+                lambda y: jnp.tanh(y) + jnp.arcsin(y) + jnp.arctanh(y) + jnp.log2(y), (y,), (y,)
+            )[1]
+            + jnp.log2(y)
+        ),
         Y,
     ),
     "unstack": (lambda x: sum(jnp.unstack(x, axis=1)), X),
     "pad and stack": (lambda x: jnp.stack([jnp.pad(x, 1), jnp.pad(x, ((0, 2), (1, 1)))]), X),
-    "own index": (lambda x, k: x[:, k[1]] + jax.lax.dynamic_slice(x, (k[0], k[1]), (1, 1))[0, 0], X, K),
-    "table": (lambda k: jnp.asarray(TABLE)[:, 90 * k[2]] * jax.lax.dynamic_slice(jnp.asarray(TABLE), (1, 70 * k[1]), (1, 2))[0], K),
-    "table, outside": (lambda k: jnp.asarray(TABLE)[0, 900 * k[2]] + jnp.asarray(TABLE)[0, -900 * k[2]], K),
-    "update at an index of the run": (lambda x, k: jax.lax.dynamic_update_slice(jnp.zeros(5), x[0, 1:2], (k[1],)), X, K),
-    "zeros of either sign": (lambda k: jnp.exp(-1 / jnp.asarray([0.0, 1.0])[k[0]]) + jnp.exp(-1 / jnp.asarray([-0.0, 1.0])[k[0]]), K),
-    "tables": (lambda k: jax.vmap(lambda i: jnp.asarray(TABLE)[:, 90 * i])(k) + jnp.asarray(TABLE)[1, 60 * k][:, None], K),
+    "own index": (
+        lambda x, k: x[:, k[1]] + jax.lax.dynamic_slice(x, (k[0], k[1]), (1, 1))[0, 0],
+        X,
+        K,
+    ),
+    "table": (
+        lambda k: (
+            jnp.asarray(TABLE)[:, 90 * k[2]]
+            * jax.lax.dynamic_slice(jnp.asarray(TABLE), (1, 70 * k[1]), (1, 2))[0]
+        ),
+        K,
+    ),
+    "table, outside": (
+        lambda k: jnp.asarray(TABLE)[0, 900 * k[2]] + jnp.asarray(TABLE)[0, -900 * k[2]],
+        K,
+    ),
+    "update at an index of the run": (
+        lambda x, k: jax.lax.dynamic_update_slice(jnp.zeros(5), x[0, 1:2], (k[1],)),
+        X,
+        K,
+    ),
+    "zeros of either sign": (
+        lambda k: (
+            jnp.exp(-1 / jnp.asarray([0.0, 1.0])[k[0]])
+            + jnp.exp(-1 / jnp.asarray([-0.0, 1.0])[k[0]])
+        ),
+        K,
+    ),
+    "tables": (
+        lambda k: (
+            jax.vmap(lambda i: jnp.asarray(TABLE)[:, 90 * i])(k)
+            + jnp.asarray(TABLE)[1, 60 * k][:, None]
+        ),
+        K,
+    ),
     "filled gather": (lambda x: jnp.take(x, jnp.asarray([0, 2]), axis=1), X),
-    "scan": (lambda x: jax.lax.scan(lambda c, r: (c + r, c * r), jnp.zeros(3), x, reverse=True)[1], X),
+    "scan": (
+        lambda x: jax.lax.scan(lambda c, r: (c + r, c * r), jnp.zeros(3), x, reverse=True)[1],
+        X,
+    ),
     "cond": (lambda x: jax.lax.cond(x[0, 0] > 0, jnp.sin, jnp.cos, x), X),
     "switch": (lambda x, k: jax.lax.switch(k[2], [jnp.sin, jnp.cos, jnp.exp], x), X, K),
-    "where and round": (lambda x: jnp.where(x > 0, jnp.round(x * 3), jnp.floor(x)) + jnp.sign(x) * jnp.clip(x, -0.5, 0.5), X),
+    "where and round": (
+        lambda x: (
+            jnp.where(x > 0, jnp.round(x * 3), jnp.floor(x)) + jnp.sign(x) * jnp.clip(x, -0.5, 0.5)
+        ),
+        X,
+    ),
     "gradient": (lambda x: jax.grad(lambda x: jnp.sum(jnp.sin(x) @ jnp.cos(x).T))(x), X),
     "gradient of a gather": (lambda x: jax.grad(lambda x: jnp.sum(x[0, :2] * x[1, 1:]))(x), X),
     "determinant": (lambda x: jnp.linalg.norm(x, axis=1), X),
@@ -189,7 +299,9 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_primitives(name):
     f, *arrays = CASES[name]
-    np.testing.assert_allclose(lowered_function(f, *arrays), f(*map(jnp.asarray, arrays)), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(
+        lowered_function(f, *arrays), f(*map(jnp.asarray, arrays)), rtol=1e-12, atol=1e-14
+    )
 
 
 REFUSED = {
@@ -215,7 +327,13 @@ def test_identities_keep_nan_and_infinity():
     b = program.Builder(np.float64)
     x = b.input("carry", 0, "f")
     zero, one = b.constant(0.0, "f"), b.constant(1.0, "f")
-    assert b.emit("mul", x, one) == b.emit("add", x, zero) == b.emit("sub", x, zero) == b.emit("div", x, one) == x
+    assert (
+        b.emit("mul", x, one)
+        == b.emit("add", x, zero)
+        == b.emit("sub", x, zero)
+        == b.emit("div", x, one)
+        == x
+    )
     assert b.emit("mul", x, zero) != zero
     assert b.emit("sub", x, x) != zero
     assert b.emit("div", x, x) != one
@@ -225,13 +343,37 @@ def test_identities_keep_nan_and_infinity():
 
 def test_a_sum_is_finite_where_its_logarithms_have_a_value_and_the_rest_is():
     def whether(x, y):
-        parts = (-jnp.log1p(y), 0.5 * (x - 0.5 * jnp.log1p(-(y**2))) + y, jnp.log1p(y) - 2.0 * x + x, 0.5 * (x + jnp.log1p(y)) - (y - x))
+        parts = (
+            -jnp.log1p(y),
+            0.5 * (x - 0.5 * jnp.log1p(-(y**2))) + y,
+            jnp.log1p(y) - 2.0 * x + x,
+            0.5 * (x + jnp.log1p(y)) - (y - x),
+        )
         return jnp.stack([jnp.isfinite(part) for part in parts])
 
     big = np.finfo(np.float64).max
-    numbers = np.array([0.0, 0.5, -0.5, 1.0, -1.0, -1.5, 1e150, -1e150, 0.6 * big, -0.6 * big, big, np.inf, -np.inf, np.nan])
+    numbers = np.array(
+        [
+            0.0,
+            0.5,
+            -0.5,
+            1.0,
+            -1.0,
+            -1.5,
+            1e150,
+            -1e150,
+            0.6 * big,
+            -0.6 * big,
+            big,
+            np.inf,
+            -np.inf,
+            np.nan,
+        ]
+    )
     x, y = np.stack(np.meshgrid(numbers, numbers)).reshape(2, -1)
-    np.testing.assert_array_equal(lowered_function(whether, x, y), whether(jnp.asarray(x), jnp.asarray(y)))
+    np.testing.assert_array_equal(
+        lowered_function(whether, x, y), whether(jnp.asarray(x), jnp.asarray(y))
+    )
     b = program.Builder(np.float64)
     v = b.emit("sub", b.input("carry", 0, "f"), b.emit("log1p", b.input("carry", 1, "f")))
     p = program.finished(b, [], [], [b.emit("is_finite", v, kind="b")])
@@ -248,12 +390,17 @@ def test_long_sums_are_asked_whether_they_are_finite(terms):
             doubled = doubled + 0.5 * doubled
         return jnp.isfinite(jnp.sum(x)) & jnp.isfinite(doubled)
 
-    for x in (np.full(terms, 0.5), np.r_[np.full(terms - 1, 0.5), np.inf], np.r_[-2.0, np.full(terms - 1, 0.5)]):
+    for x in (
+        np.full(terms, 0.5),
+        np.r_[np.full(terms - 1, 0.5), np.inf],
+        np.r_[-2.0, np.full(terms - 1, 0.5)],
+    ):
         np.testing.assert_array_equal(lowered_function(whether, x), whether(jnp.asarray(x)))
 
 
 def test_a_call_for_samples_alone_does_not_write_over_what_the_carry_reads():
-    """A call may overwrite what nobody reads of the one before; the order for a processor must not change which that is."""
+    """A call may overwrite what nobody reads of the one before; the order for a processor must not
+    change which that is."""
 
     def chain(length, extra):
         b = program.Builder(np.float64)
@@ -261,7 +408,9 @@ def test_a_call_for_samples_alone_does_not_write_over_what_the_carry_reads():
         x = b.emit("sin", a)
         for _ in range(length):
             x = b.emit("add", b.emit("mul", x, b.constant(0.5, "f")), b.constant(0.1, "f"))
-        return program.finished(b, [], [], [x, *(b.emit("add", a, b.constant(100.0 + k, "f")) for k in range(extra))])
+        return program.finished(
+            b, [], [], [x, *(b.emit("add", a, b.constant(100.0 + k, "f")) for k in range(extra))]
+        )
 
     b = program.Builder(np.float64)
     x = b.input("carry", 0, "f")
@@ -284,7 +433,9 @@ def test_classes_of_a_program():
     shapes = Shapes.of(flat, 1)
     classes = p.classes()
     sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
-    assert sines.count(program.LANE | program.TIME) <= 8 < sines.count(program.TIME), "signals of time belong to no run"
+    assert sines.count(program.LANE | program.TIME) <= 8 < sines.count(program.TIME), (
+        "signals of time belong to no run"
+    )
     assert len(p.carry) == shapes.size
     packed = pack(flat, shapes, jnp.float64, 1)
     assert len(packed.floats) + len(packed.ints) == shapes.size
@@ -303,7 +454,9 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
     execute._told.clear()
 
     def run():
-        return jax.jit(lambda: execute.run_batch(scenario, varied, (), jnp.asarray(DT), Run(3, "euler")))()
+        return jax.jit(
+            lambda: execute.run_batch(scenario, varied, (), jnp.asarray(DT), Run(3, "euler"))
+        )()
 
     with pytest.warns(execute.BackendWarning, match="vmap.*'sort'"):
         outcome = run()
@@ -315,4 +468,6 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
 
 def test_an_unknown_backend_is_refused():
     with pytest.raises(ValueError, match="backend"):
-        execute.run_batch(PRESET, {"initial.q": jnp.ones((2, 2))}, (), jnp.asarray(DT), Run(1), backend="fpga")
+        execute.run_batch(
+            PRESET, {"initial.q": jnp.ones((2, 2))}, (), jnp.asarray(DT), Run(1), backend="fpga"
+        )

@@ -1,4 +1,5 @@
-"""Backends: they agree with the reference run, runs do not touch each other, and what goes wrong falls back."""
+"""Backends: they agree with the reference run, runs do not touch each other, and what goes wrong
+falls back."""
 
 from __future__ import annotations
 
@@ -49,13 +50,18 @@ def batch(dtype="float64", backend="native", steps=400, values=None, record_ever
     key = (dtype, backend, steps, record_every)
     if key not in COMPILED:
         run = Run(steps, "rk4", record_every)
-        COMPILED[key] = jax.jit(lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run, backend=backend))
+        COMPILED[key] = jax.jit(
+            lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run, backend=backend)
+        )
     return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, folds, jnp.asarray(dt, dtype)))
 
 
 def draws(runs, seed=0):
     rng = np.random.default_rng(seed)
-    return {"plant.mass[1]": rng.uniform(0.6, 1.1, runs), "initial.q": 0.8 + 0.02 * rng.standard_normal((runs, 2))}
+    return {
+        "plant.mass[1]": rng.uniform(0.6, 1.1, runs),
+        "initial.q": 0.8 + 0.02 * rng.standard_normal((runs, 2)),
+    }
 
 
 def assert_same(found, expected, tolerance):
@@ -78,8 +84,11 @@ def test_native_agrees_with_the_reference(dtype):
 
 @pytest.fixture(scope="module")
 def recorded_steps():
-    """Steps of 19 runs with a record of every fifth one, as a function of an executor; and what the scan gives."""
-    inputs = Inputs(canonical(ij.presets.zhang_yan_2024()), (), jnp.asarray(1e-3), jnp.asarray(40.0))
+    """Steps of 19 runs with a record of every fifth one, as a function of an executor; and what the
+    scan gives."""
+    inputs = Inputs(
+        canonical(ij.presets.zhang_yan_2024()), (), jnp.asarray(1e-3), jnp.asarray(40.0)
+    )
     step = TimeStep("euler")
 
     def steps(executor, values):
@@ -128,22 +137,32 @@ def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
     run = Run(11, "euler", every)
     varied = {k: jnp.asarray(v) for k, v in draws(7).items()}
     found, expected = (
-        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied) for b in ("xla", "vmap")
+        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied)
+        for b in ("xla", "vmap")
     )
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", [pytest.param("xla", marks=pytest.mark.release), pytest.param("native", marks=needs_compiler)])
+@pytest.mark.parametrize(
+    "backend",
+    [pytest.param("xla", marks=pytest.mark.release), pytest.param("native", marks=needs_compiler)],
+)
 def test_a_spline_is_looked_up(backend):
     times = np.linspace(0.0, 0.04, 9)
-    spline = ij.references.WaypointSpline(tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1)))
-    scenario, dt = canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)), jnp.asarray(1e-3)
+    spline = ij.references.WaypointSpline(
+        tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1))
+    )
+    scenario, dt = (
+        canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)),
+        jnp.asarray(1e-3),
+    )
     run = Run(50, "heun", 10)
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
     assert execute.chosen_backend(backend, scenario, varied, (), dt, method="heun") == backend
     found, expected = (
-        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied) for b in (backend, "vmap")
+        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied)
+        for b in (backend, "vmap")
     )
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
@@ -159,7 +178,9 @@ def test_native_records_what_simulate_records():
         changed = ij.with_parameters(scenario, {k: v[i] for k, v in draws(5).items()})
         run = ij.simulate(changed, duration=steps * 1e-3, dt=1e-3, record_every=every)
         for name in ALWAYS:
-            np.testing.assert_allclose(arrays[name][i], getattr(run, name), rtol=1e-9, atol=1e-9, err_msg=name)
+            np.testing.assert_allclose(
+                arrays[name][i], getattr(run, name), rtol=1e-9, atol=1e-9, err_msg=name
+            )
         np.testing.assert_allclose(observer[i], run.observer_state, rtol=1e-9, atol=1e-9)
     assert controller == () and actuator == () and measured == ()
 
@@ -201,7 +222,11 @@ def test_a_sine_of_any_size_is_finite_in_a_batch(backend):
     }
 
     def run(backend):
-        f = jax.jit(lambda v: execute.run_batch(scenario, v, standard(), jnp.asarray(1e-3), Run(3, "euler"), backend=backend))
+        f = jax.jit(
+            lambda v: execute.run_batch(
+                scenario, v, standard(), jnp.asarray(1e-3), Run(3, "euler"), backend=backend
+            )
+        )
         return jax.tree.map(np.asarray, f(varied))
 
     found = run(backend)
@@ -211,7 +236,10 @@ def test_a_sine_of_any_size_is_finite_in_a_batch(backend):
 
 @needs_compiler
 def test_a_step_that_is_too_large_is_seen_by_every_backend():
-    values = {"plant.mass[1]": np.asarray([0.85, 0.05, 0.02, 0.85, 0.9]), "initial.q": np.full((5, 2), 0.8)}
+    values = {
+        "plant.mass[1]": np.asarray([0.85, 0.05, 0.02, 0.85, 0.9]),
+        "initial.q": np.full((5, 2), 0.8),
+    }
     found, expected = batch(values=values, dt=4e-3), batch(values=values, dt=4e-3, backend="vmap")
     np.testing.assert_array_equal(found.status, expected.status)
     assert np.any(found.status & ij.Status.STEP_TOO_LARGE)
@@ -227,7 +255,14 @@ def test_one_run_and_threads():
     finally:
         del os.environ["IBLF_JAX_THREADS"]
     assert one.status.shape == (1,)
-    assert_same(one, jax.tree.map(lambda x: x[:1], batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()})), 1e-12)
+    assert_same(
+        one,
+        jax.tree.map(
+            lambda x: x[:1],
+            batch(values=draws(5) | {k: np.repeat(v, 5, 0) for k, v in draws(1).items()}),
+        ),
+        1e-12,
+    )
 
 
 @needs_compiler
@@ -242,20 +277,31 @@ def test_leaves_become_rows_and_leaves_again(runs, dtype):
     leaves[0] = leaves[0].at[0].set(jnp.nan)
     shapes = packed.Shapes.of(leaves, 1)
     rows = jax.jit(lambda x: native.pack(x, shapes, np.dtype(dtype), runs))(leaves)
-    for found, expected in zip(rows, packed.pack(leaves, shapes, np.dtype(dtype), runs), strict=True):
+    for found, expected in zip(
+        rows, packed.pack(leaves, shapes, np.dtype(dtype), runs), strict=True
+    ):
         np.testing.assert_array_equal(found, expected, strict=True)
-    for found, expected in zip(jax.jit(lambda x: native.unpack(x, shapes, runs))(rows), leaves, strict=True):
+    for found, expected in zip(
+        jax.jit(lambda x: native.unpack(x, shapes, runs))(rows), leaves, strict=True
+    ):
         np.testing.assert_array_equal(found, expected, strict=True)
 
 
 @needs_compiler
 def test_rows_of_another_size_are_an_error_and_no_crash():
     """What XLA is told of the shapes is checked where memory is written."""
-    leaf, rows = jnp.ones((4, 3)), [jax.ShapeDtypeStruct((n, 4), t) for n, t in ((2, jnp.float64), (0, jnp.int32))]
+    leaf, rows = (
+        jnp.ones((4, 3)),
+        [jax.ShapeDtypeStruct((n, 4), t) for n, t in ((2, jnp.float64), (0, jnp.int32))],
+    )
     with pytest.raises(jax.errors.JaxRuntimeError, match="does not fit"):
         jax.block_until_ready(jax.ffi.ffi_call(native._turner("pack"), rows)(leaf))
     with pytest.raises(jax.errors.JaxRuntimeError, match="without an array"):
-        jax.block_until_ready(jax.ffi.ffi_call(native._turner("pack"), [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]])(leaf))
+        jax.block_until_ready(
+            jax.ffi.ffi_call(
+                native._turner("pack"), [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]]
+            )(leaf)
+        )
 
 
 def forget_kernels():
@@ -269,7 +315,8 @@ def forget_kernels():
 @pytest.mark.parametrize("record_every", [None, 100])
 @pytest.mark.parametrize("parts", ["functions", "calls", "both"])
 def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
-    """Cut into pieces of fifty operations, or with its stages as calls, the numbers stay: the places of some products with sums differ."""
+    """Cut into pieces of fifty operations, or with its stages as calls, the numbers stay: the
+    places of some products with sums differ."""
     whole = batch(record_every=record_every)
     if parts != "calls":
         monkeypatch.setattr(plan, "NATIVE_LONG", 0)
@@ -295,10 +342,17 @@ def test_forward_sensitivities(monkeypatch, written_out):
     directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
 
-    folds = (*standard()[:1], *as_folds((Quantities((TimeIntegral(), TimeIntegral("torque"), Peak(10.0))),), jnp.float64))
+    folds = (
+        *standard()[:1],
+        *as_folds((Quantities((TimeIntegral(), TimeIntegral("torque"), Peak(10.0))),), jnp.float64),
+    )
 
     def pushed(backend):
-        return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, Run(60, "euler"), backend=backend))(scenario, varied)
+        return jax.jit(
+            lambda s, v: execute.run_batch_jvp(
+                s, v, directions, folds, dt, Run(60, "euler"), backend=backend
+            )
+        )(scenario, varied)
 
     reference, expected, exact = pushed("vmap")
     for by_columns in (False, True):
@@ -320,7 +374,9 @@ def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
     native.kernel.cache_clear()
     called = []
     with pytest.warns(execute.BackendWarning, match="no-such-compiler.*xla"):
-        execute.with_fallback("auto", lambda name: called.append(name) or fail_if_native(name), lambda: None)
+        execute.with_fallback(
+            "auto", lambda name: called.append(name) or fail_if_native(name), lambda: None
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         execute.with_fallback("auto", fail_if_native, lambda: None)
@@ -352,7 +408,9 @@ def test_the_cache_is_private_and_found_again(monkeypatch, tmp_path):
     assert toolchain.built('extern "C" int one(void) { return 1; }')[0].stat().st_mtime_ns == made
     library.chmod(0o777)
     toolchain.built('extern "C" int one(void) { return 1; }')
-    assert stat.S_IMODE(library.stat().st_mode) & 0o022 == 0, "what others could have written is built anew"
+    assert stat.S_IMODE(library.stat().st_mode) & 0o022 == 0, (
+        "what others could have written is built anew"
+    )
 
 
 def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
@@ -366,15 +424,24 @@ def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_one_run_on_the_native_backend_is_the_run(paper):
-    """Records, metrics and status of `simulate(backend="native")` are those of xla; another value of a leaf builds nothing new."""
-    for scenario in (paper, ij.with_parameters(paper, {"controller.K2": 30.0, "plant.mass[1]": 1.1})):
-        one, other = (ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=7, backend=backend) for backend in ("xla", "native"))
+    """Records, metrics and status of `simulate(backend="native")` are those of xla; another value
+    of a leaf builds nothing new."""
+    for scenario in (
+        paper,
+        ij.with_parameters(paper, {"controller.K2": 30.0, "plant.mass[1]": 1.1}),
+    ):
+        one, other = (
+            ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=7, backend=backend)
+            for backend in ("xla", "native")
+        )
         np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-10)
         np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
         np.testing.assert_allclose(one.observer_state, other.observer_state, rtol=0, atol=1e-9)
         assert int(one.status) == int(other.status) == 0
         for name in one.metrics:
-            np.testing.assert_allclose(one.metrics[name], other.metrics[name], rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(
+                one.metrics[name], other.metrics[name], rtol=1e-9, atol=1e-12
+            )
     with pytest.raises(ValueError, match="backend"):
         ij.simulate(paper, duration=0.5, dt=1e-3, backend="fortran")
 
@@ -383,12 +450,20 @@ def test_one_run_on_the_native_backend_is_the_run(paper):
 @pytest.mark.parametrize("every", [1, 7])
 def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
     """Python sees Ctrl-C between them; the numbers are bit for bit those of one call."""
-    options = {"duration": 0.5, "dt": 1e-3, "record_every": every, "method": "euler", "backend": "native"}
+    options = {
+        "duration": 0.5,
+        "dt": 1e-3,
+        "record_every": every,
+        "method": "euler",
+        "backend": "native",
+    }
     scenario = ij.presets.zhang_yan_2024()
     whole = ij.simulate(scenario, **options)
     calls = []
     monkeypatch.setattr(plan, "NATIVE_UNSEEN", 1.0)
-    monkeypatch.setattr(plan, "native_stretch", lambda nodes, steps, every: calls.append(nodes) or 21 * 7)
+    monkeypatch.setattr(
+        plan, "native_stretch", lambda nodes, steps, every: calls.append(nodes) or 21 * 7
+    )
     parts = ij.simulate(scenario, **options)
     assert len(calls) == 1
     assert calls[0] > 100
@@ -397,7 +472,8 @@ def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
 
 
 @pytest.mark.parametrize(
-    ("nodes", "steps", "every"), [(1800, 20_001, 1), (1800, 20_000_001, 1000), (1800, 20_000_001, None), (60_000, 10**6, 10**5)]
+    ("nodes", "steps", "every"),
+    [(1800, 20_001, 1), (1800, 20_000_001, 1000), (1800, 20_000_001, None), (60_000, 10**6, 10**5)],
 )
 def test_a_stretch_is_short_and_whole(nodes, steps, every):
     stretch = plan.native_stretch(nodes, steps, every)

@@ -1,4 +1,5 @@
-"""The gpu backend: the kernel on a GPU or, without one, its logic on a CPU; its source through NVRTC; and what happens without a device.
+"""The gpu backend: the kernel on a GPU or, without one, its logic on a CPU; its source through
+NVRTC; and what happens without a device.
 
     JAX_PLATFORMS=cuda,cpu python -m pytest tests/test_lowering_gpu.py
 
@@ -68,9 +69,14 @@ def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
 def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
     """The carry of one run after some steps, by NumPy, node by node."""
     layout, values = Layout.of(program), np.zeros(len(program.kinds), object)
-    values[layout.floats], values[layout.ints] = list(np.asarray(carry.floats)), list(np.asarray(carry.ints))
+    values[layout.floats], values[layout.ints] = (
+        list(np.asarray(carry.floats)),
+        list(np.asarray(carry.ints)),
+    )
     for i in range(steps):
-        values = evaluate(written_out(program), np.asarray(shared), np.asarray(lane), list(values), i)
+        values = evaluate(
+            written_out(program), np.asarray(shared), np.asarray(lane), list(values), i
+        )
         values = [np.broadcast_to(v, np.shape(carry.floats)[1:]) for v in values]
     return np.asarray(values, float)
 
@@ -80,8 +86,12 @@ def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
 def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
     varied = {"initial.q": [[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]], "plant.mass[1]": [0.9, 0.7, 0.8]}
-    program, shared, lane, carry = step_of(with_member(family, name, getattr(ij, family).MEMBERS[name]), varied)
-    (floats, ints), _ = run_program(program, shared, lane, carry, 5, None, **({} if ON_A_GPU else {"flags": ("-O1",)}))
+    program, shared, lane, carry = step_of(
+        with_member(family, name, getattr(ij, family).MEMBERS[name]), varied
+    )
+    (floats, ints), _ = run_program(
+        program, shared, lane, carry, 5, None, **({} if ON_A_GPU else {"flags": ("-O1",)})
+    )
     layout, expected = Layout.of(program), stepped(program, shared, lane, carry, 5)
     np.testing.assert_allclose(floats, expected[layout.floats], rtol=1e-10, atol=1e-10)
     np.testing.assert_array_equal(ints, expected[layout.ints])
@@ -103,7 +113,12 @@ def outcome(dtype, backend, values, steps=200, record_every=None):
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
     varied, dt = {k: jnp.asarray(v, dtype) for k, v in values.items()}, jnp.asarray(DT, dtype)
     run = Run(steps, "rk4", record_every)
-    return jax.tree.map(np.asarray, jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run, backend=backend))(scenario, varied))
+    return jax.tree.map(
+        np.asarray,
+        jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run, backend=backend))(
+            scenario, varied
+        ),
+    )
 
 
 def spoiled(runs):
@@ -119,7 +134,8 @@ def spoiled(runs):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_batch_agrees_with_the_reference(dtype, runs_here):
-    """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not full."""
+    """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not
+    full."""
     good = draws(37)
     found, expected = outcome(dtype, "gpu", good), outcome(dtype, "vmap", good)
     assert_same(found, expected, TOLERANCE[dtype])
@@ -129,7 +145,11 @@ def test_a_batch_agrees_with_the_reference(dtype, runs_here):
 @needs_compiler
 def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(runs_here):
     values = spoiled(37)
-    found, good, expected = outcome("float64", "gpu", values), outcome("float64", "gpu", draws(37)), outcome("float64", "vmap", values)
+    found, good, expected = (
+        outcome("float64", "gpu", values),
+        outcome("float64", "gpu", draws(37)),
+        outcome("float64", "vmap", values),
+    )
     np.testing.assert_array_equal(found.status, expected.status)
     assert len(set(found.status[[0, 1, 3]].tolist())) == 3
     others = np.setdiff1d(np.arange(37), [1, 3, 4])
@@ -150,11 +170,19 @@ def test_records_agree_with_the_reference(runs_here, monkeypatch, written_out):
 @pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 def test_one_run_is_the_run(runs_here, paper, sampled):
-    """A law that is sampled and delayed too, with the noise of its sensor: its branches are calls in the kernel."""
+    """A law that is sampled and delayed too, with the noise of its sensor: its branches are calls
+    in the kernel."""
     if sampled:
-        sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+        sensor = ij.sensors.Encoder(
+            counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
+        )
         soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
-        paper = ij.with_parts(soft, sampling=ij.Sampling(2e-3, delay=1.3e-3), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=600.0))
+        paper = ij.with_parts(
+            soft,
+            sampling=ij.Sampling(2e-3, delay=1.3e-3),
+            sensor=sensor,
+            actuator=ij.actuators.Motor(bandwidth=600.0),
+        )
     timing = {"duration": 0.06, "dt": 4e-4, "record_every": 10, "seed": 3}
     one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "xla"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
@@ -167,12 +195,21 @@ def test_every_run_has_its_own_jump(runs_here, paper, dtype):
     """The steps of a sampled loop are divided where each run's disturbance jumps."""
     soft = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
     late = ij.disturbances.Step(size=[20.0, 5.0], time=0.1)
-    scenario = canonical(ij.astype(ij.with_parts(soft, sampling=ij.Sampling(1e-2, delay=3.7e-3), disturbance=late), dtype))
+    scenario = canonical(
+        ij.astype(
+            ij.with_parts(soft, sampling=ij.Sampling(1e-2, delay=3.7e-3), disturbance=late), dtype
+        )
+    )
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
-    varied, dt = {"disturbance.time": jnp.asarray([0.1, 0.0537, 0.1234, 0.9], dtype)}, jnp.asarray(1e-2, dtype)
+    varied, dt = (
+        {"disturbance.time": jnp.asarray([0.1, 0.0537, 0.1234, 0.9], dtype)},
+        jnp.asarray(1e-2, dtype),
+    )
 
     def metrics(backend):
-        return jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, Run(20), backend=backend))(varied).metrics
+        return jax.jit(
+            lambda v: execute.run_batch(scenario, v, folds, dt, Run(20), backend=backend)
+        )(varied).metrics
 
     found, expected = metrics("gpu"), metrics("vmap")
     rtol = {"float64": 1e-9, "float32": 2e-3}[dtype]
@@ -187,9 +224,14 @@ def test_forward_sensitivities(paper):
     along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
     inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), Run(60, "euler")
-    executor, numbers = lowered_on(run_program), {path: np.reshape(x, shape) for path, shape, x in along.items}
+    executor, numbers = (
+        lowered_on(run_program),
+        {path: np.reshape(x, shape) for path, shape, x in along.items},
+    )
     pushed = jax.jit(lambda v: run_with_tangents(executor, Batch.of(inputs, v), along, run))(varied)
-    expected = jax.jit(lambda v: execute.run_batch_jvp(scenario, v, numbers, inputs.folds, dt, run, backend="vmap"))(varied)
+    expected = jax.jit(
+        lambda v: execute.run_batch_jvp(scenario, v, numbers, inputs.folds, dt, run, backend="vmap")
+    )(varied)
     for x, y in zip(pushed, expected, strict=True):
         assert_same(jax.tree.map(np.asarray, x), jax.tree.map(np.asarray, y), 1e-10)
 
@@ -204,7 +246,9 @@ def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkey
         gpu_on_cpu.run(program, shared, lane, carry, 10, None)[0].floats.block_until_ready()
         seen.append(gpu_on_cpu.launches(*sizes))
     assert [loaded for loaded, _ in seen] == [1, 1, 1]
-    assert np.diff([launched for _, launched in seen]).tolist() == [1 + 2 * 3] * 2  # other tests may have launched it before
+    assert (
+        np.diff([launched for _, launched in seen]).tolist() == [1 + 2 * 3] * 2
+    )  # other tests may have launched it before
     (floats, ints), _ = gpu_on_cpu.run(program, shared, lane, carry, 0, None)
     np.testing.assert_array_equal(floats, carry.floats)
     np.testing.assert_array_equal(ints, carry.ints)
@@ -215,15 +259,34 @@ def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkey
 def test_what_the_driver_refuses_is_an_error_of_jax(paper):
     program, shared, lane, carry = step_of(paper, draws(2))
     sizes = program, shared.size, lane.shape[0]
-    with pytest.raises(Exception, match=r"loading: device kernel image is invalid \(CUDA error 200\)"):
-        jax.block_until_ready(gpu.call(gpu_on_cpu.kernel(*sizes, image=b"nothing"), program, shared, lane, carry, 1, None, 32))
+    with pytest.raises(
+        Exception, match=r"loading: device kernel image is invalid \(CUDA error 200\)"
+    ):
+        jax.block_until_ready(
+            gpu.call(
+                gpu_on_cpu.kernel(*sizes, image=b"nothing"),
+                program,
+                shared,
+                lane,
+                carry,
+                1,
+                None,
+                32,
+            )
+        )
     with pytest.raises(Exception, match=r"launch: invalid argument \(CUDA error 1\)"):
-        jax.block_until_ready(gpu.call(gpu_on_cpu.kernel(*sizes), program, shared, lane, carry, 1, None, 256))
+        jax.block_until_ready(
+            gpu.call(gpu_on_cpu.kernel(*sizes), program, shared, lane, carry, 1, None, 256)
+        )
     with pytest.raises(Exception, match="wrong shapes"):
-        jax.block_until_ready(gpu.call(gpu_on_cpu.kernel(*sizes), program, shared[1:], lane, carry, 1, None, 32))
+        jax.block_until_ready(
+            gpu.call(gpu_on_cpu.kernel(*sizes), program, shared[1:], lane, carry, 1, None, 32)
+        )
 
 
-@pytest.mark.parametrize(("runs", "threads"), [(1, 32), (4096, 32), (10_000, 96), (65_536, 128), (10**7, 128)])
+@pytest.mark.parametrize(
+    ("runs", "threads"), [(1, 32), (4096, 32), (10_000, 96), (65_536, 128), (10**7, 128)]
+)
 def test_threads_in_a_block(runs, threads):
     assert plan.gpu_threads(runs, 132) == threads
 
@@ -232,7 +295,10 @@ def test_threads_in_a_block(runs, threads):
 def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setattr(execute, "_told", set())
     called = []
-    with pytest.warns(execute.BackendWarning, match="gpu backend is not for the default device, cpu: running on xla"):
+    with pytest.warns(
+        execute.BackendWarning,
+        match="gpu backend is not for the default device, cpu: running on xla",
+    ):
         execute.with_fallback("gpu", called.append, lambda: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -244,10 +310,15 @@ def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
 @needs_compiler
 def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     told = repr(ij.explain(paper))
-    assert "a batch runs on native\n" in told and told.endswith("on native, one run a number, first and second ones; others by plain JAX")
+    assert "a batch runs on native\n" in told and told.endswith(
+        "on native, one run a number, first and second ones; others by plain JAX"
+    )
     monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
     told = repr(ij.explain(paper))
-    assert "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told and "derivatives of simulate: by plain JAX: it needs" in told
+    assert (
+        "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told
+        and "derivatives of simulate: by plain JAX: it needs" in told
+    )
 
 
 @needs_a_cpu
@@ -260,8 +331,16 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(nvrtc, "library", missing)
     assert execute.automatic() == ("xla", "there is no NVRTC")
-    with pytest.warns(execute.BackendWarning, match="gpu backend is not available .there is no NVRTC.: running on xla"):
-        assert execute.with_fallback("auto", lambda name: missing() if name == "gpu" else name, lambda: None) == "xla"
+    with pytest.warns(
+        execute.BackendWarning,
+        match="gpu backend is not available .there is no NVRTC.: running on xla",
+    ):
+        assert (
+            execute.with_fallback(
+                "auto", lambda name: missing() if name == "gpu" else name, lambda: None
+            )
+            == "xla"
+        )
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
     assert execute.automatic() == ("gpu", None)
@@ -270,10 +349,13 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
 @needs_a_cpu
 @needs_compiler
 def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
-    """Where JAX computes on a GPU, a user may compute on the processor: runs and studies take its backend and its devices."""
+    """Where JAX computes on a GPU, a user may compute on the processor: runs and studies take its
+    backend and its devices."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     perturbations = {"plant.mass[1]": ij.value(ij.uniform(0.7, 0.9))}
-    with pytest.raises(ValueError, match=r"platform that JAX computes on, gpu.*jax\.default_device"):
+    with pytest.raises(
+        ValueError, match=r"platform that JAX computes on, gpu.*jax\.default_device"
+    ):
         ij.monte_carlo(paper, perturbations, runs=3, duration=0.05, devices=jax.devices("cpu"))
     monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
     with jax.default_device(jax.devices("cpu")[0]):
@@ -286,7 +368,13 @@ def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("capabilities", "found"), [(["9.0"], "sm_90"), (["12.0"] * 2, "sm_120"), (["8.0", "9.0"], "differ"), (["gfx90a"], "NVIDIA")]
+    ("capabilities", "found"),
+    [
+        (["9.0"], "sm_90"),
+        (["12.0"] * 2, "sm_120"),
+        (["8.0", "9.0"], "differ"),
+        (["gfx90a"], "NVIDIA"),
+    ],
 )
 def test_architecture(capabilities, found, monkeypatch):
     class Device:
@@ -319,12 +407,31 @@ def test_nvrtc_compiles_the_kernel(architecture, dtype, paper):
 def test_the_paper_s_step_stays_in_registers(paper, tmp_path):
     program, shared, lane, _ = step_of(paper, draws(2), method="rk4", dtype="float32")
     (tmp_path / "kernel.cu").write_text(source(program, shared.size, lane.shape[0], CUDA))
-    command = ["nvcc", "-w", "-cubin", "-arch=sm_90", "-Xptxas", "-v", "-o", "kernel.cubin", "kernel.cu"]
-    report = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stderr
-    found = re.search(r"function 'iblf_jax_advance'.*?(\d+) bytes spill stores.*?Used (\d+) registers", report, re.DOTALL)
+    command = [
+        "nvcc",
+        "-w",
+        "-cubin",
+        "-arch=sm_90",
+        "-Xptxas",
+        "-v",
+        "-o",
+        "kernel.cubin",
+        "kernel.cu",
+    ]
+    report = subprocess.run(
+        command, cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stderr
+    found = re.search(
+        r"function 'iblf_jax_advance'.*?(\d+) bytes spill stores.*?Used (\d+) registers",
+        report,
+        re.DOTALL,
+    )
     assert found, report
     assert int(found[1]) == 0
-    assert int(found[2]) <= 200, "two blocks of 128 threads fit a multiprocessor; the estimate of the error takes 25 registers"
+    assert int(found[2]) <= 200, (
+        "two blocks of 128 threads fit a multiprocessor; the estimate of the error takes 25"
+        " registers"
+    )
 
 
 @needs_nvrtc
@@ -341,10 +448,20 @@ def test_what_nvrtc_refuses_is_reported_in_one_line():
 def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper, monkeypatch):
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
-    scenario, dt, varied = canonical(paper), jnp.asarray(DT), {k: jnp.asarray(v) for k, v in draws(2).items()}
-    call = jax.jit(lambda v: execute.run_batch(scenario, v, STANDARD, dt, Run(20_000, "rk4", 10), backend="gpu"))
+    scenario, dt, varied = (
+        canonical(paper),
+        jnp.asarray(DT),
+        {k: jnp.asarray(v) for k, v in draws(2).items()},
+    )
+    call = jax.jit(
+        lambda v: execute.run_batch(
+            scenario, v, STANDARD, dt, Run(20_000, "rk4", 10), backend="gpu"
+        )
+    )
     text = call.trace(varied).lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("custom_call @iblf_jax_") == 3, "the rates around the start, the steps, the rates around two more instants"
+    assert text.count("custom_call @iblf_jax_") == 3, (
+        "the rates around the start, the steps, the rates around two more instants"
+    )
     assert "every = 10 : i64, steps = 20001 : i64, threads = 32 : i64" in text
 
 
@@ -352,7 +469,10 @@ def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper,
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_on_a_gpu_it_agrees_with_the_reference(dtype):
     values = spoiled(1000)
-    found, expected = outcome(dtype, "gpu", values, 1000, 7), outcome(dtype, "vmap", values, 1000, 7)
+    found, expected = (
+        outcome(dtype, "gpu", values, 1000, 7),
+        outcome(dtype, "vmap", values, 1000, 7),
+    )
     np.testing.assert_array_equal(found.status, expected.status)
     sound = expected.status == 0
     of_sound = [jax.tree.map(lambda x: x[sound], x) for x in (found, expected)]

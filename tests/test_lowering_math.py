@@ -56,11 +56,16 @@ def spread(dtype):
 def kernel(dtype, flags=()):
     """The C library behind one function per name, `f(in, out, count)`."""
     entries = "".join(
-        f'extern "C" __attribute__((visibility("default"))) void v_{name}(const real *x, real *y, long n) '
-        f"{{ for (long i = 0; i < n; i += W) store(y + i, f_{name}(load(x + i))); }}\n"
+        f'extern "C" __attribute__((visibility("default"))) void v_{name}(const real *x, real *y,'
+        f" long n) {{ for (long i = 0; i < n; i += W) store(y + i, f_{name}(load(x + i))); }}\n"
         for name in FUNCTIONS
     )
-    source = f"#define DOUBLE {int(dtype == np.float64)}\n" + emit_c.header("vector.h") + emit_c.header("mathlib.h") + entries
+    source = (
+        f"#define DOUBLE {int(dtype == np.float64)}\n"
+        + emit_c.header("vector.h")
+        + emit_c.header("mathlib.h")
+        + entries
+    )
     return toolchain.loaded(toolchain.built(source, flags)[0])
 
 
@@ -73,8 +78,11 @@ def native_value(library, name, x):
 
 
 def ulps(found, exact, dtype):
-    """Error in units of the last place of `dtype`; near a zero of sin, of the argument's own precision."""
-    return np.abs(found.astype(np.longdouble) - exact) / np.spacing(np.maximum(np.abs(exact.astype(dtype)), np.finfo(dtype).tiny))
+    """Error in units of the last place of `dtype`; near a zero of sin, of the argument's own
+    precision."""
+    return np.abs(found.astype(np.longdouble) - exact) / np.spacing(
+        np.maximum(np.abs(exact.astype(dtype)), np.finfo(dtype).tiny)
+    )
 
 
 def exactly(f, x):
@@ -98,10 +106,15 @@ def test_native_functions(dtype):
 
 
 @needs_compiler
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have fused multiply-adds")
+@pytest.mark.skipif(
+    platform.machine() != "x86_64", reason="other processors have fused multiply-adds"
+)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_sin_and_cos_without_a_fused_multiply_add(dtype):
-    library, x = kernel(dtype, ("-march=nehalem",)), np.concatenate([LINE, UNIT, spread(dtype)]).astype(dtype)
+    library, x = (
+        kernel(dtype, ("-march=nehalem",)),
+        np.concatenate([LINE, UNIT, spread(dtype)]).astype(dtype),
+    )
     for name, f in (("sin", np.sin), ("cos", np.cos)):
         assert np.max(ulps(native_value(library, name, x), exactly(f, x), dtype)) <= 2.1
 
@@ -114,13 +127,21 @@ def test_native_functions_at_the_edges(dtype):
     with np.errstate(all="ignore"):
         for name, (f, _, _) in FUNCTIONS.items():
             found, expected = native_value(library, name, x), f(x)
-            np.testing.assert_allclose(found, expected, rtol=4 * np.finfo(dtype).eps, atol=np.finfo(dtype).tiny, err_msg=name)
+            np.testing.assert_allclose(
+                found,
+                expected,
+                rtol=4 * np.finfo(dtype).eps,
+                atol=np.finfo(dtype).tiny,
+                err_msg=name,
+            )
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_sin_and_cos_of_the_xla_backend(dtype):
     limit = vector_math.LIMIT[np.dtype(dtype)]
-    x = np.concatenate([LINE, limit * UNIT, np.pi / 2 * np.arange(-500, 500), spread(dtype)]).astype(dtype)
+    x = np.concatenate(
+        [LINE, limit * UNIT, np.pi / 2 * np.arange(-500, 500), spread(dtype)]
+    ).astype(dtype)
     function = jax.jit(lambda x: vector_math.sines(("sin", "cos"), (x, x)))
     for found, exact in zip(function(x), (np.sin, np.cos), strict=True):
         error = np.abs(np.asarray(found).astype(np.longdouble) - exact(x.astype(np.longdouble)))
@@ -133,24 +154,44 @@ def test_sin_and_cos_of_the_xla_backend(dtype):
 
 
 def all_operations(dtype, runs=256):
-    """A program of every row of the table, on every kind that C takes; what goes in; and what NumPy makes of it, with names."""
+    """A program of every row of the table, on every kind that C takes; what goes in; and what NumPy
+    makes of it, with names."""
     rng, b = np.random.default_rng(0), Builder(dtype)
     sizes = 10.0 ** rng.uniform(-3, 1, (3, runs)) * rng.choice([-1, 1], (3, runs))
-    floats = np.where(rng.random((3, runs)) < 0.5, sizes, rng.uniform(-3, 3, (3, runs))).astype(dtype)
+    floats = np.where(rng.random((3, runs)) < 0.5, sizes, rng.uniform(-3, 3, (3, runs))).astype(
+        dtype
+    )
     floats[:, :3] = 1e9  # sin and cos on their seldom way
-    values = {"f": floats, "i": rng.integers(1, 9, (3, runs)) * rng.choice([-1, 1], (3, runs)), "b": rng.random((3, runs)) < 0.5}
+    values = {
+        "f": floats,
+        "i": rng.integers(1, 9, (3, runs)) * rng.choice([-1, 1], (3, runs)),
+        "b": rng.random((3, runs)) < 0.5,
+    }
     types = {"f": np.dtype(dtype), "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
-    inputs = {kind: [b.input("carry", 3 * k + i, kind) for i in range(3)] for k, kind in enumerate("fib")}
-    outputs, expected, names = [i for kind in "fib" for i in inputs[kind]], [*values["f"], *values["i"], *values["b"]], ["input"] * 9
+    inputs = {
+        kind: [b.input("carry", 3 * k + i, kind) for i in range(3)] for k, kind in enumerate("fib")
+    }
+    outputs, expected, names = (
+        [i for kind in "fib" for i in inputs[kind]],
+        [*values["f"], *values["i"], *values["b"]],
+        ["input"] * 9,
+    )
 
     def add(op, kinds, result):
         args = [inputs[kind][place] for place, kind in enumerate(kinds)]
-        node = b.lookup((7.0, 8.0, 9.0, 10.0, 11.0), *args) if op == "lookup" else b.emit(op, *args, kind=result)
+        node = (
+            b.lookup((7.0, 8.0, 9.0, 10.0, 11.0), *args)
+            if op == "lookup"
+            else b.emit(op, *args, kind=result)
+        )
         columns = [values[kind][place].tolist() for place, kind in enumerate(kinds)]
         if op == "lookup":
             folded = [7 + min(max(x, 0), 4) for x in columns[0]]
         else:
-            folded = [fold(op, list(xs), list(kinds), result, types["f"]) for xs in zip(*columns, strict=True)]
+            folded = [
+                fold(op, list(xs), list(kinds), result, types["f"])
+                for xs in zip(*columns, strict=True)
+            ]
         outputs.append(node)
         expected.append(np.asarray(folded, types[result]))
         names.append(f"{op} of {kinds}")
@@ -160,7 +201,9 @@ def all_operations(dtype, runs=256):
             continue
         arity = sum(p.default is p.empty for p in inspect.signature(row.lax).parameters.values())
         for first in row.c or "f":
-            for kinds in [(first, *2 * kind) for kind in "fib"] if op == "select" else [(first,) * arity]:
+            for kinds in (
+                [(first, *2 * kind) for kind in "fib"] if op == "select" else [(first,) * arity]
+            ):
                 dummies = [jax.ShapeDtypeStruct((), types[kind]) for kind in kinds]
                 add(op, kinds, kind_of(jax.eval_shape(lambda *x, f=row.lax: f(*x), *dummies).dtype))
     for source, target in ("if", "bf", "bi", "fi"):
@@ -175,17 +218,30 @@ def evaluated(program, shared, lane, carry, steps, every):
     """One step as `xla.run` does it, without its loop, which takes ten times as long to compile."""
 
     def step(carry):
-        known = {a: x for (a, _), x in zip(program.carry, xla._separate(program, carry), strict=True) if a >= 0}
+        known = {
+            a: x
+            for (a, _), x in zip(program.carry, xla._separate(program, carry), strict=True)
+            if a >= 0
+        }
         Evaluator(program, carry.floats.shape[1:]).compute(known, [o for _, o in program.carry])
         return xla._joined(program, [known[o] for _, o in program.carry], carry.floats.shape[1])
 
     return machine_function(step)(carry), []
 
 
-@pytest.mark.parametrize("executor", ["xla", pytest.param("native", marks=needs_compiler), pytest.param("gpu", marks=needs_compiler)])
+@pytest.mark.parametrize(
+    "executor",
+    [
+        "xla",
+        pytest.param("native", marks=needs_compiler),
+        pytest.param("gpu", marks=needs_compiler),
+    ],
+)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_every_operation_is_the_same_everywhere(executor, dtype):
-    run, limit = {"xla": (evaluated, 128), "native": (native.run, 16), "gpu": (gpu_on_cpu.run, 16)}[executor]
+    run, limit = {"xla": (evaluated, 128), "native": (native.run, 16), "gpu": (gpu_on_cpu.run, 16)}[
+        executor
+    ]
     program, (floats, ints), expected, names = all_operations(dtype)
     assert {name.partition(" ")[0] for name in names[9:]} == set(OPERATIONS)
     kinds, more = program.kinds, [np.zeros(floats.shape[1])] * len(names)
@@ -193,11 +249,21 @@ def test_every_operation_is_the_same_everywhere(executor, dtype):
         jnp.asarray(np.stack([*floats, *more][: sum(kind == "f" for kind in kinds)]), dtype),
         jnp.asarray(np.stack([*ints, *more][: sum(kind != "f" for kind in kinds)]), jnp.int32),
     )
-    after = jax.jit(lambda carry: run(program, jnp.zeros(1, dtype), jnp.zeros((1, floats.shape[1]), dtype), carry, 1, None)[0])(packed)
+    after = jax.jit(
+        lambda carry: run(
+            program, jnp.zeros(1, dtype), jnp.zeros((1, floats.shape[1]), dtype), carry, 1, None
+        )[0]
+    )(packed)
     rows = {"f": iter(np.asarray(after.floats)), "i": iter(np.asarray(after.ints))}
     for name, kind, exact in zip(names, kinds, expected, strict=True):
         found = next(rows["f" if kind == "f" else "i"])
         if kind == "f":
-            np.testing.assert_allclose(found, exact, rtol=limit * np.finfo(dtype).eps, atol=np.finfo(dtype).tiny, err_msg=name)
+            np.testing.assert_allclose(
+                found,
+                exact,
+                rtol=limit * np.finfo(dtype).eps,
+                atol=np.finfo(dtype).tiny,
+                err_msg=name,
+            )
         else:
             np.testing.assert_array_equal(found, exact, name)

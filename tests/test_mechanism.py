@@ -1,4 +1,5 @@
-"""The mechanism that is compiled in: which zeros of an arm are left out, that every number still counts, and that nothing hides a NaN."""
+"""The mechanism that is compiled in: which zeros of an arm are left out, that every number still
+counts, and that nothing hides a NaN."""
 
 from __future__ import annotations
 
@@ -42,10 +43,16 @@ def square_arm() -> ij.Scenario:
         tip_rotation=QUARTER,
         payload=0.5,
     )
-    return canonical(dataclasses.replace(PRESET, plant=arm, model=dataclasses.replace(arm, payload=0.0)))
+    return canonical(
+        dataclasses.replace(PRESET, plant=arm, model=dataclasses.replace(arm, payload=0.0))
+    )
 
 
-FIELDS = [f.name for f in dataclasses.fields(ij.robots.Arm) if isinstance(getattr(square_arm().plant, f.name), jax.Array)]
+FIELDS = [
+    f.name
+    for f in dataclasses.fields(ij.robots.Arm)
+    if isinstance(getattr(square_arm().plant, f.name), jax.Array)
+]
 
 
 def batch_of(scenario, varied=(), known=True) -> tuple[Batch, Carry]:
@@ -89,28 +96,48 @@ def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_join
 @pytest.mark.parametrize("robot", ["plant", "model"])
 @pytest.mark.parametrize("field", FIELDS)
 def test_every_number_of_an_arm_counts_once_it_is_changed(robot, field):
-    """Zeros, ones and equal numbers, each made a number of its own: the program is that of the new arm."""
+    """Zeros, ones and equal numbers, each made a number of its own: the program is that of the new
+    arm."""
     scenario, path = square_arm(), f"{robot}.{field}"
     before = np.asarray(get(scenario, path))
     change = 0.01 * np.abs(np.cos(1.0 + np.arange(before.size))).reshape(before.shape)
-    by_program, expected = both(with_parameters(scenario, {path: jnp.asarray(np.where(np.isfinite(before), before + change, before))}))
+    by_program, expected = both(
+        with_parameters(
+            scenario, {path: jnp.asarray(np.where(np.isfinite(before), before + change, before))}
+        )
+    )
     np.testing.assert_allclose(by_program, expected, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("path", ["plant.axis", "model.rotation", "plant.g", "plant.position[0]", "model.tip_position"])
+@pytest.mark.parametrize(
+    "path", ["plant.axis", "model.rotation", "plant.g", "plant.position[0]", "model.tip_position"]
+)
 def test_what_differs_between_runs_is_never_compiled_in(path):
     """The same program for other numbers: a run beside it may have anything there."""
     scenario = square_arm()
     batch, carries, program = lowered(scenario, (path,))
     carry = jax.tree.map(lambda x: x[0], carries)
-    moved = [x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape)) for x in batch.leaves.lane]
+    moved = [
+        x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape))
+        for x in batch.leaves.lane
+    ]
     inputs = batch.leaves.together(batch.leaves.shared, moved)
     values = (numbers(x) for x in (batch.leaves.shared, moved, jax.tree.leaves(carry)))
     expected = numbers(by_jax(inputs, carry, jnp.int32(3)))
     np.testing.assert_allclose(evaluate(program, *values, 3), expected, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("path", ["plant.mass", "model.mass[0]", "plant.payload", "plant.carried.mass", "controller.K2", "model.armature"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "plant.mass",
+        "model.mass[0]",
+        "plant.payload",
+        "plant.carried.mass",
+        "controller.K2",
+        "model.armature",
+    ],
+)
 @pytest.mark.parametrize("value", [1e-6, 1.0, 2.0, 0.7])
 def test_new_masses_gains_and_loads_compile_nothing(path, value):
     scenario = square_arm()
@@ -123,14 +150,18 @@ def test_another_number_that_is_none_of_these_compiles_nothing():
     scenario = square_arm()
     longer = {f"{robot}.position[1]": jnp.asarray([0.5, 0.0, 0.0]) for robot in ("plant", "model")}
     assert mechanism_of(with_parameters(scenario, longer)) == mechanism_of(scenario)
-    assert mechanism_of(with_parameters(scenario, {"plant.position[1]": jnp.asarray([0.5, 0.0, 0.0])})) != mechanism_of(scenario)
+    assert mechanism_of(
+        with_parameters(scenario, {"plant.position[1]": jnp.asarray([0.5, 0.0, 0.0])})
+    ) != mechanism_of(scenario)
 
 
 def test_a_right_angle_costs_no_more_in_the_model_than_in_the_plant():
     """Equal numbers of a row, of either sign, are one input, and the model's are the plant's."""
     known = mechanism_of(square_arm()).numbers
     rows = [x for x in known if x is not None and x.sign < 0]
-    assert rows and all(known[x.same].same is None for x in known if x is not None and x.same is not None)
+    assert rows and all(
+        known[x.same].same is None for x in known if x is not None and x.same is not None
+    )
 
 
 def test_a_robot_of_a_user_may_have_a_field_of_that_name():
@@ -141,44 +172,79 @@ def test_a_robot_of_a_user_may_have_a_field_of_that_name():
 
     arm = square_arm().plant
     fields = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
-    assert mechanism_of(dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))) is None
+    assert (
+        mechanism_of(dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields)))
+        is None
+    )
 
 
 def test_derivatives_by_the_geometry(monkeypatch):
-    """A direction moves numbers that are compiled in as zeros: their derivatives are there all the same."""
+    """A direction moves numbers that are compiled in as zeros: their derivatives are there all the
+    same."""
     scenario = square_arm()
-    start, along = {"initial.q": scenario.initial.q[None]}, {"plant.centre": np.eye(6)[[0, 2, 3]].reshape(3, 2, 3)}
+    start, along = (
+        {"initial.q": scenario.initial.q[None]},
+        {"plant.centre": np.eye(6)[[0, 2, 3]].reshape(3, 2, 3)},
+    )
     dt = jnp.asarray(DT)
 
     def by(backend, mechanism):
         run = Run(5, "euler", mechanism=mechanism)
-        return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run, backend=backend).tangents)(scenario, start)
+        return jax.jit(
+            lambda s, v: (
+                execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run, backend=backend).tangents
+            )
+        )(scenario, start)
 
     known, plain = by("native", mechanism_of(scenario)), by("vmap", None)
     monkeypatch.setattr(plan, "JVP_LARGEST_IN_SEGMENTS", 0)
     column_by_column = by("auto", mechanism_of(scenario))
     for name, expected in plain.items():
         np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
-        np.testing.assert_allclose(column_by_column[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(
+            column_by_column[name], expected, rtol=1e-9, atol=1e-12, err_msg=name
+        )
     counts = np.abs(plain["rmse"]).max(axis=(0, 2)) > 0
     assert counts.tolist() == [True, False, True], "a height on the vertical axis is no lever"
 
 
 def test_robots_without_a_geometry_and_tracers_have_none():
     assert mechanism_of(canonical(PRESET)) is None
-    jax.jit(lambda s: jnp.asarray([mechanism_of(s) is None]) if mechanism_of(s) is None else pytest.fail("read a tracer"))(square_arm())
+    jax.jit(
+        lambda s: (
+            jnp.asarray([mechanism_of(s) is None])
+            if mechanism_of(s) is None
+            else pytest.fail("read a tracer")
+        )
+    )(square_arm())
 
 
 @partial(jax.jit, static_argnames="run")
 def status_of(scenario, *, run):
-    return execute.run_batch(scenario, {"initial.q": scenario.initial.q[None]}, STANDARD, jnp.asarray(DT), run, backend="native").status[0]
+    return execute.run_batch(
+        scenario,
+        {"initial.q": scenario.initial.q[None]},
+        STANDARD,
+        jnp.asarray(DT),
+        run,
+        backend="native",
+    ).status[0]
 
 
-@pytest.mark.parametrize("path", ["initial.q", "initial.dq", "plant.mass", "plant.position", "model.g", "controller.K2"])
+@pytest.mark.parametrize(
+    "path", ["initial.q", "initial.dq", "plant.mass", "plant.position", "model.g", "controller.K2"]
+)
 def test_a_run_that_is_not_finite_is_seen_to_be_so(path):
-    """A product with a zero of the mechanism is left out, whatever the other factor: no run may look sound by it."""
+    """A product with a zero of the mechanism is left out, whatever the other factor: no run may
+    look sound by it."""
     scenario = square_arm()
     value = get(scenario, path)
     for number, expected in ((value, 0), (jnp.full_like(value, jnp.nan), int(Status.NOT_FINITE))):
-        changed = jax.jit(lambda s, x: with_parameters(s, {path: x}))(scenario, number)  # where nothing looks at the number
-        assert int(status_of(changed, run=Run(5, "euler", mechanism=mechanism_of(changed)))) & int(Status.NOT_FINITE) == expected
+        changed = jax.jit(lambda s, x: with_parameters(s, {path: x}))(
+            scenario, number
+        )  # where nothing looks at the number
+        assert (
+            int(status_of(changed, run=Run(5, "euler", mechanism=mechanism_of(changed))))
+            & int(Status.NOT_FINITE)
+            == expected
+        )

@@ -1,4 +1,5 @@
-"""docs/members.md is what the members' docstrings give, and every law, barrier and observer names its source."""
+"""docs/members.md is what the members' docstrings give, and every law, barrier and observer names
+its source."""
 
 import runpy
 from pathlib import Path
@@ -11,10 +12,14 @@ PAGE = runpy.run_path(str(Path(__file__).resolve().parent.parent / "docs" / "mem
 
 
 def test_the_page_is_not_stale():
-    assert PAGE["TARGET"].read_text(encoding="utf-8") == PAGE["text"](), "run `python docs/members.py`"
+    assert PAGE["TARGET"].read_text(encoding="utf-8") == PAGE["text"](), (
+        "run `python docs/members.py`"
+    )
 
 
-@pytest.mark.parametrize("cls", [*barriers.MEMBERS.values(), *controllers.MEMBERS.values(), *observers.MEMBERS.values()])
+@pytest.mark.parametrize(
+    "cls", [*barriers.MEMBERS.values(), *controllers.MEMBERS.values(), *observers.MEMBERS.values()]
+)
 def test_every_member_says_what_it_is_and_where_it_comes_from(cls):
     assert len(PAGE["first_line"](cls)) > 5
     assert len(PAGE["source"](cls)) > 3

@@ -16,8 +16,13 @@ from iblf_jax.tuning.quantities import Quantities
 
 @pytest.fixture(scope="module")
 def recorded(short_run):
-    """The recorded run as NumPy arrays, and the weight of each sample in an integral by the trapezoidal rule."""
-    fields = {f.name: np.asarray(getattr(short_run, f.name)) for f in dataclasses.fields(short_run) if f.name in RECORDED}
+    """The recorded run as NumPy arrays, and the weight of each sample in an integral by the
+    trapezoidal rule."""
+    fields = {
+        f.name: np.asarray(getattr(short_run, f.name))
+        for f in dataclasses.fields(short_run)
+        if f.name in RECORDED
+    }
     weights = np.full(fields["t"].size, SHORT["dt"])
     weights[[0, -1]] = SHORT["dt"] / 2
     return fields, weights[:, None]
@@ -49,7 +54,13 @@ def test_integrals_and_peaks(short_run, recorded):
     }
     for name, value in expected.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-9, err_msg=name)
-    assert set(metrics) == {*expected, "settling_time", "overshoot", "numerical_error", "relative_numerical_error"}
+    assert set(metrics) == {
+        *expected,
+        "settling_time",
+        "overshoot",
+        "numerical_error",
+        "relative_numerical_error",
+    }
 
 
 def test_every_metric_has_a_unit(short_run):
@@ -78,9 +89,12 @@ def test_settling_counts_from_the_sample_after_the_last_one_outside():
     np.testing.assert_allclose(fold.finish(acc)["settling_time"], [0.1, np.inf])
 
 
-@pytest.mark.parametrize(("q", "slope"), [(0.84, -1.0), (0.86, -1.0), (2.0, -1.0), (0.19, 1.0), (-1.0, 1.0)])
+@pytest.mark.parametrize(
+    ("q", "slope"), [(0.84, -1.0), (0.86, -1.0), (2.0, -1.0), (0.19, 1.0), (-1.0, 1.0)]
+)
 def test_margins_go_on_through_zero(q, slope):
-    """Bounds 0.2 and 0.85: past the wall the margin is negative and its gradient still says which way is back."""
+    """Bounds 0.2 and 0.85: past the wall the margin is negative and its gradient still says which
+    way is back."""
     from iblf_jax.testing.metrics import samples
 
     fold, sample = ij.metrics.Margin(), _row(samples(np.random.default_rng(0)), 0)
@@ -103,9 +117,17 @@ def test_metrics_do_not_depend_on_what_is_recorded(paper, short_run):
     sparse = ij.simulate(paper, **SHORT, record_every=7)
     assert sparse.t.size == 500 // 7 + 1
     for name in short_run.metrics:
-        np.testing.assert_allclose(sparse.metrics[name], short_run.metrics[name], rtol=1e-10, err_msg=name)
+        np.testing.assert_allclose(
+            sparse.metrics[name], short_run.metrics[name], rtol=1e-10, err_msg=name
+        )
     for name in ("t", "q", "dq", "tau", "e2", "V", "disturbance_estimate", "observer_state"):
-        np.testing.assert_allclose(getattr(sparse, name), np.asarray(getattr(short_run, name))[::7], rtol=1e-9, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(sparse, name),
+            np.asarray(getattr(short_run, name))[::7],
+            rtol=1e-9,
+            atol=1e-12,
+            err_msg=name,
+        )
     assert int(sparse.status) == int(short_run.status)
 
 
@@ -148,7 +170,9 @@ def test_access_by_name_and_by_attribute(short_run):
 
 # -------------------------------------------------------------------------------------------- integrals are of second order
 
-SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0})
+SLOW = ij.with_parameters(
+    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+)
 STEP = ij.disturbances.Step(size=[8.0, 3.0], time=0.0631)
 LOOPS = {
     "continuous": {},
@@ -156,37 +180,76 @@ LOOPS = {
     "disturbed": {"disturbance": STEP},
     "sampled and disturbed": {"disturbance": STEP, "sampling": ij.Sampling(period=1e-2)},
 }
-"""Parts of scenarios in which nothing jumps, torque and law signals do, the disturbance does, and both."""
+"""Parts of scenarios in which nothing jumps, torque and law signals do, the disturbance does, and
+both."""
 QUICK = ("continuous", "sampled and disturbed")
-INTEGRALS = ("rmse", "ise", "iae", "itae", "effort", "torque_rms", "effort_above_gravity", "estimate_rmse")
+INTEGRALS = (
+    "rmse",
+    "ise",
+    "iae",
+    "itae",
+    "effort",
+    "torque_rms",
+    "effort_above_gravity",
+    "estimate_rmse",
+)
 
 
-@pytest.mark.parametrize("loop", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LOOPS])
+@pytest.mark.parametrize(
+    "loop", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LOOPS]
+)
 def test_integrals_are_of_second_order(loop):
-    """Whatever jumps: the disturbance does at 0.0631 s, which is at no instant, and the command arrives within a step."""
+    """Whatever jumps: the disturbance does at 0.0631 s, which is at no instant, and the command
+    arrives within a step."""
     scenario = dataclasses.replace(SLOW, **LOOPS[loop])
-    folds = (ij.metrics.Tracking(), ij.metrics.Torque(), ij.metrics.AboveGravity(), ij.metrics.Estimation())
+    folds = (
+        ij.metrics.Tracking(),
+        ij.metrics.Torque(),
+        ij.metrics.AboveGravity(),
+        ij.metrics.Estimation(),
+    )
 
     def integrals(parts):
-        return ij.simulate(scenario, duration=0.12, dt=1e-2 / parts, metrics=folds, record_every=10_000).metrics
+        return ij.simulate(
+            scenario, duration=0.12, dt=1e-2 / parts, metrics=folds, record_every=10_000
+        ).metrics
 
     coarse, fine, truth = (integrals(parts) for parts in (8, 32, 128))
     for name in INTEGRALS:
-        errors = [np.max(np.abs(x[name] - truth[name]) / np.abs(truth[name])) for x in (coarse, fine)]
+        errors = [
+            np.max(np.abs(x[name] - truth[name]) / np.abs(truth[name])) for x in (coarse, fine)
+        ]
         assert errors[0] < 6e-3, (name, errors)
-        # Where the leading terms cancel, a smaller one, of the cell that the jump divides, is all that is left.
+        # Where the leading terms cancel, a smaller one, of the cell that the jump divides, is all
+        # that is left.
         assert errors[1] < 1e-7 or np.log2(errors[0] / errors[1]) / 2 > 1.9, (name, errors)
 
 
 def test_one_definition_serves_runs_batches_and_losses():
-    """A disturbance that jumps within a step, under a sampled law: the numbers of a run, a batch and a loss are the same."""
+    """A disturbance that jumps within a step, under a sampled law: the numbers of a run, a batch
+    and a loss are the same."""
     scenario = dataclasses.replace(SLOW, **LOOPS["sampled and disturbed"])
     timing = {"duration": 0.12, "dt": 1e-2}
     objective = ij.objectives.tracking() + ij.objectives.effort()
-    folds = (ij.metrics.Tracking(), ij.metrics.Torque(), ij.metrics.Estimation(), Quantities(objective.quantities))
+    folds = (
+        ij.metrics.Tracking(),
+        ij.metrics.Torque(),
+        ij.metrics.Estimation(),
+        Quantities(objective.quantities),
+    )
     run = ij.simulate(scenario, metrics=folds, **timing)
-    study = ij.monte_carlo(scenario, {"disturbance.time": ij.value(ij.uniform(0.05, 0.07))}, runs=3, progress=False, **timing)
+    study = ij.monte_carlo(
+        scenario,
+        {"disturbance.time": ij.value(ij.uniform(0.05, 0.07))},
+        runs=3,
+        progress=False,
+        **timing,
+    )
     replayed = study.replay(1)
     for name in ("ise", "effort", "estimate_rmse"):
-        np.testing.assert_allclose(study.metrics[name][1], replayed.metrics[name], rtol=1e-12, err_msg=name)
-    np.testing.assert_allclose(run.metrics["tuning_exact"], [np.sum(run.metrics.ise), run.metrics.effort], rtol=1e-12)
+        np.testing.assert_allclose(
+            study.metrics[name][1], replayed.metrics[name], rtol=1e-12, err_msg=name
+        )
+    np.testing.assert_allclose(
+        run.metrics["tuning_exact"], [np.sum(run.metrics.ise), run.metrics.effort], rtol=1e-12
+    )

@@ -33,7 +33,9 @@ def study():
 
 
 def results(study):
-    return dict(study.metrics) | study.samples | {"status": study.status, "mode": study.fastest_mode}
+    return (
+        dict(study.metrics) | study.samples | {"status": study.status, "mode": study.fastest_mode}
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------ bit-identity
@@ -46,8 +48,15 @@ def test_chunk_changes_nothing(study, chunk):
 
 
 @pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, plan.STUDY_IN_FLIGHT)])
-def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(study, chunk, together, monkeypatch):
-    made, now, most, execute_block = threading.Barrier(together, timeout=60), [], [], blocks._execute
+def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
+    study, chunk, together, monkeypatch
+):
+    made, now, most, execute_block = (
+        threading.Barrier(together, timeout=60),
+        [],
+        [],
+        blocks._execute,
+    )
 
     def counted(*args, **more):
         now.append(None)
@@ -78,7 +87,9 @@ def test_seed_changes_every_draw(study):
 
 def test_other_perturbations_change_no_draw(study):
     alone = cases.study(runs=3)
-    assert cases.same({"m": alone.samples["plant.mass[1]"]}, {"m": study.samples["plant.mass[1]"][:3]})
+    assert cases.same(
+        {"m": alone.samples["plant.mass[1]"]}, {"m": study.samples["plant.mass[1]"][:3]}
+    )
 
 
 @pytest.mark.slow
@@ -94,7 +105,9 @@ def test_a_study_compiles_once_whatever_its_numbers(study):
     cases.study()
     before = blocks._execute._cache_size()
     stiffer = ij.with_parameters(SCENARIO, {"controller.K2": 30.0})
-    ij.monte_carlo(stiffer, cases.perturbations(0.05, 0.01), runs=300, **cases.options() | {"seed": 9})
+    ij.monte_carlo(
+        stiffer, cases.perturbations(0.05, 0.01), runs=300, **cases.options() | {"seed": 9}
+    )
     assert blocks._execute._cache_size() == before
 
 
@@ -111,7 +124,9 @@ def test_a_repeated_study_lowers_nothing(study, monkeypatch):
 def test_draws_follow_the_documented_law(study):
     dtype = SCENARIO.initial.q.dtype
     for i in (0, 1, 256, 599):
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(3), i), zlib.crc32(b"plant.mass[1]"))
+        key = jax.random.fold_in(
+            jax.random.fold_in(jax.random.key(3), i), zlib.crc32(b"plant.mass[1]")
+        )
         u = jax.random.uniform(key, (), dtype) + jnp.finfo(dtype).eps / 2
         expected = float(SCENARIO.plant.mass[1]) * stats.norm.ppf(float(u), 1.0, 0.1)
         np.testing.assert_allclose(study.samples["plant.mass[1]"][i], expected, rtol=1e-5)
@@ -132,11 +147,15 @@ def test_entries_of_a_vector_are_independent(study):
 )
 def test_quantiles_agree_with_scipy(distribution, reference):
     u = jnp.linspace(0.01, 0.99, 99)
-    np.testing.assert_allclose(distribution.quantile(u), reference.ppf(np.asarray(u, float)), rtol=2e-5)
+    np.testing.assert_allclose(
+        distribution.quantile(u), reference.ppf(np.asarray(u, float)), rtol=2e-5
+    )
 
 
 def test_choice_has_its_weights():
-    draws = np.asarray(ij.choice([1.0, 5.0, 9.0], weights=[1, 0, 3]).quantile(jnp.linspace(0.0005, 0.9995, 1000)))
+    draws = np.asarray(
+        ij.choice([1.0, 5.0, 9.0], weights=[1, 0, 3]).quantile(jnp.linspace(0.0005, 0.9995, 1000))
+    )
     assert np.mean(draws == 1.0) == pytest.approx(0.25, abs=2e-3)
     assert set(draws) == {1.0, 9.0}
 
@@ -167,10 +186,22 @@ def test_a_law_and_a_distribution_from_a_notebook():
         def command(self, t, q, dq, f_hat, setting, state):
             never = jnp.zeros(q.shape, bool)
             tau = setting.model.gravity(q) - self.Kd * dq - f_hat
-            return ij.controllers.Command(tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), state
+            return (
+                ij.controllers.Command(tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never),
+                state,
+            )
 
-    scenario = dataclasses.replace(SCENARIO, controller=Damping(Kd=[4.0, 4.0]), observer=ij.observers.NoObserver())
-    study = ij.monte_carlo(scenario, {"plant.payload": ij.value(Triangular())}, runs=300, seed=1, duration=0.05, progress=False)
+    scenario = dataclasses.replace(
+        SCENARIO, controller=Damping(Kd=[4.0, 4.0]), observer=ij.observers.NoObserver()
+    )
+    study = ij.monte_carlo(
+        scenario,
+        {"plant.payload": ij.value(Triangular())},
+        runs=300,
+        seed=1,
+        duration=0.05,
+        progress=False,
+    )
     assert study.backend in ("native", "xla")
     assert abs(study.samples["plant.payload"].mean() - 1 / 3) < 0.05
     replayed = study.replay(7)
@@ -179,9 +210,14 @@ def test_a_law_and_a_distribution_from_a_notebook():
 
 @pytest.mark.slow
 def test_robot_paths_move_plant_and_model_together_and_shared_draws_are_one():
-    ways = {"robot.mass[1]": ij.factor(ij.uniform(0.5, 2.0)), "initial.q": ij.offset(ij.normal(0, 0.01), shared=True)}
+    ways = {
+        "robot.mass[1]": ij.factor(ij.uniform(0.5, 2.0)),
+        "initial.q": ij.offset(ij.normal(0, 0.01), shared=True),
+    }
     study = cases.study(2, ways)
-    np.testing.assert_array_equal(study.samples["initial.q"][:, 0], study.samples["initial.q"][:, 1])
+    np.testing.assert_array_equal(
+        study.samples["initial.q"][:, 0], study.samples["initial.q"][:, 1]
+    )
     run = study.replay(1)
     drawn = study.samples["robot.mass[1]"][1]
     assert run.scenario.plant.mass[1] == drawn == run.scenario.model.mass[1]
@@ -211,11 +247,17 @@ def test_all_of_a_study_are_leaves(study):
 def test_replay_is_bit_identical_and_has_the_trajectory(study):
     for i in (0, 300, int(study.worst(1)[0])):
         run = study.replay(i)
-        assert all(np.array_equal(run.metrics[name], study.metrics[name][i]) for name in run.metrics)
+        assert all(
+            np.array_equal(run.metrics[name], study.metrics[name][i]) for name in run.metrics
+        )
         assert int(run.status) == study.status[i]
         assert float(run.fastest_mode) == study.fastest_mode[i]
         np.testing.assert_array_equal(run.q[0], study.samples["initial.q"][i])
-        np.testing.assert_allclose(np.min(np.minimum(run.q - run.lower, run.upper - run.q), 0), run.metrics.margin, atol=1e-6)
+        np.testing.assert_allclose(
+            np.min(np.minimum(run.q - run.lower, run.upper - run.q), 0),
+            run.metrics.margin,
+            atol=1e-6,
+        )
 
 
 def test_an_index_selects_a_run(study):
@@ -231,7 +273,9 @@ def test_an_index_selects_a_run(study):
 
 def test_a_failing_run_touches_no_other(study):
     outside = study.status & int(Status.BOUND_VIOLATED) != 0
-    assert 0 < outside.sum() < len(study), "some of these runs start outside their bounds, by design"
+    assert 0 < outside.sum() < len(study), (
+        "some of these runs start outside their bounds, by design"
+    )
     assert np.array_equal(np.flatnonzero(study.status & int(FAILED)), study.failed)
     assert all(np.all(np.isfinite(study.metrics[name])) for name in ("margin", "xi_margin"))
     counts = study.status_counts
@@ -250,7 +294,9 @@ def test_violation_probability_is_clopper_pearson(study):
 
 @pytest.mark.parametrize(("count", "runs"), [(0, 50), (50, 50)])
 def test_clopper_pearson_at_the_ends(count, runs):
-    found = statistics.probability(np.arange(runs) < count, np.ones(runs, bool), 0.95, "independent", 1)
+    found = statistics.probability(
+        np.arange(runs) < count, np.ones(runs, bool), 0.95, "independent", 1
+    )
     end = 1 - 0.025 ** (1 / runs)
     assert (found.low, found.high) == pytest.approx((0.0, end) if count == 0 else (1 - end, 1.0))
 
@@ -293,7 +339,10 @@ def test_quantiles_include_failed_runs_unless_told(study):
 def test_rank_correlation_agrees_with_scipy(study):
     found = study.correlations(["margin"])
     y = study.metrics.margin.min(1)
-    for name, x in (("initial.q[1]", study.samples["initial.q"][:, 1]), ("plant.mass[1]", study.samples["plant.mass[1]"])):
+    for name, x in (
+        ("initial.q[1]", study.samples["initial.q"][:, 1]),
+        ("plant.mass[1]", study.samples["plant.mass[1]"]),
+    ):
         cell = found.sel(parameter=name, metric="margin")
         expected = stats.spearmanr(x, y)
         assert float(cell.correlation) == pytest.approx(expected.statistic)
@@ -304,7 +353,9 @@ def test_bands_enclose_the_runs(study):
     bands = study.bands((0.0, 0.5, 1.0), runs=300, samples=10)
     assert bands.sizes == {"quantile": 3, "time": 11, "joint": 2}
     start = study.samples["initial.q"][:300]
-    np.testing.assert_allclose(bands.q.isel(time=0, quantile=[0, 2]), [start.min(0), start.max(0)], rtol=1e-6)
+    np.testing.assert_allclose(
+        bands.q.isel(time=0, quantile=[0, 2]), [start.min(0), start.max(0)], rtol=1e-6
+    )
     np.testing.assert_allclose(float(bands.time[-1]), 0.02)
     assert np.all(bands.q.diff("quantile") >= 0)
 
@@ -334,7 +385,8 @@ def test_study_says_what_happened(study):
 
 
 def test_sobol_indices_of_what_is_known():
-    """The margin of a joint that is nearest to its bound at the start is linear in where it starts, and in nothing else."""
+    """The margin of a joint that is nearest to its bound at the start is linear in where it starts,
+    and in nothing else."""
     ways = cases.perturbations(0.01, 0.003)
 
     def start(metrics):
@@ -346,18 +398,28 @@ def test_sobol_indices_of_what_is_known():
     assert found.runs == 320
     assert "initial.q[1]" in repr(found)
     assert found.to_xarray().sizes["parameter"] == 3
-    with pytest.raises(ValueError, match="first_violation_time: got '64 of 64 runs without a finite value'"):
+    with pytest.raises(
+        ValueError, match="first_violation_time: got '64 of 64 runs without a finite value'"
+    ):
         ij.sensitivity(SCENARIO, ways, output="first_violation_time", points=64, **cases.options())
 
 
 @pytest.mark.slow
 def test_sobol_indices_of_one_number_from_few_points():
     ways = {"initial.q[1]": ij.offset(ij.normal(0.0, 0.003))}
-    found = ij.sensitivity(SCENARIO, ways, output=lambda m: m.margin[:, 1], points=4, **cases.options())
+    found = ij.sensitivity(
+        SCENARIO, ways, output=lambda m: m.margin[:, 1], points=4, **cases.options()
+    )
     assert found.first_order.shape == (1,)
     assert np.all(np.isfinite([found.first_order_interval, found.total_order_interval]))
     with pytest.raises(ValueError, match="not the same in all runs"):
-        ij.sensitivity(SCENARIO, ways, output=lambda m: np.full(len(m.margin), 3.0), points=4, **cases.options())
+        ij.sensitivity(
+            SCENARIO,
+            ways,
+            output=lambda m: np.full(len(m.margin), 3.0),
+            points=4,
+            **cases.options(),
+        )
 
 
 # --------------------------------------------------------------------------------------------------------------- refusals
@@ -374,7 +436,13 @@ def test_sobol_indices_of_one_number_from_few_points():
         ({"plant.mass": ij.offset(ij.uniform(-3.0, 1.0))}, "plant.mass"),
         ({"plant.mass": ij.factor(ij.uniform([0.9] * 3, [1.1] * 3))}, "shape"),
         ({"initial.dq": ij.factor(ij.uniform(0.9, 1.1))}, "offset"),
-        ({"robot.mass": ij.factor(ij.uniform(0.9, 1.1)), "plant.mass[0]": ij.factor(ij.uniform(0.9, 1.1))}, "overlap"),
+        (
+            {
+                "robot.mass": ij.factor(ij.uniform(0.9, 1.1)),
+                "plant.mass[0]": ij.factor(ij.uniform(0.9, 1.1)),
+            },
+            "overlap",
+        ),
         ({}, "at least one"),
         ([1], "mapping"),
     ],
@@ -458,12 +526,15 @@ else:
 
 @pytest.mark.parametrize("what", ["left", pytest.param("caught", marks=pytest.mark.slow)])
 def test_an_interrupted_study_ends_without_a_crash(what):
-    """XLA compiles in threads of its own, which go on after Ctrl-C: the end of the interpreter crashed or hung."""
+    """XLA compiles in threads of its own, which go on after Ctrl-C: the end of the interpreter
+    crashed or hung."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-c", INTERRUPTED, what]
     # XLA compiles as it does for users: longer, and on several threads.
     environment = os.environ | {"PYTHONPATH": path, "XLA_FLAGS": os.environ["TESTER_XLA_FLAGS"]}
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     assert process.stdout.readline() == "compiles\n"
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)

@@ -1,4 +1,5 @@
-"""The notebooks run from top to bottom, as a reader would run them; the site shows what they gave."""
+"""The notebooks run from top to bottom, as a reader would run them; the site shows what they
+gave."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ FOLDER = ROOT / "notebooks"
 @pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.ipynb")))
 def test_notebook_runs(name, tmp_path):
     notebook = build.execute(FOLDER / name, tmp_path)
-    shown = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    shown = [
+        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+    ]
     assert any("image/png" in output.get("data", {}) for output in shown), "no figure was shown"
 
 

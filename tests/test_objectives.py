@@ -42,7 +42,9 @@ class Swing:
 def test_a_result_of_a_metric_is_weighted_and_summed(rng):
     """On the samples of a run, against the metrics themselves."""
     run = samples(rng)
-    tracking, swing, torque = (folded((fold,), run) for fold in (ij.metrics.Tracking(), Swing(), ij.metrics.Torque()))
+    tracking, swing, torque = (
+        folded((fold,), run) for fold in (ij.metrics.Tracking(), Swing(), ij.metrics.Torque())
+    )
     parts = (
         MetricResult(ij.metrics.Tracking(), "iae"),
         MetricResult(Swing(), "swing", [2.0, 0.5]),
@@ -54,17 +56,28 @@ def test_a_result_of_a_metric_is_weighted_and_summed(rng):
     np.testing.assert_array_equal(found["tuning_smooth"], found["tuning_exact"])
 
 
-FILE = 'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n[[objective]]\nkind = "metric"\n'
+FILE = (
+    'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n[[objective]]\nkind ='
+    ' "metric"\n'
+)
 
 
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
         ('name = "iae"', ij.objectives.metric(ij.metrics.Tracking(), "iae")),
-        ('name = "effort_above_gravity"\nweight = 2.0', 2.0 * ij.objectives.metric(ij.metrics.AboveGravity(), "effort_above_gravity")),
         (
-            'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 }\njoints = [1.0, 0.0]\nscale = 0.1',
-            ij.objectives.metric(ij.metrics.Settling(tolerance=0.02), "overshoot", joints=[1.0, 0.0], scale=0.1),
+            'name = "effort_above_gravity"\nweight = 2.0',
+            2.0 * ij.objectives.metric(ij.metrics.AboveGravity(), "effort_above_gravity"),
+        ),
+        (
+            (
+                'name = "overshoot"\nfold = { kind = "settling", tolerance = 0.02 }\njoints = [1.0,'
+                " 0.0]\nscale = 0.1"
+            ),
+            ij.objectives.metric(
+                ij.metrics.Settling(tolerance=0.02), "overshoot", joints=[1.0, 0.0], scale=0.1
+            ),
         ),
     ],
 )
@@ -80,7 +93,10 @@ def test_a_tuning_file_names_any_metric(words, expected, tmp_path):
     [
         ('name = "iaee"', r"objective\[0\].name: got 'iaee'.*Did you mean iae"),
         ("weight = 2.0", r"objective\[0\].name: got nothing"),
-        ('fold = "tracking"', r"objective\[0\].name: got nothing, expected the name of one of its results"),
+        (
+            'fold = "tracking"',
+            r"objective\[0\].name: got nothing, expected the name of one of its results",
+        ),
         ('fold = "traking"\nname = "iae"', r"objective\[0\].fold.kind.*Did you mean tracking"),
         ('fold = "margin"\nname = "iae"', "got 'iae', expected one of 'margin'"),
     ],
@@ -92,9 +108,17 @@ def test_a_tuning_file_with_a_wrong_metric_is_refused(words, message, tmp_path):
 
 
 def test_what_it_refuses():
-    with pytest.raises(ValueError, match=r"MetricResult.name: got 'rmsee', expected one of 'rmse', 'ise'"):
+    with pytest.raises(
+        ValueError, match=r"MetricResult.name: got 'rmsee', expected one of 'rmse', 'ise'"
+    ):
         ij.objectives.metric(ij.metrics.Tracking(), "rmsee")
-    with pytest.raises(ValueError, match=r"MetricResult.fold: got 'tracking', expected a component that fits iblf_jax.metrics.Fold"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"MetricResult.fold: got 'tracking', expected a component that fits"
+            r" iblf_jax.metrics.Fold"
+        ),
+    ):
         ij.objectives.metric("tracking", "rmse")
     with pytest.raises(ValueError, match=r"scale: .* numbers > 0"):
         ij.objectives.metric(Swing(), "swing", scale=-1.0)
@@ -102,7 +126,9 @@ def test_what_it_refuses():
 
 @pytest.mark.slow
 def test_a_metric_is_tuned_for_and_its_result_saved(paper, tmp_path):
-    best = ij.tune(paper, ["controller.k1"], ij.objectives.metric(Swing(), "swing"), iterations=3, **TUNING)
+    best = ij.tune(
+        paper, ["controller.k1"], ij.objectives.metric(Swing(), "swing"), iterations=3, **TUNING
+    )
     losses = best.history["loss"]
     assert np.min(losses) < losses[0].min()
     assert "swing" in str(best.report)
@@ -113,8 +139,15 @@ def test_a_metric_is_tuned_for_and_its_result_saved(paper, tmp_path):
 @pytest.mark.release
 def test_tuning_by_a_metric_is_tuning_by_the_objective_that_it_equals(paper, tmp_path):
     gains = ["controller.k1", "controller.K2"]
-    by_metric = ij.tune(paper, gains, ij.objectives.metric(ij.metrics.Tracking(), "ise") + 0.1 * ij.objectives.effort(), **TUNING)
-    by_name = ij.tune(paper, gains, ij.objectives.tracking() + 0.1 * ij.objectives.effort(), **TUNING)
+    by_metric = ij.tune(
+        paper,
+        gains,
+        ij.objectives.metric(ij.metrics.Tracking(), "ise") + 0.1 * ij.objectives.effort(),
+        **TUNING,
+    )
+    by_name = ij.tune(
+        paper, gains, ij.objectives.tracking() + 0.1 * ij.objectives.effort(), **TUNING
+    )
     for name in ("loss", "gradient_norm"):
         np.testing.assert_allclose(by_metric.history[name][0], by_name.history[name][0], rtol=1e-8)
     by_metric.save(tmp_path / "tuned.json")
@@ -132,8 +165,21 @@ def rejects(objective, *words, **options):
 @pytest.mark.slow
 def test_the_packages_own_objectives_pass():
     o = ij.objectives
-    terms = o.tracking() + 0.5 * o.effort() + o.torque_rate() + o.settle() + o.peak_torque() + o.margin() + o.metric(Swing(), "swing")
-    limits = o.error_below(0.05, after=1.0) + o.peak_torque_below(30.0) + o.margin_above(0.01) + o.violation_probability_below(0.1)
+    terms = (
+        o.tracking()
+        + 0.5 * o.effort()
+        + o.torque_rate()
+        + o.settle()
+        + o.peak_torque()
+        + o.margin()
+        + o.metric(Swing(), "swing")
+    )
+    limits = (
+        o.error_below(0.05, after=1.0)
+        + o.peak_torque_below(30.0)
+        + o.margin_above(0.01)
+        + o.violation_probability_below(0.1)
+    )
     ij.testing.check_objective(terms + limits)
 
 
@@ -170,16 +216,51 @@ def test_a_quantity_of_ones_own_passes():
     [
         ({"finish": lambda self, acc: acc}, ("finish(acc)", "(smooth value, exact value, pieces)")),
         ({"finish": lambda self, acc: (acc, acc, acc)}, ("the pieces of finish(acc)", "shape ()")),
-        ({"finish": lambda self, acc: (acc, acc, 2 * acc[None])}, ("the largest of its pieces", "is not its exact value")),
-        ({"update": lambda self, acc, sample: acc + sample.dq}, ("update(acc, sample)", "carried by a scan")),
-        ({"curvature": lambda self, acc, sample: sample.dq}, ("curvature(acc, sample)", "iblf_jax.engine.derivatives.Outer")),
-        ({"hessian": lambda self, products, pieces, slopes: products[0]}, ("hessian gives shape", "(D, D)")),
-        ({"hessian": lambda self, products, pieces, slopes: jnp.triu(products)}, ("not symmetric",)),
-        ({"finish": lambda self, acc: (jnp.sqrt(acc), acc, acc[None])}, ("derivative is NaN on a run without any error",)),
-        ({"finish": lambda self, acc: (jax.lax.stop_gradient(acc), acc, acc[None])}, ("differs from its finite difference",)),
-        ({"init": lambda self, sample: jnp.zeros((), "float64")}, ("the smooth value is float64 for float32 arguments",)),
+        (
+            {"finish": lambda self, acc: (acc, acc, 2 * acc[None])},
+            ("the largest of its pieces", "is not its exact value"),
+        ),
+        (
+            {"update": lambda self, acc, sample: acc + sample.dq},
+            ("update(acc, sample)", "carried by a scan"),
+        ),
+        (
+            {"curvature": lambda self, acc, sample: sample.dq},
+            ("curvature(acc, sample)", "iblf_jax.engine.derivatives.Outer"),
+        ),
+        (
+            {"hessian": lambda self, products, pieces, slopes: products[0]},
+            ("hessian gives shape", "(D, D)"),
+        ),
+        (
+            {"hessian": lambda self, products, pieces, slopes: jnp.triu(products)},
+            ("not symmetric",),
+        ),
+        (
+            {"finish": lambda self, acc: (jnp.sqrt(acc), acc, acc[None])},
+            ("derivative is NaN on a run without any error",),
+        ),
+        (
+            {"finish": lambda self, acc: (jax.lax.stop_gradient(acc), acc, acc[None])},
+            ("differs from its finite difference",),
+        ),
+        (
+            {"init": lambda self, sample: jnp.zeros((), "float64")},
+            ("the smooth value is float64 for float32 arguments",),
+        ),
     ],
-    ids=["bare", "pieces", "largest", "grows", "not-outer", "row", "triangle", "root", "stopped", "float64"],
+    ids=[
+        "bare",
+        "pieces",
+        "largest",
+        "grows",
+        "not-outer",
+        "row",
+        "triangle",
+        "root",
+        "stopped",
+        "float64",
+    ],
 )
 def test_broken_quantities(methods, words):
     rejects(changed(**methods), *words, duration=0.5)
@@ -192,12 +273,22 @@ def test_what_is_no_objective_at_all():
 
 
 def test_a_metric_that_cannot_be_tuned_for():
-    rejects(ij.objectives.metric(Swing(), "samples"), "finish(acc)", "a result that can be differentiated")
+    rejects(
+        ij.objectives.metric(Swing(), "samples"),
+        "finish(acc)",
+        "a result that can be differentiated",
+    )
 
 
 @pytest.mark.slow
 def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
-    rejects(ij.objectives.tracking(after=1.0), "its value at the start", "scale of its own", scenario=paper, duration=0.5)
+    rejects(
+        ij.objectives.tracking(after=1.0),
+        "its value at the start",
+        "scale of its own",
+        scenario=paper,
+        duration=0.5,
+    )
 
 
 # ------------------------------------------------------------------------------------ which joints, weights, limits of each
@@ -237,12 +328,22 @@ SELECTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("joints", "expected"), SELECTIONS, ids=[str(joints) for joints, _ in SELECTIONS])
+@pytest.mark.parametrize(
+    ("joints", "expected"), SELECTIONS, ids=[str(joints) for joints, _ in SELECTIONS]
+)
 def test_joints_selects_joints_everywhere(joints, expected, three_joints):
     """Whole numbers are indices, never weights; against NumPy on the samples."""
     o, run = ij.objectives, three_joints
-    parts = o.tracking(joints=joints) + o.effort(joints=joints) + o.metric(ij.metrics.Tracking(), "iae", joints=joints)
-    parts += o.peak_torque_below(5.0, joints=joints) + o.error_below(0.1, joints=joints) + o.margin_above(0.01, joints=joints)
+    parts = (
+        o.tracking(joints=joints)
+        + o.effort(joints=joints)
+        + o.metric(ij.metrics.Tracking(), "iae", joints=joints)
+    )
+    parts += (
+        o.peak_torque_below(5.0, joints=joints)
+        + o.error_below(0.1, joints=joints)
+        + o.margin_above(0.01, joints=joints)
+    )
     tau, e1 = (np.abs(np.asarray(x))[:, expected] for x in (run.tau, run.e1))
     inside = np.minimum(run.q - run.lower, run.upper - run.q)[:, expected]
     found = exact(parts, run)
@@ -255,37 +356,57 @@ def test_joints_selects_joints_everywhere(joints, expected, three_joints):
 
 
 def test_limits_of_single_joints_and_weights(three_joints):
-    """A requirement with a limit for each joint is broken by the joint that is nearest to its own, or beyond."""
+    """A requirement with a limit for each joint is broken by the joint that is nearest to its own,
+    or beyond."""
     o, run = ij.objectives, three_joints
     peak, error = (np.abs(np.asarray(x)).max(axis=0) for x in (run.tau, run.e1))
     cases = np.array([[1.1, 1.2, 1.3], [1.1, 0.9, 1.3], [0.5, 2.0, 2.0]])
     np.testing.assert_allclose(
-        excesses([o.peak_torque_below(c * peak) for c in cases] + [o.error_below(list(c * error)) for c in cases], run),
+        excesses(
+            [o.peak_torque_below(c * peak) for c in cases]
+            + [o.error_below(list(c * error)) for c in cases],
+            run,
+        ),
         np.tile(np.max(1 / cases, axis=1) - 1, 2),
         rtol=1e-9,
     )
     # Of some joints: a limit for each of these, or for all.
     some = [o.peak_torque_below((c * peak)[[0, 2]], joints=[0, 2]) for c in cases]
     same = [o.peak_torque_below(c * peak, joints=[0, 2]) for c in cases]
-    np.testing.assert_allclose(excesses(some + same, run), np.tile(np.max(1 / cases[:, [0, 2]], axis=1) - 1, 2), rtol=1e-9)
+    np.testing.assert_allclose(
+        excesses(some + same, run), np.tile(np.max(1 / cases[:, [0, 2]], axis=1) - 1, 2), rtol=1e-9
+    )
     # Margins, of positions that are inside their bounds.
     kept = dataclasses.replace(run, lower=run.q - 0.2, upper=run.q + jnp.array([0.1, 0.3, 0.4]))
     found = excesses(
-        [o.margin_above([0.05, 0.1, 0.1]), o.margin_above([0.05, 0.25, 0.1]), o.margin_above([0.125, 0.1], joints=[0, 2])], kept
+        [
+            o.margin_above([0.05, 0.1, 0.1]),
+            o.margin_above([0.05, 0.25, 0.1]),
+            o.margin_above([0.125, 0.1], joints=[0, 2]),
+        ],
+        kept,
     )
     np.testing.assert_allclose(found, [1 - 2.0, 1 - 0.8, 1 - 0.8], rtol=1e-9)
-    weighted = exact(o.tracking(weights=[1.0, 0.5, 2.0]) + o.effort(joints=[0, 2], weights=[1.0, 3.0]), run)
-    scaled = dataclasses.replace(run, e1=run.e1 * jnp.array([1.0, 0.5, 2.0]), tau=run.tau * jnp.array([1.0, 0.0, 3.0]))
+    weighted = exact(
+        o.tracking(weights=[1.0, 0.5, 2.0]) + o.effort(joints=[0, 2], weights=[1.0, 3.0]), run
+    )
+    scaled = dataclasses.replace(
+        run, e1=run.e1 * jnp.array([1.0, 0.5, 2.0]), tau=run.tau * jnp.array([1.0, 0.0, 3.0])
+    )
     np.testing.assert_allclose(weighted, exact(o.tracking() + o.effort(), scaled), rtol=1e-10)
     term = o.peak_torque(2.0 * peak).terms[0]
-    np.testing.assert_allclose(term.value(jnp.asarray(0.5)), np.log1p(np.exp(-10.0)) / 20.0, rtol=1e-9)
+    np.testing.assert_allclose(
+        term.value(jnp.asarray(0.5)), np.log1p(np.exp(-10.0)) / 20.0, rtol=1e-9
+    )
 
 
 def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joints):
     with pytest.warns(DeprecationWarning, match=r"effort\(weights=...\)") as caught:
         old = ij.objectives.effort(joints=[1.0, 0.0, 2.0])
     assert caught[0].filename == __file__
-    np.testing.assert_array_equal(exact(old, three_joints), exact(ij.objectives.effort(weights=[1, 0, 2]), three_joints))
+    np.testing.assert_array_equal(
+        exact(old, three_joints), exact(ij.objectives.effort(weights=[1, 0, 2]), three_joints)
+    )
     with pytest.raises(ValueError, match="weights="):
         ij.objectives.effort(joints=[1.0, 0.0], weights=[1.0, 0.0])
 
@@ -293,7 +414,10 @@ def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joint
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda o: o.peak_torque_below(-5.0), r"peak_torque_below: limit: got -5.*> 0.*peak_torque_below\(limit=140.0\)"),
+        (
+            lambda o: o.peak_torque_below(-5.0),
+            r"peak_torque_below: limit: got -5.*> 0.*peak_torque_below\(limit=140.0\)",
+        ),
         (lambda o: o.peak_torque_below("much"), r"peak_torque_below: limit: got 'much'"),
         (lambda o: o.error_below([0.1, 0.0]), r"error_below: limit: got \[0.1"),
         (lambda o: o.margin_above(0.0), "margin_above: limit"),
@@ -308,9 +432,18 @@ def test_floating_point_numbers_as_joints_are_weights_with_a_warning(three_joint
         (lambda o: o.tracking(joints=[]), "tracking: joints.*at least one joint"),
         (lambda o: o.tracking(joints={0}), "tracking: joints"),
         (lambda o: o.tracking(weights=[[1.0]]), "tracking: weights"),
-        (lambda o: o.peak_torque_below([1.0, 2.0], weights=[1.0, 2.0, 3.0]), "peak_torque_below: weights"),
-        (lambda o: o.peak_torque_below(5.0, weights=-1.0), "peak_torque_below: weights: got -1.*>= 0"),
-        (lambda o: o.tracking(weights=[0.0, 0.0]), "tracking: weights: got .*at least one weight > 0"),
+        (
+            lambda o: o.peak_torque_below([1.0, 2.0], weights=[1.0, 2.0, 3.0]),
+            "peak_torque_below: weights",
+        ),
+        (
+            lambda o: o.peak_torque_below(5.0, weights=-1.0),
+            "peak_torque_below: weights: got -1.*>= 0",
+        ),
+        (
+            lambda o: o.tracking(weights=[0.0, 0.0]),
+            "tracking: weights: got .*at least one weight > 0",
+        ),
     ],
 )
 def test_errors_name_the_argument_of_the_function(call, message):
@@ -322,13 +455,19 @@ def test_errors_name_the_argument_of_the_function(call, message):
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
-        (lambda o: o.tracking(joints=[0, 2]), "tracking: joints: got 2, expected an index from 0 to 1"),
+        (
+            lambda o: o.tracking(joints=[0, 2]),
+            "tracking: joints: got 2, expected an index from 0 to 1",
+        ),
         (lambda o: o.tracking(joints=[1, 1]), "tracking: joints.*joint 1 twice.*weights="),
         (lambda o: o.tracking(joints=[True]), "tracking: joints.*2 truth values"),
         (lambda o: o.tracking(joints="joint 2"), "tracking: joints: got 'joint 2'.*Did you mean"),
         (lambda o: o.tracking(joints="2:"), "tracking: joints.*at least one joint"),
         (lambda o: o.tracking(weights=[1, 2, 3]), r"tracking: weights.*\(3,\)"),
-        (lambda o: o.tracking() + o.peak_torque_below([1, 2, 3]), r"peak_torque_below: limit: got \[1. 2. 3.\].*2, one for each"),
+        (
+            lambda o: o.tracking() + o.peak_torque_below([1, 2, 3]),
+            r"peak_torque_below: limit: got \[1. 2. 3.\].*2, one for each",
+        ),
         (lambda o: o.tracking() + o.error_below(0.1, joints=3), "error_below: joints: got 3"),
     ],
 )
@@ -346,10 +485,14 @@ def test_the_name_of_a_requirement_calls_a_slice_joints():
 def test_names_of_joints_become_indices():
     scenario = ij.presets.ur5()
     names = scenario.plant.joints
-    goal = ij.objectives.tracking(joints=[names[1], names[4]]) + ij.objectives.peak_torque_below([140, 27], joints=list(names[2:4]))
+    goal = ij.objectives.tracking(joints=[names[1], names[4]]) + ij.objectives.peak_torque_below(
+        [140, 27], joints=list(names[2:4])
+    )
     known = for_scenario(goal, scenario)
     assert [quantity.joints for quantity in known.quantities] == [(1, 4), (2, 3)]
-    assert goal.requirements[0].name == f"peak torque of joints {names[2]}, {names[3]} < [140, 27] N m"
+    assert (
+        goal.requirements[0].name == f"peak torque of joints {names[2]}, {names[3]} < [140, 27] N m"
+    )
 
 
 WITH_JOINTS = FILE.replace('kind = "metric"', 'kind = "tracking"\n')
@@ -363,9 +506,15 @@ def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
     assert loaded("joints = [1]").joints == (1,)
     assert loaded('joints = ["joint 0"]').joints == ("joint 0",)
     assert loaded('joints = "1:"').joints == ("1:",)
-    limits = loaded('weights = [1.0, 0.5]\n[[requirement]]\nkind = "peak_torque_below"\nlimit = [14.0, 2.0]')
+    limits = loaded(
+        'weights = [1.0, 0.5]\n[[requirement]]\nkind = "peak_torque_below"\nlimit = [14.0, 2.0]'
+    )
     np.testing.assert_allclose(1 / limits.weights, [14.0, 2.0])
-    for old in ("[1.0, 0.5]", "[2, 2]", "[1, 3]"):  # what earlier versions meant, where it is no selection
+    for old in (
+        "[1.0, 0.5]",
+        "[2, 2]",
+        "[1, 3]",
+    ):  # what earlier versions meant, where it is no selection
         with pytest.warns(DeprecationWarning, match="weights = "):
             found = loaded(f"joints = {old}")
         np.testing.assert_allclose(found.weights, eval(old))
@@ -375,8 +524,11 @@ def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
 
 
 def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
-    """A file of the version before `weights`: tracking, peak_torque, a metric, and two requirements."""
-    found = ij.load_tuning(Path(__file__).parent / "data" / "tuning_before_weights.json").setup.objective
+    """A file of the version before `weights`: tracking, peak_torque, a metric, and two
+    requirements."""
+    found = ij.load_tuning(
+        Path(__file__).parent / "data" / "tuning_before_weights.json"
+    ).setup.objective
     weights = [np.asarray(quantity.weights).tolist() for quantity in found.quantities]
     assert weights == [[1.0, 0.25], [1.0, 3.0], [0.0, 2.0], [0.0, 1.0], 1.0]
     assert all(quantity.joints is None for quantity in found.quantities)
@@ -386,7 +538,12 @@ def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
 def test_tuning_and_a_front_under_limits_of_single_joints(paper, tmp_path):
     o = ij.objectives
     limits = [16.0, 14.0]
-    goal = o.tracking(joints=[0]) + 0.1 * o.effort() + o.peak_torque_below(limits) + o.margin_above([0.02, 0.05])
+    goal = (
+        o.tracking(joints=[0])
+        + 0.1 * o.effort()
+        + o.peak_torque_below(limits)
+        + o.margin_above([0.02, 0.05])
+    )
     best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, iterations=25, **TUNING)
     peaks = np.asarray(ij.simulate(best.scenario, duration=0.5, dt=1e-3).metrics.peak_torque)
     assert np.all(peaks < np.array(limits) * 1.001)
@@ -396,7 +553,12 @@ def test_tuning_and_a_front_under_limits_of_single_joints(paper, tmp_path):
     assert jax.tree.structure(again.setup.objective) == jax.tree.structure(best.setup.objective)
     assert again.report.verdicts == best.report.verdicts
     pair = (o.tracking(joints=[0]), o.effort() + o.peak_torque_below(limits))
-    front = ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, duration=0.5, dt=1e-3)
+    front = ij.pareto(
+        paper, ["controller.k1", "controller.K2"], pair, points=4, duration=0.5, dt=1e-3
+    )
     for i in range(len(front)):
-        assert np.all(np.asarray(ij.simulate(front.scenario(i), duration=0.5, dt=1e-3).metrics.peak_torque) < np.array(limits) * 1.001)
+        assert np.all(
+            np.asarray(ij.simulate(front.scenario(i), duration=0.5, dt=1e-3).metrics.peak_torque)
+            < np.array(limits) * 1.001
+        )
     ij.testing.check_objective(goal, scenario=paper, duration=0.5)

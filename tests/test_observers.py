@@ -1,4 +1,5 @@
-"""Disturbance observers: the error equations that they are said to obey, point by point and along a run."""
+"""Disturbance observers: the error equations that they are said to obey, point by point and along a
+run."""
 
 from __future__ import annotations
 
@@ -28,7 +29,11 @@ def estimate_rate():
             return scenario.observer.estimate(t, q, dq, scenario.model, eta)
 
         _, df_hat = jax.jvp(f_hat, (q, dq, eta), (rate.q, rate.dq, rate.observer))
-        return df_hat, sample.disturbance - sample.disturbance_estimate, mass_matrix_rate(scenario.model, q, dq) @ dq
+        return (
+            df_hat,
+            sample.disturbance - sample.disturbance_estimate,
+            mass_matrix_rate(scenario.model, q, dq) @ dq,
+        )
 
     return at
 
@@ -36,14 +41,17 @@ def estimate_rate():
 @pytest.mark.parametrize("payload", [0.0, 0.5], ids=["nominal", "unknown-payload"])
 @pytest.mark.parametrize("kind", [Momentum, Printed])
 def test_error_equation(estimate_rate, kind, payload, rng):
-    """f_hat' = kf f_tilde: f_tilde' = f' - kf f_tilde exactly (momentum), and less kf M0' q' as printed."""
+    """f_hat' = kf f_tilde: f_tilde' = f' - kf f_tilde exactly (momentum), and less kf M0' q' as
+    printed."""
     base = ij.presets.zhang_yan_2024()
     kf = np.asarray([20.0, 12.0])
     plant = dataclasses.replace(base.plant, payload=payload)
     scenario = dataclasses.replace(base, plant=plant, observer=kind(kf=kf))
     for _ in range(5):
         q, dq, eta = rng.uniform(0.3, 0.7, 2), rng.normal(size=2), rng.normal(size=2)
-        df_hat, f_tilde, rest = estimate_rate(scenario, jnp.asarray(0.4), *map(jnp.asarray, (q, dq, eta)))
+        df_hat, f_tilde, rest = estimate_rate(
+            scenario, jnp.asarray(0.4), *map(jnp.asarray, (q, dq, eta))
+        )
         expected = kf * f_tilde + (kf * rest if kind is Printed else 0.0)
         np.testing.assert_allclose(df_hat, expected, rtol=1e-9, atol=1e-9)
         assert np.max(np.abs(rest)) > 1e-3
@@ -59,14 +67,18 @@ def test_the_momentum_observer_finds_a_constant_torque():
         def slope(t, x):
             q, dq, eta = x
             tau = jnp.stack([3 * jnp.sin(5 * t), jnp.cos(3 * t)])
-            ddq = jnp.linalg.solve(model.mass_matrix(q), tau + f - model.coriolis(q, dq, dq) - model.gravity(q))
+            ddq = jnp.linalg.solve(
+                model.mass_matrix(q), tau + f - model.coriolis(q, dq, dq) - model.gravity(q)
+            )
             return dq, ddq, observer.derivative(t, q, dq, tau, model, eta)
 
         def one(x, i):
             from iblf_jax.simulation.integrators import step
 
             t = i * 1e-3
-            return step("rk4", lambda t, x: (slope(t, x), None), t, x, 1e-3).state, f - observer.estimate(t, x[0], x[1], model, x[2])
+            return step(
+                "rk4", lambda t, x: (slope(t, x), None), t, x, 1e-3
+            ).state, f - observer.estimate(t, x[0], x[1], model, x[2])
 
         q, dq = jnp.asarray([0.3, 0.2]), jnp.asarray([1.0, -0.5])
         return jax.lax.scan(one, (q, dq, observer.init(q, dq, model)), jnp.arange(400.0))[1]

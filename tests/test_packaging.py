@@ -1,4 +1,5 @@
-"""pyproject.toml, constraints.txt and the workflows name the same Pythons, and declare what the package imports."""
+"""pyproject.toml, constraints.txt and the workflows name the same Pythons, and declare what the
+package imports."""
 
 from __future__ import annotations
 
@@ -16,10 +17,14 @@ from packaging.utils import canonicalize_name
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 REQUIRED = [Requirement(text) for text in PROJECT["dependencies"]]
-OPTIONAL = [Requirement(text) for extra in PROJECT["optional-dependencies"].values() for text in extra]
+OPTIONAL = [
+    Requirement(text) for extra in PROJECT["optional-dependencies"].values() for text in extra
+]
 PINS = {
     canonicalize_name(name): version
-    for name, version in re.findall(r"^([\w.-]+)==([\w.]+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    for name, version in re.findall(
+        r"^([\w.-]+)==([\w.]+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE
+    )
 }
 CLASSIFIED = [
     tuple(map(int, match[1].split(".")))
@@ -30,11 +35,13 @@ CLASSIFIED = [
 DISTRIBUTION = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "tomli_w": "tomli-w"}
 """Name of an import -> its distribution, where they differ."""
 COMES_WITH = {"jaxlib": "jax", "pandas": "xarray", "pillow": "matplotlib"}
-"""What the package imports without a declaration of its own -> the dependency that always brings it."""
+"""What the package imports without a declaration of its own -> the dependency that always brings
+it."""
 
 
 def imported(source: str) -> set[str]:
-    """Top-level names of what a file imports from outside the standard library, inside functions too."""
+    """Top-level names of what a file imports from outside the standard library, inside functions
+    too."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -51,7 +58,9 @@ def names_of(requirements: list[Requirement]) -> set[str]:
 def test_the_classifiers_are_the_pythons_that_are_required():
     oldest = min(CLASSIFIED)
     assert PROJECT["requires-python"] == f">={oldest[0]}.{oldest[1]}"
-    assert [(3, minor) for minor in range(oldest[1], max(CLASSIFIED)[1] + 1)] == CLASSIFIED, "none is left out"
+    assert [(3, minor) for minor in range(oldest[1], max(CLASSIFIED)[1] + 1)] == CLASSIFIED, (
+        "none is left out"
+    )
     assert sys.version_info[:2] >= oldest
 
 
@@ -63,19 +72,27 @@ def test_the_documentation_names_the_oldest_python():
 
 def test_workflows_use_a_python_of_the_classifiers():
     files = [*(ROOT / ".github").rglob("*.yml"), ROOT / ".readthedocs.yaml"]
-    used = [version for path in files for version in re.findall(r'python(?:-version)?: "(3\.\d+)"', path.read_text())]
+    used = [
+        version
+        for path in files
+        for version in re.findall(r'python(?:-version)?: "(3\.\d+)"', path.read_text())
+    ]
     assert used
     assert {tuple(map(int, version.split("."))) for version in used} <= set(CLASSIFIED)
 
 
 def test_every_import_is_declared():
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "iblf_jax").rglob("*.py")]
-    distributions = {DISTRIBUTION.get(name, name) for source in sources for name in imported(source)}
+    distributions = {
+        DISTRIBUTION.get(name, name) for source in sources for name in imported(source)
+    }
     declared = names_of(REQUIRED) | names_of(OPTIONAL)
     undeclared = {canonicalize_name(name) for name in distributions} - declared - set(COMES_WITH)
     assert not undeclared, f"declare {undeclared} in pyproject.toml"
     for name, parent in COMES_WITH.items():
-        assert name in names_of(list(map(Requirement, importlib.metadata.requires(parent) or []))), (name, parent)
+        assert name in names_of(
+            list(map(Requirement, importlib.metadata.requires(parent) or []))
+        ), (name, parent)
 
 
 @pytest.mark.parametrize("name", ["numpy", "scipy", "jax"])
@@ -105,5 +122,7 @@ def test_the_pinned_versions_install_on_the_oldest_python():
 
 
 def test_these_tests_can_fail():
-    assert imported("import os, made_up.part\ndef f():\n    from other import x\n    import iblf_jax") == {"made_up", "other"}
+    assert imported(
+        "import os, made_up.part\ndef f():\n    from other import x\n    import iblf_jax"
+    ) == {"made_up", "other"}
     assert not SpecifierSet(">=3.12").contains("3.11.9")

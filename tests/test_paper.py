@@ -1,4 +1,5 @@
-"""The paper's simulation against an independent program (SciPy DOP853, rtol 1e-12), and the numbers that it must show."""
+"""The paper's simulation against an independent program (SciPy DOP853, rtol 1e-12), and the numbers
+that it must show."""
 
 from __future__ import annotations
 
@@ -14,7 +15,9 @@ both = pytest.mark.parametrize(("law", "reading"), VARIANTS)
 
 def reference_of(data, law, reading):
     prefix = f"{'iblf' if law == 'integral' else 'log'}_{reading}."
-    return {key.removeprefix(prefix): value for key, value in data.items() if key.startswith(prefix)}
+    return {
+        key.removeprefix(prefix): value for key, value in data.items() if key.startswith(prefix)
+    }
 
 
 def largest(a, b):
@@ -23,7 +26,10 @@ def largest(a, b):
 
 @both
 def test_all_four_variants_at_one_millisecond(reference_data, law, reading):
-    run, ref = ij.simulate(ij.presets.zhang_yan_2024(law=law, reading=reading), **PAPER), reference_of(reference_data, law, reading)
+    run, ref = (
+        ij.simulate(ij.presets.zhang_yan_2024(law=law, reading=reading), **PAPER),
+        reference_of(reference_data, law, reading),
+    )
     assert run.ok
     np.testing.assert_allclose(run.t, reference_data["t"], atol=1e-12)
     assert largest(run.q, ref["q"]) <= 1e-7
@@ -40,7 +46,10 @@ def test_all_four_variants_at_one_millisecond(reference_data, law, reading):
 
 @both
 def test_torque_at_half_a_millisecond(reference_data, law, reading):
-    scenario, ref = ij.presets.zhang_yan_2024(law=law, reading=reading), reference_of(reference_data, law, reading)
+    scenario, ref = (
+        ij.presets.zhang_yan_2024(law=law, reading=reading),
+        reference_of(reference_data, law, reading),
+    )
     run = ij.simulate(scenario, duration=20.0, dt=5e-4, record_every=20)
     assert largest(run.tau, ref["tau"]) <= 2e-5
     assert largest(run.q, ref["q"]) <= 1e-8
@@ -74,7 +83,9 @@ def test_the_papers_words_hold(paper_run):
     np.testing.assert_allclose(log.metrics.settling_time, [1.07, 0.83], atol=1e-2)
     for run in (paper_run, log):
         assert np.all(np.asarray(run.metrics.margin) > 0)
-    assert np.all(np.asarray(paper_run.metrics.settling_time) < np.asarray(log.metrics.settling_time))
+    assert np.all(
+        np.asarray(paper_run.metrics.settling_time) < np.asarray(log.metrics.settling_time)
+    )
 
     def overshoot(run):
         e2 = np.asarray(run.e2)

@@ -18,7 +18,9 @@ WIDE = ij.bounds.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant
 
 
 def same(a, b) -> bool:
-    return jax.tree.structure(a) == jax.tree.structure(b) and all(map(np.array_equal, jax.tree.leaves(a), jax.tree.leaves(b)))
+    return jax.tree.structure(a) == jax.tree.structure(b) and all(
+        map(np.array_equal, jax.tree.leaves(a), jax.tree.leaves(b))
+    )
 
 
 @pytest.mark.parametrize(
@@ -38,14 +40,24 @@ def test_one_part_is_exchanged_and_no_other(paper, name, part):
     new = ij.with_parts(paper, **{name: part})
     fitted = dataclasses.replace(paper, **{name: part})
     for field in dataclasses.fields(ij.Scenario):
-        assert same(getattr(new, field.name), getattr(fitted if field.name == name else paper, field.name)), field.name
+        assert same(
+            getattr(new, field.name), getattr(fitted if field.name == name else paper, field.name)
+        ), field.name
     assert same(paper, ij.presets.zhang_yan_2024())
 
 
 def test_the_result_runs_whatever_the_scenario_came_from(paper, short_run, tmp_path):
     ij.save_scenario(paper, tmp_path / "paper.toml")
-    parts = {"controller": LAWS["pd_gravity"], "observer": OBSERVERS["none"], "bounds": WIDE, "disturbance": DISTURBANCES["step"]}
-    runs = [ij.simulate(ij.with_parts(s, **parts), **SHORT) for s in (paper, ij.load_scenario(tmp_path / "paper.toml"))]
+    parts = {
+        "controller": LAWS["pd_gravity"],
+        "observer": OBSERVERS["none"],
+        "bounds": WIDE,
+        "disturbance": DISTURBANCES["step"],
+    }
+    runs = [
+        ij.simulate(ij.with_parts(s, **parts), **SHORT)
+        for s in (paper, ij.load_scenario(tmp_path / "paper.toml"))
+    ]
     assert runs[0].ok
     assert np.array_equal(runs[0].q, runs[1].q)
     assert not np.allclose(runs[0].q[-1], short_run.q[-1])
@@ -64,7 +76,9 @@ def test_plant_alone_leaves_the_model_and_robot_takes_both(paper):
 
 def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
     chain = ROBOTS["chain_3"]
-    with pytest.raises(ValueError, match=r"plant: got '3 joints', expected 2 joints, as the model has\. .*robot="):
+    with pytest.raises(
+        ValueError, match=r"plant: got '3 joints', expected 2 joints, as the model has\. .*robot="
+    ):
         ij.with_parts(paper, plant=chain)
     with pytest.raises(ValueError, match=r"reference\.offset: got .* one number, or 3"):
         ij.with_parts(paper, robot=chain)
@@ -85,9 +99,18 @@ def test_a_robot_of_other_joints_takes_its_surroundings_with_it(paper):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({"law": LAWS["pd_gravity"]}, "part: got 'law', expected the name of a part: robot, plant, reference, bounds, controller"),
+        (
+            {"law": LAWS["pd_gravity"]},
+            (
+                "part: got 'law', expected the name of a part: robot, plant, reference, bounds,"
+                " controller"
+            ),
+        ),
         ({"controler": LAWS["pd_gravity"]}, "got 'controler'"),
-        ({"controller": OBSERVERS["momentum"]}, "Scenario.controller: got .* a component that fits .*Controller"),
+        (
+            {"controller": OBSERVERS["momentum"]},
+            "Scenario.controller: got .* a component that fits .*Controller",
+        ),
         ({"observer": None}, "Scenario.observer: got None"),
         ({"observer": ij.observers.NoObserver}, "It is a class: make an instance"),
         ({"bounds": (0.1, 0.9)}, "Scenario.bounds: .* expected a Bounds"),
@@ -117,7 +140,9 @@ def test_inside_jit_and_grad(paper):
     initial = ij.Initial(q=0.8, dq=[0.3, -0.2])
 
     def torque(kf):
-        field = ij.vector_field(ij.with_parts(paper, observer=ij.observers.Momentum(kf=kf), initial=initial))
+        field = ij.vector_field(
+            ij.with_parts(paper, observer=ij.observers.Momentum(kf=kf), initial=initial)
+        )
         return field.sample(0.0, field.start).tau
 
     M0 = paper.model.mass_matrix(jnp.array([0.8, 0.8]))

@@ -30,7 +30,10 @@ SIX = [f"figure_{k}" for k in range(1, 7)]
 @pytest.fixture(scope="module")
 def runs(paper, short_run):
     """The start of the paper's run, with two gains."""
-    return {"k1=2": short_run, "k1=4": ij.simulate(ij.with_parameters(paper, {"controller.k1": 4.0}), **SHORT)}
+    return {
+        "k1=2": short_run,
+        "k1=4": ij.simulate(ij.with_parameters(paper, {"controller.k1": 4.0}), **SHORT),
+    }
 
 
 def lines_of(axes, name):
@@ -51,11 +54,17 @@ def drawn(figure):
 def test_the_paper_s_figures_have_their_panels_and_units(runs):
     figures = plotting.paper_figures(runs)
     assert list(figures) == SIX
-    labels = {name: [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()] for name, figure in figures.items()}
+    labels = {
+        name: [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()]
+        for name, figure in figures.items()
+    }
     assert labels["figure_1"] == labels["figure_2"] == ["position $q$ [rad]", "error $e_1$ [rad]"]
     assert labels["figure_3"] == ["joint 0\n$e_2$ [rad/s]", "joint 1\n$e_2$ [rad/s]"]
     assert labels["figure_4"] == ["joint 0\n$f$ [N m]", "joint 1\n$f$ [N m]"]
-    assert labels["figure_5"] == [r"joint 0" + "\n" + r"$\tau$ [N m]", "joint 1\n" + r"$\tau$ [N m]"]
+    assert labels["figure_5"] == [
+        r"joint 0" + "\n" + r"$\tau$ [N m]",
+        "joint 1\n" + r"$\tau$ [N m]",
+    ]
     assert labels["figure_6"] == ["position of joint 1 [rad]"]
     for name, figure in figures.items():
         assert len(figure.axes) == (1 if name == "figure_6" else 4), name
@@ -76,7 +85,11 @@ def test_what_is_drawn_is_what_the_run_holds(runs):
     np.testing.assert_array_equal(lower.get_ydata(), run.lower[:, 1])
     (k_l,) = lines_of(error, "bounds")
     np.testing.assert_allclose(k_l.get_ydata(), run.lower[:, 1] - run.q_d[:, 1])
-    for field, make in (("e2", plotting.velocity_errors), ("tau", plotting.torques), ("disturbance_estimate", plotting.uncertain_terms)):
+    for field, make in (
+        ("e2", plotting.velocity_errors),
+        ("tau", plotting.torques),
+        ("disturbance_estimate", plotting.uncertain_terms),
+    ):
         line = make(run).axes[2].get_lines()[-1]
         np.testing.assert_array_equal(line.get_ydata(), np.asarray(getattr(run, field))[:, 1])
     (path,) = lines_of(plotting.phase_portrait(run, (1, 0)).axes[0], "$q$")
@@ -95,7 +108,9 @@ def test_the_zoom_shows_the_start_at_full_resolution_and_whole(runs):
 def test_the_zoom_is_as_long_as_the_transient():
     run = made_up(chain(2), duration=20.0)
     ends = [make(run).axes[1].get_xlim()[1] for make in (plotting.torques, plotting.joint)]
-    assert 0.2 < ends[0] < ends[1] < 4.0, "the torque settles at a rate of 9 1/s, the error at 3 1/s"
+    assert 0.2 < ends[0] < ends[1] < 4.0, (
+        "the torque settles at a rate of 9 1/s, the error at 3 1/s"
+    )
 
 
 def test_runs_are_told_apart_without_colour(runs):
@@ -107,13 +122,21 @@ def test_runs_are_told_apart_without_colour(runs):
 def test_shared_bounds_and_uncertain_terms_are_drawn_once_others_each():
     one, same, wider = made_up(chain(2)), made_up(chain(2), shift=0.02), made_up(chain(2))
     wider = dataclasses.replace(wider, upper=wider.upper + 0.2, disturbance=2 * wider.disturbance)
-    for pair, sides, terms in (({"a": one, "b": same}, 1, ["$f$"]), ({"a": one, "b": wider}, 2, ["a $f$", "b $f$"])):
+    for pair, sides, terms in (
+        ({"a": one, "b": same}, 1, ["$f$"]),
+        ({"a": one, "b": wider}, 2, ["a $f$", "b $f$"]),
+    ):
         assert len(lines_of(plotting.joint(pair).axes[0], "bounds")) == sides
-        assert [text for text in texts_of(plotting.uncertain_terms(pair)) if text.endswith("$f$")] == terms
+        assert [
+            text for text in texts_of(plotting.uncertain_terms(pair)) if text.endswith("$f$")
+        ] == terms
 
 
 def test_runs_of_different_length_and_record_share_one_time_axis():
-    runs = {"long": made_up(chain(2), duration=6.0), "short": made_up(chain(2), duration=2.0, dt=0.05)}
+    runs = {
+        "long": made_up(chain(2), duration=6.0),
+        "short": made_up(chain(2), duration=2.0, dt=0.05),
+    }
     axes = plotting.joint(runs).axes[0]
     assert axes.get_xlim() == (0.0, 6.0)
     assert lines_of(axes, "short")[0].get_xdata()[-1] == pytest.approx(2.0)
@@ -137,7 +160,12 @@ def test_every_figure_scales_to_n_joints(n):
 def test_the_overview_names_units_and_status(runs):
     figure = runs["k1=2"].plot()
     labels = {axes.get_ylabel() for axes in figure.axes}
-    assert {"position $q$ [rad]", "error $e_1$ [rad]", r"relative error $\xi$ [1]", r"torque $\tau$ [N m]"} <= labels
+    assert {
+        "position $q$ [rad]",
+        "error $e_1$ [rad]",
+        r"relative error $\xi$ [1]",
+        r"torque $\tau$ [N m]",
+    } <= labels
     assert figure.get_suptitle() == "Overview of the run\nstatus: ok"
     assert runs["k1=2"].plot(title="mine").get_suptitle().startswith("mine")
 
@@ -146,12 +174,19 @@ def test_a_failed_run_is_named_cut_and_does_not_flatten_the_others():
     good, bad = made_up(chain(2)), runaway(chain(2))
     runs = {"good": good, "bad": bad}
     for name, figure in plotting.paper_figures(runs).items():
-        assert "bad: a bound was violated; the state ran away and was frozen" in figure.get_suptitle().replace("\n", " "), name
+        assert (
+            "bad: a bound was violated; the state ran away and was frozen"
+            in figure.get_suptitle().replace("\n", " ")
+        ), name
         low, high = figure.axes[0].get_ylim()
         assert high - low < 40, f"{name} is flattened: {low} to {high}"
     axes = plotting.joint(runs).axes[0]
-    assert lines_of(axes, "bad")[0].get_xdata()[-1] == pytest.approx(1.5), "drawn until it was frozen"
-    assert any(line.get_marker() == "x" for line in axes.get_lines()), "the place where it broke is marked"
+    assert lines_of(axes, "bad")[0].get_xdata()[-1] == pytest.approx(1.5), (
+        "drawn until it was frozen"
+    )
+    assert any(line.get_marker() == "x" for line in axes.get_lines()), (
+        "the place where it broke is marked"
+    )
     drawn(bad.plot())
     drawn(plotting.phase_portrait(runs))
     only = plotting.torques(bad).axes[0].get_ylim()
@@ -195,7 +230,11 @@ def test_bad_arguments_are_named(runs, tmp_path):
         plotting.joint(run, zoom=-1.0)
     with pytest.raises(ValueError, match="formats: got 'docx'"):
         plotting.save({"a": plotting.torques(run)}, tmp_path, ("docx",))
-    for path, options, said in (("a.mp4", {}, r"\.gif or \.html"), ("a.gif", {"fps": 0}, "fps: got 0"), ("a.gif", {"speed": -1}, "speed")):
+    for path, options, said in (
+        ("a.mp4", {}, r"\.gif or \.html"),
+        ("a.gif", {"fps": 0}, "fps: got 0"),
+        ("a.gif", {"speed": -1}, "speed"),
+    ):
         with pytest.raises(ValueError, match=said):
             plotting.animate(run, tmp_path / path, **options)
     assert not list(tmp_path.iterdir()), "nothing is written when an argument is bad"
@@ -222,23 +261,31 @@ def test_no_global_state_is_touched_and_no_figure_stays_open(runs):
 
 def colours_of(figure):
     """Colours of all text that is shown."""
-    texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    texts = [
+        text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()
+    ]
     return {to_hex(text.get_color()) for text in texts}
 
 
 def test_figures_follow_the_user_s_style(runs):
-    with matplotlib.rc_context(matplotlib.style.library["dark_background"] | {"font.size": 16.0, "lines.linewidth": 3.0}):
+    with matplotlib.rc_context(
+        matplotlib.style.library["dark_background"] | {"font.size": 16.0, "lines.linewidth": 3.0}
+    ):
         cycle = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
         figures = [plotting.joint(runs), runs["k1=2"].plot(), plotting.phase_portrait(runs)]
     for figure in figures:
-        drawn(figure)  # outside of the user's context: the figure keeps the style that it was made in
+        drawn(
+            figure
+        )  # outside of the user's context: the figure keeps the style that it was made in
         assert to_hex(figure.get_facecolor()) == to_hex(figure.axes[0].get_facecolor()) == "#000000"
         assert colours_of(figure) == {"#ffffff"}
         assert figure.axes[0].xaxis.label.get_size() == pytest.approx(16.0)
         assert figure.axes[0].get_yticklabels()[0].get_size() == pytest.approx(16.0 * 8 / 9)
     (line,) = lines_of(figures[0].axes[0], "k1=4")
     assert (to_hex(line.get_color()), line.get_linewidth()) == (cycle[1], 3.0)
-    with matplotlib.rc_context({"axes.grid": True, "grid.color": "red", "text.color": "blue", "axes.facecolor": "#eeeeee"}):
+    with matplotlib.rc_context(
+        {"axes.grid": True, "grid.color": "red", "text.color": "blue", "axes.facecolor": "#eeeeee"}
+    ):
         axes = plotting.joint(runs).axes[0]
     assert to_hex(axes.get_xgridlines()[0].get_color()) == "#ff0000"
     assert to_hex(axes.get_facecolor()) == "#eeeeee"
@@ -258,7 +305,11 @@ def test_joints_have_the_names_of_the_robot_s_file(tmp_path):
     assert "of  _hidden" in plotting.joint(run, 1).get_suptitle()
     curves = curves_of(run)
     bars = Scene(curves, *motions_of(curves, np.linspace(0.0, 1.0, 3))).bars
-    assert [text.get_text() for text in bars.get_yticklabels()] == ["base_yaw", " _hidden", r"cost\$5\$"]
+    assert [text.get_text() for text in bars.get_yticklabels()] == [
+        "base_yaw",
+        " _hidden",
+        r"cost\$5\$",
+    ]
 
 
 def test_a_spike_is_cut_and_named():
@@ -271,12 +322,20 @@ def test_a_spike_is_cut_and_named():
 
 
 def test_no_row_has_a_panel_alone_and_no_labels_meet():
-    assert [_style.row_sizes(n, 4) for n in (1, 4, 5, 9, 13)] == [[1], [4], [3, 2], [3, 3, 3], [4, 3, 3, 3]]
+    assert [_style.row_sizes(n, 4) for n in (1, 4, 5, 9, 13)] == [
+        [1],
+        [4],
+        [3, 2],
+        [3, 3, 3],
+        [4, 3, 3, 3],
+    ]
     with _style.styled():
         figure = _style.new_figure(10.0, 8.0)
         rows = _style.spread(figure, 13, 4)
     for axes in itertools.chain(*rows):
-        axes.set_xlabel("plant.link[the_very_long_name_of_a_link_of_somebody].friction_width [rad/s]")
+        axes.set_xlabel(
+            "plant.link[the_very_long_name_of_a_link_of_somebody].friction_width [rad/s]"
+        )
         axes.set_ylabel("worst xi margin of all joints together, as a part of the bound [1]")
     drawn(figure)
     figure.draw_without_rendering()  # at the figure's own resolution, in which extents are given
@@ -285,7 +344,16 @@ def test_no_row_has_a_panel_alone_and_no_labels_meet():
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
-@pytest.mark.parametrize("words", ["plant.link[forearm_2].mass [kg]", r"$f$ (broad), $\hat f$ [N m]", r"cost\$5\$ of 0.05", "x" * 50, ""])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "plant.link[forearm_2].mass [kg]",
+        r"$f$ (broad), $\hat f$ [N m]",
+        r"cost\$5\$ of 0.05",
+        "x" * 50,
+        "",
+    ],
+)
 def test_a_wrapped_label_keeps_its_words_and_formulas(words):
     lines = _style.wrapped(words, 9).split("\n")
     assert "".join(lines).replace(" ", "") == words.replace(" ", "")
@@ -333,7 +401,9 @@ def test_an_animation_moves(plant, tmp_path):
 
 
 def test_an_animation_as_a_page(tmp_path):
-    path = plotting.animate(made_up(chain(2), duration=1.0), tmp_path / "arm.html", fps=8, speed=2.0)
+    path = plotting.animate(
+        made_up(chain(2), duration=1.0), tmp_path / "arm.html", fps=8, speed=2.0
+    )
     page = path.read_text()
     assert page.count("data:image/png;base64") == 5
     assert "<input" in page

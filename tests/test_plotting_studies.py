@@ -54,13 +54,17 @@ def test_histograms_count_every_run(study):
 
 def test_scatter_shows_the_correlation(study):
     figure = drawn(plotting.scatter(study))
-    rho = float(study.correlations(["margin"]).correlation.sel(parameter="plant.mass[1]", metric="margin"))
+    rho = float(
+        study.correlations(["margin"]).correlation.sel(parameter="plant.mass[1]", metric="margin")
+    )
     assert figure.axes[0].get_title() == f"rank correlation {rho:.2f}"
 
 
 def test_heat_maps_stand_side_by_side(table):
     figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
-    shares, margins = (axes.images[0].get_array() for axes in figure.axes if axes.images and not axes.get_label())
+    shares, margins = (
+        axes.images[0].get_array() for axes in figure.axes if axes.images and not axes.get_label()
+    )
     violated = (table.status & int(Status.BOUND_VIOLATED)) != 0
     np.testing.assert_array_equal(shares, violated.mean("run").T)
     np.testing.assert_array_equal(margins, table.margin.min("joint").median("run").T)
@@ -89,7 +93,10 @@ def test_parallel_has_a_line_a_point(table):
         (lambda study, table: plotting.heat_map(table, "speed"), "margin"),
         (lambda study, table: plotting.heat_map(table, "margin", x="nothing"), "two dimensions"),
         (lambda study, table: plotting.heat_map(table, **{"no.thing": 1.0}), "dimension"),
-        (lambda study, table: plotting.heat_map(table.drop_attrs(deep=False)), "Dataset of a sweep"),
+        (
+            lambda study, table: plotting.heat_map(table.drop_attrs(deep=False)),
+            "Dataset of a sweep",
+        ),
     ],
 )
 def test_bad_figures_are_refused(study, table, draw, message):

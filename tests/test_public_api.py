@@ -1,4 +1,5 @@
-"""What `import iblf_jax` gives: every name documented, nothing heavy loaded, the session's settings untouched."""
+"""What `import iblf_jax` gives: every name documented, nothing heavy loaded, the session's settings
+untouched."""
 
 from __future__ import annotations
 
@@ -16,8 +17,30 @@ from conftest import ROOT
 import iblf_jax as ij
 
 PROMISED = [
-    *("simulate", "recommended_dt", "Scenario", "Initial", "Rollout", "Metrics", "Status", "SimulationError", "SimulationWarning"),
-    *("parameters", "with_parameters", "astype", "component", "leaf", "Leaf", "static", "robots", "references", "bounds", "disturbances"),
+    *(
+        "simulate",
+        "recommended_dt",
+        "Scenario",
+        "Initial",
+        "Rollout",
+        "Metrics",
+        "Status",
+        "SimulationError",
+        "SimulationWarning",
+    ),
+    *(
+        "parameters",
+        "with_parameters",
+        "astype",
+        "component",
+        "leaf",
+        "Leaf",
+        "static",
+        "robots",
+        "references",
+        "bounds",
+        "disturbances",
+    ),
     *(
         "with_parts",
         "vector_field",
@@ -32,14 +55,36 @@ PROMISED = [
         "testing",
     ),
     *("identify", "Identification", "excitation", "joint_normal"),
-    *("distributed", "certificates", "Study", "TuneResult", "Sensitivity", "Certificate", "Counterexample", "Attack", "Front"),
+    *(
+        "distributed",
+        "certificates",
+        "Study",
+        "TuneResult",
+        "Sensitivity",
+        "Certificate",
+        "Counterexample",
+        "Attack",
+        "Front",
+    ),
 ]
 
-HEAVY = ("matplotlib", "optax", "xarray", "pandas", "scipy", "zarr", "tqdm", "mujoco", "IPython", "hypothesis")
+HEAVY = (
+    "matplotlib",
+    "optax",
+    "xarray",
+    "pandas",
+    "scipy",
+    "zarr",
+    "tqdm",
+    "mujoco",
+    "IPython",
+    "hypothesis",
+)
 
 
 def public(module) -> dict[str, object]:
-    """Public names of a module that the package defines, or that its __all__ or __init__ exports."""
+    """Public names of a module that the package defines, or that its __all__ or __init__
+    exports."""
     names = getattr(module, "__all__", None) or [x for x in vars(module) if not x.startswith("_")]
     members = {name: getattr(module, name) for name in names}
     if getattr(module, "__all__", None):
@@ -57,12 +102,18 @@ def undocumented(name: str, thing: object) -> list[str]:
         return []
     missing = [] if (thing.__doc__ or "").strip() else [name]
     # The docstring that dataclasses makes up is a signature, and says nothing.
-    if re.fullmatch(rf"{getattr(thing, '__name__', '')}\(.*\)", (thing.__doc__ or "").strip(), re.DOTALL):
+    if re.fullmatch(
+        rf"{getattr(thing, '__name__', '')}\(.*\)", (thing.__doc__ or "").strip(), re.DOTALL
+    ):
         missing = [name]
     if inspect.isclass(thing):
         for key, value in vars(thing).items():
             function = inspect.unwrap(value.fget if isinstance(value, property) else value)
-            if not key.startswith("_") and inspect.isfunction(function) and not (function.__doc__ or "").strip():
+            if (
+                not key.startswith("_")
+                and inspect.isfunction(function)
+                and not (function.__doc__ or "").strip()
+            ):
                 missing.append(f"{name}.{key}")
     return missing
 
@@ -72,8 +123,21 @@ PUBLIC_MODULE = {
     "iblf_jax.simulation.metrics": "iblf_jax.simulation.metrics",
     "iblf_jax.studies.distributions": "iblf_jax.studies.distributions",
 }
-"""Module with a Protocol -> the public module of its family, where that is not the module or folder at the top of the package."""
-ELSEWHERE = ("jax.Array", "np.ndarray", "Any", "bool", "dict", "float", "int", "str", "tuple", "None", "ClassVar")
+"""Module with a Protocol -> the public module of its family, where that is not the module or folder
+at the top of the package."""
+ELSEWHERE = (
+    "jax.Array",
+    "np.ndarray",
+    "Any",
+    "bool",
+    "dict",
+    "float",
+    "int",
+    "str",
+    "tuple",
+    "None",
+    "ClassVar",
+)
 """What annotations of the protocols name that is not of this package."""
 
 
@@ -104,37 +168,63 @@ def types_named(annotations: list[ast.expr]) -> set[str]:
 
 
 def not_public(key: str, definition: ast.ClassDef) -> list[str]:
-    """Types that a class of this Protocol returns or is given, and that no public module has under their name."""
+    """Types that a class of this Protocol returns or is given, and that no public module has under
+    their name."""
     module = importlib.import_module(key.split(":")[0])
     family = family_of(key.split(":")[0])
     anywhere = [getattr(ij, name) for name in dir(ij) if inspect.ismodule(getattr(ij, name))]
     methods = [node for node in definition.body if isinstance(node, ast.FunctionDef)]
     returned = types_named([node.returns for node in methods if node.returns is not None])
-    fields = types_named([node.annotation for node in definition.body if isinstance(node, ast.AnnAssign)])
-    given = types_named([arg.annotation for node in methods for arg in node.args.args if arg.annotation is not None])
+    fields = types_named(
+        [node.annotation for node in definition.body if isinstance(node, ast.AnnAssign)]
+    )
+    given = types_named(
+        [arg.annotation for node in methods for arg in node.args.args if arg.annotation is not None]
+    )
 
     def lacks(name: str, places: list) -> bool:
         return not any(getattr(place, name, None) is getattr(module, name) for place in places)
 
     own = {definition.name, *returned, *fields}
-    missing = {name for name in own if lacks(name, [family])} | {name for name in given if lacks(name, [family, *anywhere])}
+    missing = {name for name in own if lacks(name, [family])} | {
+        name for name in given if lacks(name, [family, *anywhere])
+    }
     return sorted(missing)
 
 
 def test_the_protocols_of_all_families_are_among_them():
     names = {key.split(":")[1] for key in PROTOCOLS}
-    assert {"Robot", "Reference", "Side", "Region", "Disturbance", "Barrier", "Observer", "Controller"} <= names
+    assert {
+        "Robot",
+        "Reference",
+        "Side",
+        "Region",
+        "Disturbance",
+        "Barrier",
+        "Observer",
+        "Controller",
+    } <= names
     assert {"Sensor", "Velocity", "Actuator", "Fold", "Quantity", "Distribution"} <= names
 
 
 @pytest.mark.parametrize("key", PROTOCOLS)
 def test_every_type_that_a_users_class_returns_is_public(key):
     missing = not_public(key, PROTOCOLS[key])
-    assert not missing, f"{family_of(key.split(':')[0]).__name__} must export {missing}, for classes of users"
+    assert not missing, (
+        f"{family_of(key.split(':')[0]).__name__} must export {missing}, for classes of users"
+    )
 
 
 @pytest.mark.parametrize(
-    "name", ["actuators.Delivered", "controllers.Command", "sensors.Measurement", "bounds.Tube", "metrics.Sample", "objectives.Outer"]
+    "name",
+    [
+        "actuators.Delivered",
+        "controllers.Command",
+        "sensors.Measurement",
+        "bounds.Tube",
+        "metrics.Sample",
+        "objectives.Outer",
+    ],
 )
 def test_what_users_return_is_documented_on_the_reference_pages(name, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
@@ -142,12 +232,18 @@ def test_what_users_return_is_documented_on_the_reference_pages(name, tmp_path, 
     import reference
 
     family, _, short = name.partition(".")
-    listed = {f"{family}.{known}" for known in public_types.types_of(getattr(ij, family))} if family in reference.FAMILIES else set()
+    listed = (
+        {f"{family}.{known}" for known in public_types.types_of(getattr(ij, family))}
+        if family in reference.FAMILIES
+        else set()
+    )
     listed |= {known for _, names in reference.PAGES.values() for known in names.split()}
     assert name in listed
     fields = public_types.fields_of(reference.named(name))
     assert set(getattr(reference.named(name), "_fields", ())) <= set(fields)
-    assert all(f"**{field}**" in reference.page_of(reference.named(name), short) for field in fields)
+    assert all(
+        f"**{field}**" in reference.page_of(reference.named(name), short) for field in fields
+    )
 
 
 @pytest.mark.parametrize("name", PROMISED)
@@ -163,7 +259,9 @@ def test_every_public_name_is_documented(module):
     assert not missing, f"{module.__name__}: without a docstring: {missing}"
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if hasattr(m, "__all__")], ids=lambda m: m.__name__)
+@pytest.mark.parametrize(
+    "module", [m for m in MODULES if hasattr(m, "__all__")], ids=lambda m: m.__name__
+)
 def test_all_lists_what_exists(module):
     """A missing comma joins two names into one that does not exist."""
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
@@ -213,17 +311,19 @@ def test_version_is_the_packages():
 
 
 def test_import_is_light_and_leaves_the_session_alone():
-    """In a process of its own: nothing heavy beyond what jax loads, no array made, x64 and the cache as they were."""
+    """In a process of its own: nothing heavy beyond what jax loads, no array made, x64 and the
+    cache as they were."""
     code = (
-        "import sys, json, jax\n"
-        "before = set(sys.modules); x64 = jax.config.jax_enable_x64; cache = jax.config.jax_compilation_cache_dir\n"
-        "import iblf_jax\n"
-        f"heavy = [m for m in {HEAVY!r} if m in set(sys.modules) - before]\n"
-        "from jax._src import xla_bridge\n"
-        "same = [x64 == jax.config.jax_enable_x64, cache == jax.config.jax_compilation_cache_dir]\n"
-        "print(json.dumps([heavy, *same, bool(xla_bridge._backends)]))"
+        "import sys, json, jax\nbefore = set(sys.modules); x64 = jax.config.jax_enable_x64; cache"
+        f" = jax.config.jax_compilation_cache_dir\nimport iblf_jax\nheavy = [m for m in {HEAVY!r}"
+        " if m in set(sys.modules) - before]\nfrom jax._src import xla_bridge\nsame = [x64 =="
+        " jax.config.jax_enable_x64, cache =="
+        " jax.config.jax_compilation_cache_dir]\nprint(json.dumps([heavy, *same,"
+        " bool(xla_bridge._backends)]))"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     heavy, same_x64, same_cache, backend_started = json.loads(out)
     assert heavy == []
     assert same_x64
@@ -232,9 +332,15 @@ def test_import_is_light_and_leaves_the_session_alone():
 
 
 def test_these_tests_can_fail():
-    made_up = ast.parse("class Robot(Protocol):\n    def load(self, x: planar_skeleton) -> tuple[keep_programs, Robot]: ...").body[0]
+    made_up = ast.parse(
+        "class Robot(Protocol):\n    def load(self, x: planar_skeleton) -> tuple[keep_programs,"
+        " Robot]: ..."
+    ).body[0]
     assert isinstance(made_up, ast.ClassDef)
-    assert not_public("iblf_jax.robots._base:Robot", made_up) == ["keep_programs", "planar_skeleton"]
+    assert not_public("iblf_jax.robots._base:Robot", made_up) == [
+        "keep_programs",
+        "planar_skeleton",
+    ]
 
     class Bare:
         def method(self): ...

@@ -1,4 +1,5 @@
-"""The quadratic programme of fixed length: beside a maintained solver, where there is no solution, and its derivatives."""
+"""The quadratic programme of fixed length: beside a maintained solver, where there is no solution,
+and its derivatives."""
 
 import warnings
 
@@ -16,12 +17,17 @@ TIGHT = {"tol_gap_abs": 1e-13, "tol_gap_rel": 1e-13, "tol_feas": 1e-13}
 
 
 def random_programs(rng, count, n, m):
-    """Programmes with a solution; scales of H, of the rows and of the distances over two to three decades."""
+    """Programmes with a solution; scales of H, of the rows and of the distances over two to three
+    decades."""
     A = rng.normal(size=(count, n, n)) * 10 ** rng.uniform(-0.5, 1, (count, 1, 1))
     H = np.einsum("bij,bkj->bik", A, A) + 0.1 * np.eye(n)
     G = rng.normal(size=(count, m, n)) * 10 ** rng.uniform(-1, 2, (count, m, 1))
     inside = rng.normal(size=(count, n)) * 10 ** rng.uniform(-1, 2, (count, 1))
-    room = np.abs(rng.normal(size=(count, m))) * np.linalg.norm(G, axis=2) * 10 ** rng.uniform(-2, 1, (count, 1))
+    room = (
+        np.abs(rng.normal(size=(count, m)))
+        * np.linalg.norm(G, axis=2)
+        * 10 ** rng.uniform(-2, 1, (count, 1))
+    )
     return H, G, np.einsum("bij,bj->bi", G, inside) + room
 
 
@@ -31,11 +37,20 @@ def elsewhere(H, g, G, h):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return qpsolvers.solve_qp(sp.csc_matrix(H), g, sp.csc_matrix(G), h, solver="clarabel", **TIGHT)
+        return qpsolvers.solve_qp(
+            sp.csc_matrix(H), g, sp.csc_matrix(G), h, solver="clarabel", **TIGHT
+        )
 
 
 @pytest.mark.parametrize(
-    ("n", "m", "count"), [(2, 8, 300), *(pytest.param(*x, 1500, marks=pytest.mark.slow) for x in ((1, 4), (2, 8), (3, 12), (7, 30)))]
+    ("n", "m", "count"),
+    [
+        (2, 8, 300),
+        *(
+            pytest.param(*x, 1500, marks=pytest.mark.slow)
+            for x in ((1, 4), (2, 8), (3, 12), (7, 30))
+        ),
+    ],
 )
 def test_random_programs_have_the_solution_of_a_maintained_solver(n, m, count, rng):
     H, G, h = random_programs(rng, count, n, m)
@@ -46,13 +61,16 @@ def test_random_programs_have_the_solution_of_a_maintained_solver(n, m, count, r
     solved = [i for i, x in enumerate(others) if x is not None]
     assert len(solved) > 0.97 * count
     for i in solved:
-        np.testing.assert_allclose(found.x[i], others[i], rtol=0, atol=1e-8 * (1 + np.max(np.abs(others[i]))))
+        np.testing.assert_allclose(
+            found.x[i], others[i], rtol=0, atol=1e-8 * (1 + np.max(np.abs(others[i])))
+        )
     active = [np.sum(G[i] @ others[i] > h[i] - 1e-6) for i in solved]
     assert np.mean(np.array(active) > 0) > 0.3  # not all of them are free
 
 
 def test_what_has_no_solution_is_the_least_breaking_and_says_so(rng):
-    """Soft rows that exclude each other within a hard box: the squares of their slacks are those of a bounded least-squares problem."""
+    """Soft rows that exclude each other within a hard box: the squares of their slacks are those of
+    a bounded least-squares problem."""
     n, count, broken, solved = 2, 60, 0, jax.jit(quadratic_program)
     for _ in range(count):
         rows = rng.normal(size=(6, n))
@@ -68,15 +86,20 @@ def test_what_has_no_solution_is_the_least_breaking_and_says_so(rng):
         least = float(np.sum(np.maximum(rows @ other[:n] - room, 0.0) ** 2))
         assert np.max(np.abs(found.x)) <= 1 + 1e-9  # the box is never broken
         assert float(jnp.sum(found.slack**2)) == pytest.approx(least, rel=1e-5, abs=1e-8)
-        np.testing.assert_allclose(found.slack[:6], np.maximum(rows @ found.x - room, 0.0), atol=1e-6)
+        np.testing.assert_allclose(
+            found.slack[:6], np.maximum(rows @ found.x - room, 0.0), atol=1e-6
+        )
         assert (float(jnp.max(found.slack)) > 0) == (least > 1e-8)
         broken += least > 1e-8
     assert 0.2 * count < broken < count
 
 
-@pytest.mark.parametrize(("n", "rows"), [(2, 6), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((3, 9), (7, 16)))])
+@pytest.mark.parametrize(
+    ("n", "rows"), [(2, 6), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((3, 9), (7, 16)))]
+)
 def test_many_without_a_solution_meet_the_conditions_of_the_least(n, rows, rng):
-    """Soft rows near and far within a hard box: no point breaks the same rows less (by bounded least squares)."""
+    """Soft rows near and far within a hard box: no point breaks the same rows less (by bounded
+    least squares)."""
     from scipy.optimize import lsq_linear
 
     A = rng.normal(size=(200, rows, n))
@@ -100,7 +123,9 @@ def test_many_without_a_solution_meet_the_conditions_of_the_least(n, rows, rng):
 def test_derivatives_are_those_of_the_solution(rng):
     H, G, h = (jnp.asarray(x[0]) for x in random_programs(rng, 1, 3, 8))
     soft = jnp.ones(8)
-    assert np.sum(np.asarray(G @ jax.jit(quadratic_program)(H, G, h, soft).x) > h - 1e-6) > 0  # some are active
+    assert (
+        np.sum(np.asarray(G @ jax.jit(quadratic_program)(H, G, h, soft).x) > h - 1e-6) > 0
+    )  # some are active
     dH, dG, dh = (jnp.asarray(rng.normal(size=x.shape)) for x in (H, G, h))
     dH = dH + dH.T
 
@@ -119,13 +144,21 @@ def test_derivatives_are_those_of_the_solution(rng):
     np.testing.assert_allclose(jax.jit(jax.jacrev(x))(0.0), moved, rtol=1e-9)
     second = jax.jit(jax.jacfwd(by_e))(0.0)
     slope = [by_e(e) for e in (step, -step)]
-    np.testing.assert_allclose(second, (slope[0] - slope[1]) / (2 * step), rtol=1e-4, atol=1e-3 * float(jnp.max(jnp.abs(second))))
+    np.testing.assert_allclose(
+        second,
+        (slope[0] - slope[1]) / (2 * step),
+        rtol=1e-4,
+        atol=1e-3 * float(jnp.max(jnp.abs(second))),
+    )
 
 
 def test_float32_is_finite_and_near(rng):
     H, G, h = random_programs(rng, 200, 2, 8)
     soft = np.ones(h.shape)
-    exact, near = SOLVED(H, G, h, soft), SOLVED(*(jnp.asarray(x, jnp.float32) for x in (H, G, h, soft)))
+    exact, near = (
+        SOLVED(H, G, h, soft),
+        SOLVED(*(jnp.asarray(x, jnp.float32) for x in (H, G, h, soft))),
+    )
     assert near.x.dtype == jnp.float32
     scale = 1 + np.max(np.abs(h) / np.linalg.norm(G, axis=2), axis=1)
     off = np.max(np.abs(np.asarray(exact.x) - np.asarray(near.x)), axis=1) / scale
@@ -134,5 +167,7 @@ def test_float32_is_finite_and_near(rng):
 
 
 def test_rows_of_zeros_bind_nothing():
-    found = quadratic_program(jnp.eye(2), jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([-1.0, 3.0]), jnp.ones(2))
+    found = quadratic_program(
+        jnp.eye(2), jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([-1.0, 3.0]), jnp.ones(2)
+    )
     np.testing.assert_allclose(found.x, [-1.0, 0.0], atol=1e-9)

@@ -1,4 +1,5 @@
-"""Random input at the entry points: a ValueError or a result, never a crash of another kind, never a silent NaN."""
+"""Random input at the entry points: a ValueError or a result, never a crash of another kind, never
+a silent NaN."""
 
 from __future__ import annotations
 
@@ -50,15 +51,43 @@ SCALARS = st.one_of(
     st.complex_numbers(),
     st.binary(max_size=3),
     st.sampled_from(
-        [np.float16(1), np.float32("nan"), np.int64(-3), np.bool_(True), np.str_("x"), 10**400, Ellipsis, object, {}, set(), b""]
+        [
+            np.float16(1),
+            np.float32("nan"),
+            np.int64(-3),
+            np.bool_(True),
+            np.str_("x"),
+            10**400,
+            Ellipsis,
+            object,
+            {},
+            set(),
+            b"",
+        ]
     ),
 )
 ARRAYS = hnp.arrays(
-    st.sampled_from([np.float16, np.float32, np.float64, np.int32, np.uint8, np.bool_, np.complex64, "U3", object]),
+    st.sampled_from(
+        [
+            np.float16,
+            np.float32,
+            np.float64,
+            np.int32,
+            np.uint8,
+            np.bool_,
+            np.complex64,
+            "U3",
+            object,
+        ]
+    ),
     hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3),
 )
 ANYTHING = st.one_of(
-    SCALARS, ARRAYS, st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=3) | st.tuples(inner, inner), max_leaves=5)
+    SCALARS,
+    ARRAYS,
+    st.recursive(
+        SCALARS, lambda inner: st.lists(inner, max_size=3) | st.tuples(inner, inner), max_leaves=5
+    ),
 )
 MEMBERS = [member for family, (members, _, _) in FAMILIES.items() for member in members.values()]
 many = settings(max_examples=400)
@@ -98,7 +127,10 @@ def test_constructors(member, data, value):
 
 
 @many
-@given(name=st.sampled_from([f.name for f in dataclasses.fields(ij.Scenario)]), value=st.one_of(ANYTHING, st.sampled_from(MEMBERS)))
+@given(
+    name=st.sampled_from([f.name for f in dataclasses.fields(ij.Scenario)]),
+    value=st.one_of(ANYTHING, st.sampled_from(MEMBERS)),
+)
 def test_scenarios(paper, name, value):
     """Any part of a scenario exchanged for anything, other families' members included."""
     accepts_or_value_error(lambda: dataclasses.replace(paper, **{name: value}))
@@ -108,9 +140,37 @@ PATHLIKE = st.one_of(
     st.text(alphabet="plantmscoer.[]0123456789-_K ", max_size=20),
     st.builds(
         lambda a, b, i: f"{a}.{b}{i}",
-        st.sampled_from(["plant", "model", "robot", "controller", "initial", "disturbance", "bounds.lower", "observer", "x"]),
-        st.sampled_from(["mass", "K2", "k1", "q", "g", "kf", "phase", "offset", "reading", "barrier", "__init__"]),
-        st.sampled_from(["", "[0]", "[1]", "[-1]", "[7]", "[0][0]", "[99999999999]", ".real", "[a]"]),
+        st.sampled_from(
+            [
+                "plant",
+                "model",
+                "robot",
+                "controller",
+                "initial",
+                "disturbance",
+                "bounds.lower",
+                "observer",
+                "x",
+            ]
+        ),
+        st.sampled_from(
+            [
+                "mass",
+                "K2",
+                "k1",
+                "q",
+                "g",
+                "kf",
+                "phase",
+                "offset",
+                "reading",
+                "barrier",
+                "__init__",
+            ]
+        ),
+        st.sampled_from(
+            ["", "[0]", "[1]", "[-1]", "[7]", "[0][0]", "[99999999999]", ".real", "[a]"]
+        ),
     ),
     ANYTHING,
 )
@@ -122,7 +182,16 @@ def test_parse_and_get(paper, path):
     tokens = accepts_or_value_error(lambda: paths.parse(path))
     if tokens is not None:
         assert all(isinstance(t, str | int) for t in tokens)
-        spelled = [f"[{t}]" if isinstance(t, int) else f"[{json.dumps(t)}]" if isinstance(t, paths.RowName) else f".{t}" for t in tokens]
+        spelled = [
+            (
+                f"[{t}]"
+                if isinstance(t, int)
+                else f"[{json.dumps(t)}]"
+                if isinstance(t, paths.RowName)
+                else f".{t}"
+            )
+            for t in tokens
+        ]
         assert paths.parse("".join(spelled).removeprefix(".")) == tokens
     value = accepts_or_value_error(lambda: paths.get(paper, path))
     assert value is None or np.all(np.isfinite(value))
@@ -135,8 +204,12 @@ def test_with_parameters(paper, path, value):
     if other is not None:
         assert finite(other)
         assert jax.tree.structure(other) == jax.tree.structure(paper)
-        assert [np.shape(x) for x in jax.tree.leaves(other)] == [np.shape(x) for x in jax.tree.leaves(paper)]
-        before, after = ({p.path: np.asarray(p.value) for p in ij.parameters(s)} for s in (paper, other))
+        assert [np.shape(x) for x in jax.tree.leaves(other)] == [
+            np.shape(x) for x in jax.tree.leaves(paper)
+        ]
+        before, after = (
+            {p.path: np.asarray(p.value) for p in ij.parameters(s)} for s in (paper, other)
+        )
         changed = {p for p in before if not np.array_equal(before[p], after[p])}
         touched = {p.split("[")[0] for p in paths.expand(path)}
         assert changed <= touched
@@ -153,7 +226,9 @@ def entered(*args, **options):
 @many
 @given(data=st.data(), value=ANYTHING)
 def test_arguments_of_simulate(paper, data, value):
-    name = data.draw(st.sampled_from(["duration", "dt", "method", "record_every", "metrics", "scenario"]))
+    name = data.draw(
+        st.sampled_from(["duration", "dt", "method", "record_every", "metrics", "scenario"])
+    )
     options = {"scenario": paper, **SHORT, name: value}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "run_one", entered)
@@ -173,26 +248,46 @@ def test_steps(duration, dt):
 
 
 NUMBERS = st.one_of(
-    st.floats(-1e3, 1e3), st.floats(1e-3, 1e2), st.floats(allow_nan=False, allow_infinity=False), st.sampled_from([1e-300, 1e300, 0.0])
+    st.floats(-1e3, 1e3),
+    st.floats(1e-3, 1e2),
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.sampled_from([1e-300, 1e300, 0.0]),
 )
 
 
 @pytest.mark.slow
 @settings(max_examples=300)
 @given(
-    values=st.dictionaries(st.sampled_from([p.path for p in ij.parameters(ij.presets.zhang_yan_2024())]), NUMBERS, min_size=1, max_size=4)
+    values=st.dictionaries(
+        st.sampled_from([p.path for p in ij.parameters(ij.presets.zhang_yan_2024())]),
+        NUMBERS,
+        min_size=1,
+        max_size=4,
+    )
 )
 def test_no_silent_nan_in_a_run(paper, values):
-    """Any numbers in any leaves: refused, or run; a run that is not finite says so, and its records are finite up to there."""
+    """Any numbers in any leaves: refused, or run; a run that is not finite says so, and its records
+    are finite up to there."""
     # The step that a warning names takes longer to find than the run; other tests look at it.
     with mock.patch("iblf_jax.engine.simulate.find_dt", return_value=1e-4):
-        run = accepts_or_value_error(lambda: ij.simulate(ij.with_parameters(paper, values), **SHORT))
+        run = accepts_or_value_error(
+            lambda: ij.simulate(ij.with_parameters(paper, values), **SHORT)
+        )
     if run is None:
         return
     status = int(run.status)
-    state = np.concatenate([np.asarray(run.q).ravel(), np.asarray(run.dq).ravel(), np.asarray(run.observer_state).ravel()])
+    state = np.concatenate(
+        [
+            np.asarray(run.q).ravel(),
+            np.asarray(run.dq).ravel(),
+            np.asarray(run.observer_state).ravel(),
+        ]
+    )
     assert np.all(np.isfinite(state))
-    others = [np.asarray(x) for x in (run.tau, run.e1, run.e2, run.xi, run.disturbance, run.disturbance_estimate, run.V)]
+    others = [
+        np.asarray(x)
+        for x in (run.tau, run.e1, run.e2, run.xi, run.disturbance, run.disturbance_estimate, run.V)
+    ]
     if not all(np.all(np.isfinite(x)) for x in others):
         assert status & Status.NOT_FINITE, values
 
@@ -241,30 +336,94 @@ NASTY = {
 WAYS = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
 GOAL = ij.objectives.tracking(scale=1.0)
 ENTRIES = {
-    "simulate": (ij.simulate, {"scenario": None, "method": "rk4", "record_every": 1, "throw": False, "backend": "auto"}),
-    "compare": (ij.compare, {"scenario": None, "laws": ["log"], "record_every": 1, "equal_effort": True}),
+    "simulate": (
+        ij.simulate,
+        {"scenario": None, "method": "rk4", "record_every": 1, "throw": False, "backend": "auto"},
+    ),
+    "compare": (
+        ij.compare,
+        {"scenario": None, "laws": ["log"], "record_every": 1, "equal_effort": True},
+    ),
     "monte_carlo": (
         ij.monte_carlo,
-        {"scenario": None, "perturbations": WAYS, "runs": 4, "seed": 0, "sampler": "sobol", "replicates": 2, "chunk": 8, "memory": 1e9}
+        {
+            "scenario": None,
+            "perturbations": WAYS,
+            "runs": 4,
+            "seed": 0,
+            "sampler": "sobol",
+            "replicates": 2,
+            "chunk": 8,
+            "memory": 1e9,
+        }
         | {"devices": None, "progress": False},
     ),
     "sweep": (
         ij.sweep,
-        {"scenario": None, "grid": {"controller.K2": [1.0, 2.0]}, "perturbations": None, "runs": 1, "points": None, "store": None}
+        {
+            "scenario": None,
+            "grid": {"controller.K2": [1.0, 2.0]},
+            "perturbations": None,
+            "runs": 1,
+            "points": None,
+            "store": None,
+        }
         | {"unit": None, "memory": 1e9, "devices": None, "progress": False},
     ),
-    "sensitivity": (ij.sensitivity, {"scenario": None, "perturbations": WAYS, "points": 4, "memory": 1e9, "devices": None}),
+    "sensitivity": (
+        ij.sensitivity,
+        {"scenario": None, "perturbations": WAYS, "points": 4, "memory": 1e9, "devices": None},
+    ),
     "tune": (
         ij.tune,
-        {"scenario": None, "parameters": ["controller.K2"], "objective": GOAL, "runs": 1, "seed": 0, "resample": False, "starts": 1}
-        | {"sharpenings": 2, "iterations": 2, "tolerance": 1e-5, "patience": 3, "report_runs": 4, "report_seed": None, "confidence": 0.9}
-        | {"checkpoint": None, "callback": None, "risk": "mean", "perturbations": None, "progress": False},
+        {
+            "scenario": None,
+            "parameters": ["controller.K2"],
+            "objective": GOAL,
+            "runs": 1,
+            "seed": 0,
+            "resample": False,
+            "starts": 1,
+        }
+        | {
+            "sharpenings": 2,
+            "iterations": 2,
+            "tolerance": 1e-5,
+            "patience": 3,
+            "report_runs": 4,
+            "report_seed": None,
+            "confidence": 0.9,
+        }
+        | {
+            "checkpoint": None,
+            "callback": None,
+            "risk": "mean",
+            "perturbations": None,
+            "progress": False,
+        },
     ),
     "pareto": (
         ij.pareto,
-        {"scenario": None, "parameters": ["controller.K2"], "objectives": (GOAL, GOAL), "points": 2, "iterations": 2, "tolerance": 1e-5},
+        {
+            "scenario": None,
+            "parameters": ["controller.K2"],
+            "objectives": (GOAL, GOAL),
+            "points": 2,
+            "iterations": 2,
+            "tolerance": 1e-5,
+        },
     ),
-    "falsify": (ij.falsify, {"scenario": None, "perturbations": WAYS, "starts": 2, "iterations": 2, "seed": 0, "progress": False}),
+    "falsify": (
+        ij.falsify,
+        {
+            "scenario": None,
+            "perturbations": WAYS,
+            "starts": 2,
+            "iterations": 2,
+            "seed": 0,
+            "progress": False,
+        },
+    ),
     "certify": (ij.certify, {"scenario": None, "run": None, "worst": 3}),
     "explain": (ij.explain, {"scenario": None, "varied": (), "metrics": ()}),
     "load_scenario": (ij.load_scenario, {"path": "x.toml"}),
@@ -276,8 +435,14 @@ ENTRIES = {
     "save_scenario": (ij.save_scenario, {"scenario": None, "path": "/", "run": None}),
     "astype": (ij.astype, {"tree": None, "dtype": "float32"}),
     "choice": (ij.choice, {"values": [1.0], "weights": None}),
-    "tunable": (ij.tunable, {"path": "controller.K2", "low": None, "high": None, "tied": False, "scale": None}),
-    "arm_scenario": (ij.presets.arm_scenario, {"robot": None, "reference": None, "law": "log", "model": None}),
+    "tunable": (
+        ij.tunable,
+        {"path": "controller.K2", "low": None, "high": None, "tied": False, "scale": None},
+    ),
+    "arm_scenario": (
+        ij.presets.arm_scenario,
+        {"robot": None, "reference": None, "law": "log", "model": None},
+    ),
 }
 """Entry points and arguments; None stands for what is made in the test, or for none."""
 TIMED = ("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "pareto", "falsify")
@@ -304,15 +469,21 @@ def no_runs(monkeypatch):
 @pytest.mark.parametrize("entry", ENTRIES)
 @pytest.mark.filterwarnings("ignore")
 def test_anything_in_the_place_of_any_argument(entry, paper, no_runs, tmp_path, monkeypatch):
-    """A ValueError that says what came, in one line that can be read; or nothing is there; or the call goes on to its runs."""
+    """A ValueError that says what came, in one line that can be read; or nothing is there; or the
+    call goes on to its runs."""
     monkeypatch.chdir(tmp_path)
     function, arguments = ENTRIES[entry]
     for name in arguments:
         for label, value in NASTY.items():
             given = {"duration": 0.01} if entry in TIMED else {}
-            given |= {key: paper if x is None and key in ("scenario", "tree") else x for key, x in arguments.items()} | {name: value}
+            given |= {
+                key: paper if x is None and key in ("scenario", "tree") else x
+                for key, x in arguments.items()
+            } | {name: value}
             if entry == "arm_scenario":
-                given = {"robot": paper.plant, "reference": paper.reference} | {key: x for key, x in given.items() if x is not None}
+                given = {"robot": paper.plant, "reference": paper.reference} | {
+                    key: x for key, x in given.items() if x is not None
+                }
             try:
                 function(**given)
             except (Entered, FileNotFoundError, ij.StoreError):
@@ -327,47 +498,110 @@ def test_anything_in_the_place_of_any_argument(entry, paper, no_runs, tmp_path, 
 
 PARTS = {
     "at_time": (robots.at_time, {"robot": members.TWO_LINK, "t": 0.0}, ("robot",)),
-    "friction_torque": (robots.friction_torque, {"robot": members.TWO_LINK, "dq": [0.1, 0.2]}, ("dq",)),
+    "friction_torque": (
+        robots.friction_torque,
+        {"robot": members.TWO_LINK, "dq": [0.1, 0.2]},
+        ("dq",),
+    ),
     "coriolis_from_mass_matrix": (
         robots.coriolis_from_mass_matrix,
-        {"mass_matrix": members.TWO_LINK.mass_matrix, "q": [0.1, 0.2], "v": [0.1, 0.2], "u": [0.1, 0.2]},
+        {
+            "mass_matrix": members.TWO_LINK.mass_matrix,
+            "q": [0.1, 0.2],
+            "v": [0.1, 0.2],
+            "u": [0.1, 0.2],
+        },
         ("q", "v", "u"),
     ),
-    "mass_matrix_rate": (robots.mass_matrix_rate, {"robot": members.TWO_LINK, "q": [0.1, 0.2], "dq": [0.1, 0.2]}, ("robot", "q", "dq")),
-    "energy_gradient": (robots.energy_gradient, {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]}, ("robot", "q", "v")),
+    "mass_matrix_rate": (
+        robots.mass_matrix_rate,
+        {"robot": members.TWO_LINK, "q": [0.1, 0.2], "dq": [0.1, 0.2]},
+        ("robot", "q", "dq"),
+    ),
+    "energy_gradient": (
+        robots.energy_gradient,
+        {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]},
+        ("robot", "q", "v"),
+    ),
     "from_energy": (robots.from_energy, {"cls": None}, ("cls",)),
     "joint_names": (robots.joint_names, {"robot": members.TWO_LINK, "n": 2}, ("n",)),
     "tube_at": (
         bounds.tube_at,
-        {"reference": members.REFERENCES["sinusoid"], "bounds": bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(2.0)), "t": 0.1},
+        {
+            "reference": members.REFERENCES["sinusoid"],
+            "bounds": bounds.Bounds(bounds.Constant(-2.0), bounds.Constant(2.0)),
+            "t": 0.1,
+        },
         ("reference", "bounds", "t", "acceleration"),
     ),
     "positive_width": (bounds.positive_width, {"k": 1.0}, ("k",)),
-    "guarded_error": (barriers.guarded_error, {"tube": None, "q": [0.1, 0.2], "guard": 1e-3}, ("tube", "q", "guard")),
-    "guard_is_active": (barriers.guard_is_active, {"tube": None, "q": [0.1, 0.2], "guard": 1e-3}, ("tube", "q", "guard")),
-    "splines": (ij.references.WaypointSpline, {"times": (0.0, 1.0), "waypoints": [[0.0], [1.0]]}, ("times", "waypoints")),
-    "objectives.complete": (ij.objectives.complete, {"objective": GOAL, "start": [1.0]}, ("objective", "start")),
-    "objectives.sharper": (ij.objectives.sharper, {"objective": GOAL, "factor": 2.0}, ("objective",)),
-    "objectives.metric": (ij.objectives.metric, {"fold": metrics.Tracking(), "name": "rmse"}, ("fold", "name")),
+    "guarded_error": (
+        barriers.guarded_error,
+        {"tube": None, "q": [0.1, 0.2], "guard": 1e-3},
+        ("tube", "q", "guard"),
+    ),
+    "guard_is_active": (
+        barriers.guard_is_active,
+        {"tube": None, "q": [0.1, 0.2], "guard": 1e-3},
+        ("tube", "q", "guard"),
+    ),
+    "splines": (
+        ij.references.WaypointSpline,
+        {"times": (0.0, 1.0), "waypoints": [[0.0], [1.0]]},
+        ("times", "waypoints"),
+    ),
+    "objectives.complete": (
+        ij.objectives.complete,
+        {"objective": GOAL, "start": [1.0]},
+        ("objective", "start"),
+    ),
+    "objectives.sharper": (
+        ij.objectives.sharper,
+        {"objective": GOAL, "factor": 2.0},
+        ("objective",),
+    ),
+    "objectives.metric": (
+        ij.objectives.metric,
+        {"fold": metrics.Tracking(), "name": "rmse"},
+        ("fold", "name"),
+    ),
     "check_law": (ij.testing.check_law, {"law": members.LAWS["pd_gravity"]}, ("law", "scenario")),
     "check_robot": (ij.testing.check_robot, {"robot": members.TWO_LINK}, ("robot", "q")),
-    "check_reference": (ij.testing.check_reference, {"reference": members.REFERENCES["sinusoid"]}, ("reference", "n", "duration")),
-    "check_side": (ij.testing.check_side, {"side": bounds.Constant(1.0)}, ("side", "n", "duration")),
+    "check_reference": (
+        ij.testing.check_reference,
+        {"reference": members.REFERENCES["sinusoid"]},
+        ("reference", "n", "duration"),
+    ),
+    "check_side": (
+        ij.testing.check_side,
+        {"side": bounds.Constant(1.0)},
+        ("side", "n", "duration"),
+    ),
     "check_disturbance": (
         ij.testing.check_disturbance,
         {"disturbance": members.DISTURBANCES["step"]},
         ("disturbance", "plant", "model", "duration"),
     ),
-    "check_observer": (ij.testing.check_observer, {"observer": members.OBSERVERS["printed"]}, ("observer", "model")),
-    "check_objective": (ij.testing.check_objective, {"objective": GOAL}, ("objective", "scenario", "duration")),
+    "check_observer": (
+        ij.testing.check_observer,
+        {"observer": members.OBSERVERS["printed"]},
+        ("observer", "model"),
+    ),
+    "check_objective": (
+        ij.testing.check_objective,
+        {"objective": GOAL},
+        ("objective", "scenario", "duration"),
+    ),
 }
-"""Functions that parts are made of and looked at with: arguments that are fine, and those that anything is put in the place of."""
+"""Functions that parts are made of and looked at with: arguments that are fine, and those that
+anything is put in the place of."""
 
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.filterwarnings("ignore")
 def test_anything_in_the_place_of_the_arguments_of_a_part(part, paper, monkeypatch):
-    """A ValueError that says what came, or the findings of a checker; what is accepted goes no further than to its first function."""
+    """A ValueError that says what came, or the findings of a checker; what is accepted goes no
+    further than to its first function."""
     monkeypatch.setattr("iblf_jax.testing._contract.probe", entered)
     for checker in ("barriers", "laws", "metrics", "observers", "robots", "world", "objectives"):
         monkeypatch.setattr(f"iblf_jax.testing.{checker}.shape_of", entered)
@@ -376,7 +610,13 @@ def test_anything_in_the_place_of_the_arguments_of_a_part(part, paper, monkeypat
         arguments = {**arguments, "tube": bounds.tube_at(paper.reference, paper.bounds, 0.1)}
     refused = set()
     for name in names:
-        for label, value in {**NASTY, "empty": [], "complex": 1j, "matrix": np.ones((2, 3, 4)), "words of words": {"a": 1}}.items():
+        for label, value in {
+            **NASTY,
+            "empty": [],
+            "complex": 1j,
+            "matrix": np.ones((2, 3, 4)),
+            "words of words": {"a": 1},
+        }.items():
             try:
                 function(**(arguments | {name: value}))
             except (Entered, ij.testing.ContractError):
@@ -398,14 +638,45 @@ def depth_left(n: int) -> bool:
     ("call", "words"),
     [
         (lambda s: ij.monte_carlo(s, WAYS, runs=2**31, duration=0.01), ("runs", "at most", "GiB")),
-        (lambda s: ij.sweep(s, {"controller.K2": ij.uniform(1.0, 2.0)}, design="random", points=2**31, duration=0.01), ("points", "GiB")),
-        (lambda s: ij.sensitivity(s, WAYS, points=2**30, duration=0.01), ("points", "at most", "GiB")),
-        (lambda s: ij.tune(s, ["controller.K2"], GOAL, starts=2**40, duration=0.01), ("starts", "at most", "GiB")),
+        (
+            lambda s: ij.sweep(
+                s,
+                {"controller.K2": ij.uniform(1.0, 2.0)},
+                design="random",
+                points=2**31,
+                duration=0.01,
+            ),
+            ("points", "GiB"),
+        ),
+        (
+            lambda s: ij.sensitivity(s, WAYS, points=2**30, duration=0.01),
+            ("points", "at most", "GiB"),
+        ),
+        (
+            lambda s: ij.tune(s, ["controller.K2"], GOAL, starts=2**40, duration=0.01),
+            ("starts", "at most", "GiB"),
+        ),
         (lambda s: ij.falsify(s, WAYS, starts=2**40, duration=0.01), ("GiB",)),
-        (lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=[], duration=0.01), ("devices", "at least one")),
-        (lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=["cpu"], duration=0.01), ("devices", "cpu")),
-        (lambda s: ij.simulate(s, metrics=[metrics.Settling(tolerance=[0.1] * 3)], duration=0.01), ("metrics[0].tolerance", "2")),
-        (lambda s: ij.tune(s, ["controller.K2"], ij.objectives.effort(joints=[1.0] * 3), duration=0.01), ("joints", "(3,)")),
+        (
+            lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=[], duration=0.01),
+            ("devices", "at least one"),
+        ),
+        (
+            lambda s: ij.monte_carlo(s, WAYS, runs=2, devices=["cpu"], duration=0.01),
+            ("devices", "cpu"),
+        ),
+        (
+            lambda s: ij.simulate(
+                s, metrics=[metrics.Settling(tolerance=[0.1] * 3)], duration=0.01
+            ),
+            ("metrics[0].tolerance", "2"),
+        ),
+        (
+            lambda s: ij.tune(
+                s, ["controller.K2"], ij.objectives.effort(joints=[1.0] * 3), duration=0.01
+            ),
+            ("joints", "(3,)"),
+        ),
         (lambda s: ij.objectives.margin_above(0.1, allowed=5.0), ("allowed", "0 to 1")),
     ],
 )
@@ -418,13 +689,29 @@ def test_sizes_devices_and_shapes(paper, call, words):
 
 @pytest.mark.slow
 def test_recording_less_often_than_there_are_steps(paper, short_run):
-    """Past the end of the run every step is as good as any; 2**31 is more than the compiled loop can count."""
+    """Past the end of the run every step is as good as any; 2**31 is more than the compiled loop
+    can count."""
     run = ij.simulate(paper, record_every=2**31, **SHORT)
     assert run.t.shape == (1,)
     np.testing.assert_array_equal(run.metrics.rmse, short_run.metrics.rmse)
 
 
-@pytest.mark.parametrize("name", ["a\nb", "..", "a]b", "[", 'quo"te', "1", "back\\slash", '"x"', "\u2028", "plain name", "gelenk_ü"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a\nb",
+        "..",
+        "a]b",
+        "[",
+        'quo"te',
+        "1",
+        "back\\slash",
+        '"x"',
+        "\u2028",
+        "plain name",
+        "gelenk_ü",
+    ],
+)
 def test_names_of_links_of_any_characters(name, tmp_path):
     """Each listed path leads to its value, and back, in files too."""
     arm = ij.presets.ur5()
@@ -442,7 +729,14 @@ def test_names_of_links_of_any_characters(name, tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["x = " + "[" * 100_000, "[" + "a." * 5000 + "a]", "x = " + "[" * 60 + "]" * 60, "x = " + "9" * 6000, "run = 2020-01-01", "\0"],
+    [
+        "x = " + "[" * 100_000,
+        "[" + "a." * 5000 + "a]",
+        "x = " + "[" * 60 + "]" * 60,
+        "x = " + "9" * 6000,
+        "run = 2020-01-01",
+        "\0",
+    ],
     ids=["lists", "tables", "closed", "digits", "date", "null"],
 )
 def test_toml_of_any_depth(text, tmp_path, capsys):
@@ -464,24 +758,78 @@ def test_toml_of_any_depth(text, tmp_path, capsys):
 
 @pytest.fixture
 def results(paper, no_runs, monkeypatch):
-    """One result of every kind, which no simulator made; whatever would run or draw raises Entered."""
+    """One result of every kind, which no simulator made; whatever would run or draw raises
+    Entered."""
     monkeypatch.setattr("iblf_jax.plotting._style.new_figure", entered)
     monkeypatch.setattr("iblf_jax.tuning.result._slice", entered)
     run = made_up(paper.plant, duration=0.1)
-    setup = prepare(paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="xla")
-    found = Metrics({"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)}, (("margin", "rad"), ("rmse", "rad")))
-    study = ij.Study(paper, found, np.zeros(4, np.int32), np.ones(4), {"controller.K2": np.full((4, 2), 20.0)}, setup)
-    history = {"valid": np.ones((1, 1), bool), "x": np.full((1, 1, 2), 20.0), "objective": np.ones((1, 1)), "evaluations": np.ones(1, int)}
-    asked = TuneSetup(GOAL, {}, as_risk("mean"), 1, 0, 0.01, 1e-3, "rk4", "auto", 4, 1, 0.95, ((1.0, 100.0), (1.0, 100.0)))
+    setup = prepare(
+        paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="xla"
+    )
+    found = Metrics(
+        {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)},
+        (("margin", "rad"), ("rmse", "rad")),
+    )
+    study = ij.Study(
+        paper,
+        found,
+        np.zeros(4, np.int32),
+        np.ones(4),
+        {"controller.K2": np.full((4, 2), 20.0)},
+        setup,
+    )
+    history = {
+        "valid": np.ones((1, 1), bool),
+        "x": np.full((1, 1, 2), 20.0),
+        "objective": np.ones((1, 1)),
+        "evaluations": np.ones(1, int),
+    }
+    asked = TuneSetup(
+        GOAL,
+        {},
+        as_risk("mean"),
+        1,
+        0,
+        0.01,
+        1e-3,
+        "rk4",
+        "auto",
+        4,
+        1,
+        0.95,
+        ((1.0, 100.0), (1.0, 100.0)),
+    )
     names = ("controller.K2[0]", "controller.K2[1]")
-    tuned = ij.TuneResult(paper, paper, {"controller.K2": np.full(2, 20.0)}, names, history, 0, "done", "newton", "forward", 1.0, asked)
+    tuned = ij.TuneResult(
+        paper,
+        paper,
+        {"controller.K2": np.full(2, 20.0)},
+        names,
+        history,
+        0,
+        "done",
+        "newton",
+        "forward",
+        1.0,
+        asked,
+    )
     vars(tuned)["nominal"] = (run, run)
     twos, (blocks, _) = np.ones((2, 2)), layout(paper, ["controller.K2"], 1e-3, "rk4")
     front = ij.Front(("a", "b"), twos, twos, names, twos, twos[0], paper, blocks, twos, 1.0)
-    attack = ij.Attack(paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, {"duration": 0.01, "dt": 1e-3, "method": "rk4"})
+    attack = ij.Attack(
+        paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, {"duration": 0.01, "dt": 1e-3, "method": "rk4"}
+    )
     compared = ij.Comparison({"log": run}, {}, {}, {}, {"log": "K2 = 20"})
     matters = ij.Sensitivity(names, np.ones(2), np.ones(2), twos, twos, "margin", 8, 0)
-    return {"run": run, "study": study, "tuning": tuned, "front": front, "attack": attack, "comparison": compared, "sensitivity": matters}
+    return {
+        "run": run,
+        "study": study,
+        "tuning": tuned,
+        "front": front,
+        "attack": attack,
+        "comparison": compared,
+        "sensitivity": matters,
+    }
 
 
 METHODS = {
@@ -496,7 +844,12 @@ METHODS = {
     "study.parameter_unit": {"path": "controller.K2"},
     "study.plot": {"runs": 2},
     "tuning.check": {"runs": 2, "seed": 3},
-    "tuning.landscape": {"first": "controller.K2[0]", "second": "controller.K2[1]", "points": 2, "span": 1.0},
+    "tuning.landscape": {
+        "first": "controller.K2[0]",
+        "second": "controller.K2[1]",
+        "points": 2,
+        "span": 1.0,
+    },
     "tuning.plot": {"landscape": None},
     "tuning.save": {"path": "/"},
     "front.scenario": {"index": 0},
@@ -513,7 +866,15 @@ def test_anything_in_the_place_of_the_arguments_of_a_method(method, results, tmp
     kind, _, name = method.partition(".")
     call, odd = (
         getattr(results[kind], name),
-        {**NASTY, "-1": -1, "half": 0.5, "true": True, "slice": slice(0, 1), "far": -(2**70), "pair": (1, 2)},
+        {
+            **NASTY,
+            "-1": -1,
+            "half": 0.5,
+            "true": True,
+            "slice": slice(0, 1),
+            "far": -(2**70),
+            "pair": (1, 2),
+        },
     )
     refused = set()
     for argument in METHODS[method]:
@@ -555,9 +916,15 @@ jax.tree_util.register_dataclass(Own, ["width"], ["units"])
 def test_anything_in_a_fold_and_in_a_table(odd):
     value = NASTY[odd]
     for field in ("width", "units"):
-        accepts_or_value_error(lambda field=field: metrics.as_folds([Own(**{field: value})], np.float64, ij.presets.zhang_yan_2024()))
+        accepts_or_value_error(
+            lambda field=field: metrics.as_folds(
+                [Own(**{field: value})], np.float64, ij.presets.zhang_yan_2024()
+            )
+        )
     for table in (value, {"k1": value}, {"k1": 1.0, "K2": 1.0, "o": 1.0, "barrier": value}):
-        accepts_or_value_error(lambda table=table: decode_fields(ij.controllers.Backstepping, table, "controller"))
+        accepts_or_value_error(
+            lambda table=table: decode_fields(ij.controllers.Backstepping, table, "controller")
+        )
     assert depth_left(500)
 
 
@@ -593,7 +960,16 @@ WORDS += [
     "a=",
     "[" * 3000 + "=1",
 ]
-WORDS += ["controller.K2=nan", "controller.K2=" + "[" * 5000, "law=7", "plant.mass[999999999999]=1", "localhost:99999", "::1", ",", "rk5"]
+WORDS += [
+    "controller.K2=nan",
+    "controller.K2=" + "[" * 5000,
+    "law=7",
+    "plant.mass[999999999999]=1",
+    "localhost:99999",
+    "::1",
+    ",",
+    "rk5",
+]
 COMMANDS = {
     "reproduce": ["--out", "out"],
     "simulate": ["zhang_yan_2024", "--duration", "0.01"],
@@ -608,8 +984,11 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_any_word_in_the_place_of_any_other_on_the_command_line(command, no_runs, tmp_path, monkeypatch, capsys):
-    """Exit code 2 and one line that can be read, or the command goes on to its runs; `presets` and `parameters` print."""
+def test_any_word_in_the_place_of_any_other_on_the_command_line(
+    command, no_runs, tmp_path, monkeypatch, capsys
+):
+    """Exit code 2 and one line that can be read, or the command goes on to its runs; `presets` and
+    `parameters` print."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jax.distributed.initialize", entered)
     monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
@@ -620,7 +999,9 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(command, no_runs
     (tmp_path / "empty.toml").touch()
     (tmp_path / "loop.toml").symlink_to("loop.toml")
     os.mkfifo(tmp_path / "pipe.toml")
-    (commands,) = (x.choices for x in cli.build_parser()._actions if isinstance(x, argparse._SubParsersAction))
+    (commands,) = (
+        x.choices for x in cli.build_parser()._actions if isinstance(x, argparse._SubParsersAction)
+    )
     words, fine, calls = itertools.cycle(WORDS), COMMANDS[command], [COMMANDS[command]]
     for action in commands[command]._actions[1:]:
         for word in itertools.islice(words, len(WORDS) // 8):
@@ -629,7 +1010,10 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(command, no_runs
             elif action.nargs == 0:
                 calls.append([*fine, action.option_strings[0], word])
             else:
-                calls += [[*fine, action.option_strings[0], word], [*fine, f"{action.option_strings[0]}={word}"]]
+                calls += [
+                    [*fine, action.option_strings[0], word],
+                    [*fine, f"{action.option_strings[0]}={word}"],
+                ]
         calls.append([*fine, f"{action.option_strings[0]}=--"] if action.option_strings else ["--"])
     codes = set()
     for call in calls:

@@ -1,4 +1,5 @@
-"""The reference governor: beside an independent program, and what it keeps where the law alone does not."""
+"""The reference governor: beside an independent program, and what it keeps where the law alone does
+not."""
 
 import dataclasses
 
@@ -13,7 +14,10 @@ import iblf_jax as ij
 from iblf_jax import bounds, controllers
 from iblf_jax.control.controllers.reference_governor import GovernorState
 
-LAWS = {"pd": controllers.PDGravity(Kp=[30.0, 10.0], Kd=[1.5, 0.3]), "computed_torque": controllers.ComputedTorque(Kp=[40.0, 30.0], Kd=3.0)}
+LAWS = {
+    "pd": controllers.PDGravity(Kp=[30.0, 10.0], Kd=[1.5, 0.3]),
+    "computed_torque": controllers.ComputedTorque(Kp=[40.0, 30.0], Kd=3.0),
+}
 
 
 def scenario_of(law, q=(0.75, 0.3), dq=(0.0, 0.0), goal=(0.25, 0.8)):
@@ -21,7 +25,11 @@ def scenario_of(law, q=(0.75, 0.3), dq=(0.0, 0.0), goal=(0.25, 0.8)):
     rest = ij.references.Sinusoid(offset=goal, amplitude=0.0)
     walls = bounds.Bounds(lower=bounds.Constant([0.2, 0.15]), upper=bounds.Constant([0.9, 0.85]))
     parts = {"controller": law, "reference": rest, "bounds": walls, "initial": ij.Initial(q, dq)}
-    return ij.with_parts(ij.presets.zhang_yan_2024(law="pd", reading="corrected"), **parts, disturbance=ij.disturbances.Nothing())
+    return ij.with_parts(
+        ij.presets.zhang_yan_2024(law="pd", reading="corrected"),
+        **parts,
+        disturbance=ij.disturbances.Nothing(),
+    )
 
 
 def independent_rate(name, governor, goal, x):
@@ -33,12 +41,25 @@ def independent_rate(name, governor, goal, x):
     if name == "pd":
         tau, V = G - Kp * (q - g) - Kd * v, 0.5 * v @ M @ v + 0.5 * np.sum(Kp * (q - g) ** 2)
     else:
-        tau, V = M @ (-Kp * (q - g) - Kd * v) + C(v) @ v + G, 0.5 * v @ v + 0.5 * np.sum(Kp * (q - g) ** 2)
+        tau, V = (
+            M @ (-Kp * (q - g) - Kd * v) + C(v) @ v + G,
+            0.5 * v @ v + 0.5 * np.sum(Kp * (q - g) ** 2),
+        )
     distance = np.minimum(g - low, high - g)
     level = 0.5 * np.min(Kp * np.maximum(distance, 0) ** 2)
     away = np.asarray(goal) - g
-    field = away / max(np.linalg.norm(away), 0.02) + np.maximum(1 - (g - low) / 0.02, 0) - np.maximum(1 - (high - g) / 0.02, 0)
-    return np.concatenate([v, np.linalg.solve(M, tau - C(v) @ v - G), float(governor.eta) * max(level - V, 0.0) * field])
+    field = (
+        away / max(np.linalg.norm(away), 0.02)
+        + np.maximum(1 - (g - low) / 0.02, 0)
+        - np.maximum(1 - (high - g) / 0.02, 0)
+    )
+    return np.concatenate(
+        [
+            v,
+            np.linalg.solve(M, tau - C(v) @ v - G),
+            float(governor.eta) * max(level - V, 0.0) * field,
+        ]
+    )
 
 
 @pytest.mark.parametrize("name", list(LAWS))
@@ -47,7 +68,13 @@ def test_the_run_is_that_of_an_independent_program(name):
     scenario, t = scenario_of(governor), np.linspace(0.0, 3.0, 61)
     start = [0.75, 0.3, 0, 0, 0.75, 0.3]
     found = solve_ivp(
-        lambda t, x: independent_rate(name, governor, (0.25, 0.8), x), (0, 3.0), start, "DOP853", t_eval=t, rtol=1e-10, atol=1e-12
+        lambda t, x: independent_rate(name, governor, (0.25, 0.8), x),
+        (0, 3.0),
+        start,
+        "DOP853",
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
     )
     run = ij.simulate(scenario, duration=3.0, dt=2.5e-4, record_every=200)
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
@@ -57,18 +84,29 @@ def test_the_run_is_that_of_an_independent_program(name):
 @pytest.mark.parametrize("name", list(LAWS))
 def test_it_keeps_what_the_law_alone_breaks_from_random_starts(name):
     governor = controllers.ReferenceGovernor(law=LAWS[name])
-    perturbations = {"initial.q": ij.value(ij.uniform([0.3, 0.25], [0.8, 0.75])), "initial.dq": ij.value(ij.uniform(-0.3, 0.3))}
+    perturbations = {
+        "initial.q": ij.value(ij.uniform([0.3, 0.25], [0.8, 0.75])),
+        "initial.dq": ij.value(ij.uniform(-0.3, 0.3)),
+    }
     options = {"runs": 300, "duration": 3.0, "dt": 1e-3, "progress": False, "seed": 5}
-    alone, governed = (ij.monte_carlo(scenario_of(law), perturbations, **options) for law in (LAWS[name], governor))
+    alone, governed = (
+        ij.monte_carlo(scenario_of(law), perturbations, **options) for law in (LAWS[name], governor)
+    )
     scenario = scenario_of(governor)
 
     def inside(q, dq):  # V <= Gamma at the start
         g = governor.init(q, dq, scenario.setting).g
-        return governor.energy(q, dq, g, scenario.setting) <= governor.level(jnp.zeros(()), g, scenario.setting)
+        return governor.energy(q, dq, g, scenario.setting) <= governor.level(
+            jnp.zeros(()), g, scenario.setting
+        )
 
-    fine = np.asarray(jax.vmap(inside)(governed.samples["initial.q"], governed.samples["initial.dq"]))
+    fine = np.asarray(
+        jax.vmap(inside)(governed.samples["initial.q"], governed.samples["initial.dq"])
+    )
     assert np.sum(fine) > 100
-    assert np.all(np.asarray(governed.metrics["margin"])[fine] > 0.0199)  # the margin of 0.02 is kept, but for the steps
+    assert np.all(
+        np.asarray(governed.metrics["margin"])[fine] > 0.0199
+    )  # the margin of 0.02 is kept, but for the steps
     assert np.mean(np.min(np.asarray(alone.metrics["margin"])[fine], axis=1) < 0) > 0.3
 
 
@@ -76,7 +114,9 @@ def test_V_stays_below_Gamma():
     governor = controllers.ReferenceGovernor(law=LAWS["pd"])
     run = ij.simulate(scenario_of(governor), duration=3.0, dt=1e-3)
     setting = run.scenario.setting
-    V = jax.vmap(lambda q, dq, g: governor.energy(q, dq, g, setting))(run.q, run.dq, run.controller_state.g)
+    V = jax.vmap(lambda q, dq, g: governor.energy(q, dq, g, setting))(
+        run.q, run.dq, run.controller_state.g
+    )
     level = jax.vmap(lambda t, g: governor.level(t, g, setting))(run.t, run.controller_state.g)
     assert np.all(level * (1 + 1e-6) + 1e-12 >= V)
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 0.02  # and it gets there
@@ -97,16 +137,31 @@ def test_files_paths_and_gradients(tmp_path):
     assert {"controller.eta", "controller.Kp"} <= {p.path for p in ij.parameters(scenario)}
 
     def loss(eta):
-        run = ij.simulate(ij.with_parameters(scenario, {"controller.eta": eta}), duration=0.2, dt=1e-3, record_every=200)
+        run = ij.simulate(
+            ij.with_parameters(scenario, {"controller.eta": eta}),
+            duration=0.2,
+            dt=1e-3,
+            record_every=200,
+        )
         return jnp.sum(run.metrics.ise)
 
     found, h = jax.grad(loss)(40.0), 1e-3
-    assert float(found) == pytest.approx((float(loss(40.0 + h)) - float(loss(40.0 - h))) / (2 * h), rel=1e-5)
+    assert float(found) == pytest.approx(
+        (float(loss(40.0 + h)) - float(loss(40.0 - h))) / (2 * h), rel=1e-5
+    )
 
 
 def test_its_speed_is_tuned():
     scenario = scenario_of(controllers.ReferenceGovernor(law=LAWS["pd"], eta=2.0))
-    result = ij.tune(scenario, ["controller.eta"], ij.objectives.tracking(), duration=0.4, dt=2e-3, iterations=3, progress=False)
+    result = ij.tune(
+        scenario,
+        ["controller.eta"],
+        ij.objectives.tracking(),
+        duration=0.4,
+        dt=2e-3,
+        iterations=3,
+        progress=False,
+    )
     assert float(np.min(result.values["controller.eta"])) > 3.0  # a faster one tracks better
     assert result.nominal[1].metrics.ise.sum() < 0.95 * result.nominal[0].metrics.ise.sum()
 

@@ -1,4 +1,5 @@
-"""Regions for the tip and for joints' origins: watched under every law, kept by the safety filter, drawn, tuned, attacked."""
+"""Regions for the tip and for joints' origins: watched under every law, kept by the safety filter,
+drawn, tuned, attacked."""
 
 import itertools
 
@@ -23,22 +24,34 @@ REACH = regions.Sphere(centre=[0.1, 0.1], radius=0.46, keep="inside")
 
 
 def stepping(law=None, goal=(0.3, 0.9), **parts):
-    """PD that steps towards a reference whose tip is beyond the wall, and whose elbow is in the ball; no disturbance."""
+    """PD that steps towards a reference whose tip is beyond the wall, and whose elbow is in the
+    ball; no disturbance."""
     law = controllers.PDGravity(Kp=[30.0, 20.0], Kd=[2.0, 1.0]) if law is None else law
     walls = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(2.2))
     rest = ij.references.Sinusoid(offset=goal, amplitude=0.0)
-    made = {"controller": law, "reference": rest, "bounds": walls, "initial": ij.Initial([1.0, 1.3]), "regions": (WALL, BALL, REACH)}
+    made = {
+        "controller": law,
+        "reference": rest,
+        "bounds": walls,
+        "initial": ij.Initial([1.0, 1.3]),
+        "regions": (WALL, BALL, REACH),
+    }
     scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
     return ij.with_parts(scenario, **(made | {"disturbance": ij.disturbances.Nothing()} | parts))
 
 
 def filtered(scenario, **options):
-    return ij.with_parts(scenario, controller=controllers.SafetyFilter(law=scenario.controller, **options))
+    return ij.with_parts(
+        scenario, controller=controllers.SafetyFilter(law=scenario.controller, **options)
+    )
 
 
 @pytest.fixture(scope="module")
 def alone():
-    with pytest.warns(ij.SimulationWarning, match=r"a region was left\. regions\[\d\]: the \w+.* crossed its wall, at t = .* m\.$"):
+    with pytest.warns(
+        ij.SimulationWarning,
+        match=r"a region was left\. regions\[\d\]: the \w+.* crossed its wall, at t = .* m\.$",
+    ):
         return ij.simulate(stepping(), **RUN)
 
 
@@ -59,7 +72,10 @@ def points(q):
 def distances(q):
     elbow, tip = points(q)
     normal = np.array([-2.0, 0.2]) / np.hypot(2.0, 0.2)
-    ball, reach = np.linalg.norm(elbow - [0.40, 0.06]) - 0.1, 0.46 - np.linalg.norm(tip - [0.1, 0.1])
+    ball, reach = (
+        np.linalg.norm(elbow - [0.40, 0.06]) - 0.1,
+        0.46 - np.linalg.norm(tip - [0.1, 0.1]),
+    )
     return np.array([normal @ tip + 0.46, ball, reach])
 
 
@@ -70,16 +86,24 @@ def levels(q):
 
 
 def rates(q, v, h=1e-5):
-    """Slope of the levels (3, 2) and their second rate without accelerations (3,), by central differences of the fourth order."""
+    """Slope of the levels (3, 2) and their second rate without accelerations (3,), by central
+    differences of the fourth order."""
     w = np.array([1 / 12, -2 / 3, 2 / 3, -1 / 12]) / h
-    slope = np.stack([sum(c * levels(q + s * h * e) for c, s in zip(w, (-2, -1, 1, 2), strict=True)) for e in np.eye(2)], axis=1)
+    slope = np.stack(
+        [
+            sum(c * levels(q + s * h * e) for c, s in zip(w, (-2, -1, 1, 2), strict=True))
+            for e in np.eye(2)
+        ],
+        axis=1,
+    )
     k = 1e-3
     w2 = np.array([-1 / 12, 4 / 3, -5 / 2, 4 / 3, -1 / 12]) / k**2
     return slope, sum(c * levels(q + s * k * v) for c, s in zip(w2, (-2, -1, 0, 1, 2), strict=True))
 
 
 def least_change(G, h):
-    """The least x with G x <= h, of two numbers, by trying every set of active rows; None if there is none."""
+    """The least x with G x <= h, of two numbers, by trying every set of active rows; None if there
+    is none."""
     best = None
     for size in range(3):
         for active in itertools.combinations(range(len(h)), size):
@@ -87,7 +111,9 @@ def least_change(G, h):
             if size == 2 and abs(np.linalg.det(A)) < 1e-9 * np.prod(np.linalg.norm(A, axis=1)):
                 continue
             x = np.linalg.pinv(A) @ h[list(active)] if size else np.zeros(2)
-            if np.all(G @ x <= h + 1e-10 * (1 + np.abs(h))) and (best is None or x @ x < best @ best):
+            if np.all(G @ x <= h + 1e-10 * (1 + np.abs(h))) and (
+                best is None or x @ x < best @ best
+            ):
                 best = x
     return best
 
@@ -109,7 +135,9 @@ def test_the_torque_is_that_of_every_set_of_active_rows(rng):
     scenario, changed = filtered(stepping()), 0
     q, v = rng.uniform([0.8, 0.9], [1.2, 1.6], (60, 2)), rng.uniform(-1.5, 1.5, (60, 2))
     law, zero = scenario.controller, jnp.zeros(2)
-    found = jax.jit(jax.vmap(lambda q, v: law.command(zero[0], q, v, zero, scenario.setting, ())[0]))(q, v)
+    found = jax.jit(
+        jax.vmap(lambda q, v: law.command(zero[0], q, v, zero, scenario.setting, ())[0])
+    )(q, v)
     np.testing.assert_array_equal(found.slack, 0.0)
     np.testing.assert_array_equal(found.region_slack, 0.0)
     for k in range(len(q)):
@@ -123,11 +151,17 @@ def test_the_torque_is_that_of_every_set_of_active_rows(rng):
 def test_a_run_is_that_of_an_independent_program():
     def rate(_, x):
         M, C, G, _ = Loop().arm(x[:2])
-        return np.concatenate([x[2:], np.linalg.solve(M, filtered_torque(x[:2], x[2:])[1] - C(x[2:]) @ x[2:] - G)])
+        return np.concatenate(
+            [x[2:], np.linalg.solve(M, filtered_torque(x[:2], x[2:])[1] - C(x[2:]) @ x[2:] - G)]
+        )
 
     t = np.linspace(0.0, 1.0, 11)
-    found = solve_ivp(rate, (0.0, 1.0), [1.0, 1.3, 0.0, 0.0], "DOP853", t_eval=t, rtol=1e-8, atol=1e-10)
-    run = ij.simulate(filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400, backend="xla")
+    found = solve_ivp(
+        rate, (0.0, 1.0), [1.0, 1.3, 0.0, 0.0], "DOP853", t_eval=t, rtol=1e-8, atol=1e-10
+    )
+    run = ij.simulate(
+        filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400, backend="xla"
+    )
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
 
 
@@ -135,20 +169,26 @@ def test_a_run_is_that_of_an_independent_program():
 
 
 def test_margins_are_those_by_hand_and_what_the_status_says(alone):
-    np.testing.assert_allclose(alone.region_margin, [distances(q) for q in np.asarray(alone.q)], atol=1e-12)
+    np.testing.assert_allclose(
+        alone.region_margin, [distances(q) for q in np.asarray(alone.q)], atol=1e-12
+    )
     outside = np.asarray(alone.region_margin <= 0)
     first = int(np.flatnonzero(outside.any(axis=1))[0])
     assert ij.Status(int(alone.status)) & ij.status.FAILED == ij.Status.REGION_VIOLATED
     assert float(alone.metrics.first_region_violation_time) == pytest.approx(float(alone.t[first]))
     assert outside[first, int(alone.metrics.first_region_violation_region)]
-    np.testing.assert_allclose(alone.metrics.region_margin, alone.region_margin.min(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(
+        alone.metrics.region_margin, alone.region_margin.min(axis=0), rtol=1e-12
+    )
     assert np.sum(np.asarray(alone.metrics.region_margin) < -0.01) >= 2
 
 
 def test_the_loop_does_not_know(alone):
     free = ij.simulate(stepping(regions=()), **RUN)
     for name in ("q", "tau", "V"):
-        np.testing.assert_allclose(getattr(free, name), getattr(alone, name), rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(
+            getattr(free, name), getattr(alone, name), rtol=1e-12, atol=1e-13
+        )
     assert free.region_margin == () and "region_margin" not in free.metrics
 
 
@@ -171,10 +211,13 @@ def test_too_little_torque_breaks_them_and_says_by_how_much():
     at = scenario.setting.regions_along(run.q[1], run.dq[1])
     model, law = scenario.model, scenario.controller
     ddq = np.linalg.solve(
-        model.mass_matrix(run.q[1]), run.tau[1] - model.coriolis(run.q[1], run.dq[1], run.dq[1]) - model.gravity(run.q[1])
+        model.mass_matrix(run.q[1]),
+        run.tau[1] - model.coriolis(run.q[1], run.dq[1], run.dq[1]) - model.gravity(run.q[1]),
     )
     broken = -(at.slope @ ddq + at.bend + (law.b1 + law.b2) * at.rate + law.b1 * law.b2 * at.level)
-    np.testing.assert_allclose(run.region_slack[1], np.maximum(broken, 0.0), atol=1e-5 * np.max(np.abs(broken)))
+    np.testing.assert_allclose(
+        run.region_slack[1], np.maximum(broken, 0.0), atol=1e-5 * np.max(np.abs(broken))
+    )
 
 
 def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path):
@@ -191,13 +234,17 @@ def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path)
     for q, v, a in rng.uniform(-1.5, 1.5, (5, 3, robot.n)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(position_of(robot, "wrist", q), data.joint("wrist").xanchor, atol=1e-12)
+        np.testing.assert_allclose(
+            position_of(robot, "wrist", q), data.joint("wrist").xanchor, atol=1e-12
+        )
         np.testing.assert_allclose(position_of(robot, "tip", q), data.site("tip").xpos, atol=1e-12)
         h = 1e-4
         moved = [moving(q + s * v + 0.5 * s**2 * a, v).level for s in (-h, 0.0, h)]
         at = moving(q, v)
         np.testing.assert_allclose(at.rate, (moved[2] - moved[0]) / (2 * h), atol=1e-6)
-        np.testing.assert_allclose(at.slope @ a + at.bend, (moved[2] - 2 * moved[1] + moved[0]) / h**2, atol=1e-5)
+        np.testing.assert_allclose(
+            at.slope @ a + at.bend, (moved[2] - 2 * moved[1] + moved[0]) / h**2, atol=1e-5
+        )
     assert in_words(parts[1], robot) == "the origin of wrist"
 
 
@@ -209,7 +256,8 @@ MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="base"
 
 @pytest.mark.slow
 def test_a_run_in_space_by_the_kernels():
-    """A wall for the tip of an arm that is thrown at it, and what a batch says of it on two backends."""
+    """A wall for the tip of an arm that is thrown at it, and what a batch says of it on two
+    backends."""
     robot = random_arm(2, seed=1, armature=0.1)
     start = position_of(robot, "tip", jnp.full(2, 0.5))
     wall = regions.HalfSpace(normal=[0.0, 0.0, 1.0], offset=float(start[2]) - 0.02)
@@ -217,13 +265,17 @@ def test_a_run_in_space_by_the_kernels():
         plant=robot,
         reference=ij.references.Sinusoid(offset=[0.5] * 2, amplitude=0.0),
         bounds=bounds.Bounds(lower=bounds.Constant(-3.0), upper=bounds.Constant(3.0)),
-        controller=controllers.SafetyFilter(law=controllers.PDGravity(Kp=1.0, Kd=0.1), nearest="acceleration"),
+        controller=controllers.SafetyFilter(
+            law=controllers.PDGravity(Kp=1.0, Kd=0.1), nearest="acceleration"
+        ),
         initial=ij.Initial([0.5] * 2, [0.4, -0.8]),
         regions=(wall,),
     )
     options = {"runs": 3, "duration": 0.1, "dt": 1e-3, "method": "euler", "progress": False}
     perturbations = {"regions[0].offset": ij.offset(ij.uniform(-0.01, 0.0))}
-    found, again = (ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "vmap"))
+    found, again = (
+        ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "vmap")
+    )
     for name in ("region_margin", "largest_slack", "peak_torque"):
         np.testing.assert_allclose(found.metrics[name], again.metrics[name], rtol=1e-7, atol=1e-9)
     assert found.metrics.region_margin.shape == (3, 1)
@@ -235,20 +287,43 @@ def test_a_run_in_space_by_the_kernels():
 
 def test_derivatives_by_the_region_and_the_rates():
     def worst(offset, b1):
-        scenario = ij.with_parameters(filtered(stepping(regions=(WALL, BALL))), {"regions[0].offset": offset, "controller.b1": b1})
-        run = ij.simulate(scenario, duration=0.4, dt=2e-3, record_every=200, method="euler", metrics=(metrics.RegionMargin(),))
+        scenario = ij.with_parameters(
+            filtered(stepping(regions=(WALL, BALL))),
+            {"regions[0].offset": offset, "controller.b1": b1},
+        )
+        run = ij.simulate(
+            scenario,
+            duration=0.4,
+            dt=2e-3,
+            record_every=200,
+            method="euler",
+            metrics=(metrics.RegionMargin(),),
+        )
         return jnp.min(run.metrics.region_margin)
 
     point, h = (-0.46, 10.0), 1e-5
     found = jax.jvp(worst, point, (1.0, 20.0))[1]
-    difference = (worst(point[0] + h, point[1] + 20 * h) - worst(point[0] - h, point[1] - 20 * h)) / (2 * h)
+    difference = (
+        worst(point[0] + h, point[1] + 20 * h) - worst(point[0] - h, point[1] - 20 * h)
+    ) / (2 * h)
     assert abs(float(found)) > 1e-3
     assert float(found) == pytest.approx(float(difference), rel=1e-4)
 
 
 def test_a_requirement_on_regions_and_an_attack_on_them():
-    scenario, short = stepping(goal=(0.5, 0.9), regions=(BALL, WALL)), {"duration": 0.4, "dt": 2e-3, "progress": False}
-    objective = ij.objectives.tracking() + 0.1 * ij.objectives.effort() + ij.objectives.region_margin_above(0.01)
+    scenario, short = (
+        stepping(goal=(0.5, 0.9), regions=(BALL, WALL)),
+        {
+            "duration": 0.4,
+            "dt": 2e-3,
+            "progress": False,
+        },
+    )
+    objective = (
+        ij.objectives.tracking()
+        + 0.1 * ij.objectives.effort()
+        + ij.objectives.region_margin_above(0.01)
+    )
     result = ij.tune(scenario, ["controller.Kd"], objective, **short, iterations=8)
     line = result.report.verdicts[0]
     assert (line.name, line.unit, line.verdict) == ("region margin > 0.01 m", "m", "pass")
@@ -267,8 +342,22 @@ def test_a_requirement_on_regions_and_an_attack_on_them():
 
 def test_starts_beyond_a_wall_are_told_from_violations():
     scenario = stepping(goal=(1.0, 1.3), regions=(regions.HalfSpace([1.0, 0.0], -0.1),))
-    study = ij.monte_carlo(scenario, {"initial.q": ij.offset(ij.uniform(-0.3, 0.3))}, runs=32, duration=0.1, dt=1e-3, progress=False)
-    outside = np.asarray(jax.vmap(lambda q: margins(scenario.regions, scenario.plant, q))(study.samples["initial.q"]))[:, 0] <= 0
+    study = ij.monte_carlo(
+        scenario,
+        {"initial.q": ij.offset(ij.uniform(-0.3, 0.3))},
+        runs=32,
+        duration=0.1,
+        dt=1e-3,
+        progress=False,
+    )
+    outside = (
+        np.asarray(
+            jax.vmap(lambda q: margins(scenario.regions, scenario.plant, q))(
+                study.samples["initial.q"]
+            )
+        )[:, 0]
+        <= 0
+    )
     assert 0 < np.sum(outside) < 32
     np.testing.assert_array_equal(study.started_outside, outside)
     assert study.violation_probability.count >= np.sum(outside)
@@ -282,7 +371,9 @@ def test_files_and_datasets_hold_them(tmp_path, alone):
     again = load_scenario(tmp_path / "s.toml")
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
     jax.tree.map(np.testing.assert_array_equal, again, scenario)
-    assert "[[regions]]" in scenario_to_toml(scenario) and "regions" not in scenario_to_toml(stepping(regions=()))
+    assert "[[regions]]" in scenario_to_toml(scenario) and "regions" not in scenario_to_toml(
+        stepping(regions=())
+    )
     assert "radius = 0.1  # m" in scenario_to_toml(scenario)
     assert {"regions[1].centre", "controller.b2"} <= {p.path for p in ij.parameters(scenario)}
     data = alone.to_xarray()
@@ -296,7 +387,11 @@ def test_figures(alone, kept):
     drawn = plotting.workspace({"alone": alone, "filtered": kept}).axes[0]
     tip = next(x for x in drawn.get_lines() if x.get_label() == "filtered").get_xydata()
     np.testing.assert_allclose(tip[-1], points(np.asarray(kept.q[-1]))[1])
-    assert {x.get_label() for x in drawn.get_lines()} >= {"wall of the tip", "wall of the origin of joint 1", "reference"}
+    assert {x.get_label() for x in drawn.get_lines()} >= {
+        "wall of the tip",
+        "wall of the origin of joint 1",
+        "reference",
+    }
     line = next(x for x in figure.axes[0].get_lines() if x.get_label() == "alone")
     np.testing.assert_allclose(line.get_ydata()[-1], alone.region_margin[-1, 0])
 

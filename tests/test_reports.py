@@ -27,7 +27,9 @@ def results():
         "Study": ij.monte_carlo(scenario, drawn, runs=16, progress=False, **SHORT),
         "Certificate": ij.certify(scenario, **SHORT),
         "Comparison": ij.compare(scenario, ["integral", "log"], **SHORT),
-        "TuneResult": ij.tune(scenario, ["controller.K2"], ij.objectives.tracking() + ij.objectives.effort(), **SHORT),
+        "TuneResult": ij.tune(
+            scenario, ["controller.K2"], ij.objectives.tracking() + ij.objectives.effort(), **SHORT
+        ),
     }
 
 
@@ -62,7 +64,9 @@ def test_a_page_needs_nothing_else(results, kind, tmp_path):
     assert f"iblf_jax {ij.__version__}" in text and f"jax {jax.__version__}" in text
     for words in SAYS[kind]:
         assert words in text, words
-    assert ("[controller]" in text) == (kind != "Certificate"), "the scenario as a file, of what keeps it"
+    assert ("[controller]" in text) == (kind != "Certificate"), (
+        "the scenario as a file, of what keeps it"
+    )
     assert ("factor uniform, low 0.8, high 1.25, shared" in text) == (kind == "Study")
 
 
@@ -85,16 +89,36 @@ def test_a_title_does_not_repeat_the_name_of_the_class(results):
     study = reports.shown(results["Study"])
     assert study.title == "Monte-Carlo study"
     assert study.words[0].startswith("16 runs of 0.2 s, dt = 0.002 s, seed 0")
-    assert reports.shown(results["Comparison"]).words == ["2 laws, 0.2 s, dt = 0.002 s, rk4; worst joint"]
+    assert reports.shown(results["Comparison"]).words == [
+        "2 laws, 0.2 s, dt = 0.002 s, rk4; worst joint"
+    ]
 
 
 def made_up_report(violated: int, verdicts: list[str], seed: int | None = 3) -> Report:
     def of(count):
         return probability(np.arange(100) < count, np.ones(100, bool), 0.95, "independent", 1)
 
-    made = [Verdict(f"{verdict} one", 0.1, of(0), of(20 if verdict == "fail" else 0), verdict) for verdict in verdicts]
-    changes = (Change("objective (mean)", 1.0, 0.5, -0.6, -0.4), Change("rmse (mean)", 1.0, 0.5, -0.6, -0.4))
-    return Report(100, seed, 0.95, changes, tuple(made), (of(3), of(violated)), (0.1, -0.2), ((1.0,), (2.0,)), (), "half", ("stopped",))
+    made = [
+        Verdict(f"{verdict} one", 0.1, of(0), of(20 if verdict == "fail" else 0), verdict)
+        for verdict in verdicts
+    ]
+    changes = (
+        Change("objective (mean)", 1.0, 0.5, -0.6, -0.4),
+        Change("rmse (mean)", 1.0, 0.5, -0.6, -0.4),
+    )
+    return Report(
+        100,
+        seed,
+        0.95,
+        changes,
+        tuple(made),
+        (of(3), of(violated)),
+        (0.1, -0.2),
+        ((1.0,), (2.0,)),
+        (),
+        "half",
+        ("stopped",),
+    )
 
 
 @pytest.mark.parametrize("seed", [3, None])
@@ -106,7 +130,16 @@ def test_the_tuning_report_begins_with_bounds_then_requirements_then_the_objecti
     assert rows[1].strip() == "smallest margin: 0.1 -> -0.2 rad"
     kinds = [row.split()[1] for row in rows if row.strip().startswith("requirement")]
     assert kinds == ["fail", "undecided", "pass", "pass"]
-    order = ["bounds violated", "requirement fail", "requirement pass", "objective (mean)", "rmse (mean)", "peak torque", "half", "stopped"]
+    order = [
+        "bounds violated",
+        "requirement fail",
+        "requirement pass",
+        "objective (mean)",
+        "rmse (mean)",
+        "peak torque",
+        "half",
+        "stopped",
+    ]
     places = [text.index(words) for words in order]
     assert places == sorted(places)
     assert "not kept" not in str(made_up_report(0, ["pass"], seed))

@@ -1,4 +1,5 @@
-"""Published examples: their scenario files run, do what their pages say, and agree with programs written here without the package."""
+"""Published examples: their scenario files run, do what their pages say, and agree with programs
+written here without the package."""
 
 from __future__ import annotations
 
@@ -33,10 +34,19 @@ def test_each_has_a_page_a_source_and_its_command():
     assert len(NAMES) >= 5
     for name in NAMES:
         text = (FOLDER / f"{name}.toml").read_text(encoding="utf-8")
-        assert text.splitlines()[0].endswith(f": python -m iblf_jax simulate examples/reproductions/{name}.toml")
+        assert text.splitlines()[0].endswith(
+            f": python -m iblf_jax simulate examples/reproductions/{name}.toml"
+        )
         page = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
-        assert all(words in page for words in ("| printed | value | where |", "**Not printed", "**Not reproduced:**"))
-        assert set(load_scenario_file(FOLDER / f"{name}.toml").run) == {"duration", "dt", "record_every"}
+        assert all(
+            words in page
+            for words in ("| printed | value | where |", "**Not printed", "**Not reproduced:**")
+        )
+        assert set(load_scenario_file(FOLDER / f"{name}.toml").run) == {
+            "duration",
+            "dt",
+            "record_every",
+        }
 
 
 @pytest.mark.slow
@@ -52,16 +62,29 @@ def dimanidis(run):
     assert run.status == 0
     for joint, limit in ((0, 1e-3), (1, 3e-3)):
         _, t, e1 = published("dimanidis_2018")[published("dimanidis_2018")[:, 0] == joint].T
-        assert np.abs(np.interp(t, run.t, run.e1[:, joint]) - e1).max() < limit < 0.01 * np.abs(e1).max()
+        assert (
+            np.abs(np.interp(t, run.t, run.e1[:, joint]) - e1).max()
+            < limit
+            < 0.01 * np.abs(e1).max()
+        )
     assert np.abs(run.e1[run.t > 6.0]).max() < np.pi / 180
 
 
 def shaw_cortez(run):
-    assert int(run.status) == int(ij.Status.TORQUE_SATURATED)  # the law asks for more than the filter gives
-    assert np.min(run.metrics.margin) > 0 and np.abs(run.dq).max() < 1.5 and np.all(np.abs(run.tau).max(axis=0) < [18.0, 10.0])
+    assert int(run.status) == int(
+        ij.Status.TORQUE_SATURATED
+    )  # the law asks for more than the filter gives
+    assert (
+        np.min(run.metrics.margin) > 0
+        and np.abs(run.dq).max() < 1.5
+        and np.all(np.abs(run.tau).max(axis=0) < [18.0, 10.0])
+    )
     kept = published("shaw_cortez_2022")
     for columns, limit in (((1, 2), 6e-3), ((3, 4), 1e-4)):
-        off = [np.abs(np.interp(kept[:, 0], run.t, run.q[:, i]) - kept[:, column]).max() for i, column in enumerate(columns)]
+        off = [
+            np.abs(np.interp(kept[:, 0], run.t, run.q[:, i]) - kept[:, column]).max()
+            for i, column in enumerate(columns)
+        ]
         assert max(off) < limit
     # The reference leaves the bounds, and is no fault of a filter's run.
     assert np.any(run.q_d > run.scenario.bounds.upper.value)
@@ -71,16 +94,22 @@ def zhang(run):
     assert run.status == 0
     late = np.flatnonzero(run.t < 6.99)[-1]
     M = np.asarray(run.scenario.plant.mass_matrix(run.q[late]))
-    np.testing.assert_allclose(run.e1[late], np.linalg.solve(M, [0.15, 0.18, 0.12]) / 1500, rtol=0.03)
+    np.testing.assert_allclose(
+        run.e1[late], np.linalg.solve(M, [0.15, 0.18, 0.12]) / 1500, rtol=0.03
+    )
     assert np.abs(run.e1[run.t < 6.0]).max() < 1e-8
 
 
 def mahmud(run):
     assert run.status == 0
-    np.testing.assert_allclose(run.metrics.margin, 2.0, atol=1e-9)  # at the start, in a corner of the box
+    np.testing.assert_allclose(
+        run.metrics.margin, 2.0, atol=1e-9
+    )  # at the start, in a corner of the box
     np.testing.assert_allclose(run.metrics.velocity_margin, 2.0, atol=1e-9)
     assert np.abs(run.q[run.t > 6.0]).max() < 0.05
-    np.testing.assert_allclose(run.scenario.plant.mass_matrix(np.zeros(2)), [[3.957, 0.438], [0.438, 0.196]], rtol=1e-9)
+    np.testing.assert_allclose(
+        run.scenario.plant.mass_matrix(np.zeros(2)), [[3.957, 0.438], [0.438, 0.196]], rtol=1e-9
+    )
 
 
 def cruz_ancona(run):
@@ -135,7 +164,9 @@ def dimanidis_alone(t, x):
     e = q - np.pi / 2 - np.pi / 6 * np.array([np.sin(t), -np.cos(t)])
     de = v - np.pi / 6 * np.array([np.cos(t), np.sin(t)])
     d = np.array([3 * np.sin(t), 2 * np.cos(t)]) - v
-    return np.concatenate([v, np.linalg.solve(M, performance_torque(t, de + 2 * e, 6.0, 30.0, 0.035, 1.5) + d - rest)])
+    return np.concatenate(
+        [v, np.linalg.solve(M, performance_torque(t, de + 2 * e, 6.0, 30.0, 0.035, 1.5) + d - rest)]
+    )
 
 
 def cruz_ancona_alone(t, x):
@@ -149,13 +180,16 @@ def cruz_ancona_alone(t, x):
 
 
 def nearest(u, G, h):
-    """The x of least |x - u| with G x <= h, for two numbers: by its active conditions, none, one or two."""
+    """The x of least |x - u| with G x <= h, for two numbers: by its active conditions, none, one or
+    two."""
     for count in range(3):
         for active in itertools.combinations(range(len(h)), count):
             A = G[list(active)]
             if np.linalg.matrix_rank(A) < count:
                 continue
-            multipliers = np.linalg.solve(A @ A.T, A @ u - h[list(active)]) if count else np.zeros(0)
+            multipliers = (
+                np.linalg.solve(A @ A.T, A @ u - h[list(active)]) if count else np.zeros(0)
+            )
             x = u - A.T @ multipliers
             if np.all(multipliers >= 0) and np.all(G @ x <= h + 1e-9 * (1 + np.abs(h))):
                 return x
@@ -166,7 +200,11 @@ def shaw_cortez_alone(t, x):
     q, v = x[:2], x[2:]
     M, rest = two_links((1.0, 1.0), (1.0, 1.0), (0.5, 0.5), (1 / 12 + 0.5, 1 / 12), 0.0)(q, v)
     amplitude, w = np.array([np.pi / 2 + 1.9, np.pi / 6 + 2.1]), 1.3
-    r, dr, ddr = amplitude * np.sin(w * t) + [0, 2 * np.pi / 3], amplitude * w * np.cos(w * t), -amplitude * w**2 * np.sin(w * t)
+    r, dr, ddr = (
+        amplitude * np.sin(w * t) + [0, 2 * np.pi / 3],
+        amplitude * w * np.cos(w * t),
+        -amplitude * w**2 * np.sin(w * t),
+    )
     u = M @ (ddr - 5 * (v - dr) - 5 * (q - r)) + rest
     gamma, nu, eta, inverse = 0.8906, 10.0, 0.5, np.linalg.inv(M)
     drift, rows, room = -inverse @ rest, [], []
@@ -176,7 +214,9 @@ def shaw_cortez_alone(t, x):
         rows.append(sign * inverse)
         room.append(gamma * dh / (1 + h**2) + nu * z**3 - eta - sign * drift)
     limits = np.array([18.0, 10.0])
-    tau = nearest(u, np.concatenate([*rows, np.eye(2), -np.eye(2)]), np.concatenate([*room, limits, limits]))
+    tau = nearest(
+        u, np.concatenate([*rows, np.eye(2), -np.eye(2)]), np.concatenate([*room, limits, limits])
+    )
     return np.concatenate([v, np.linalg.solve(M, tau - rest - 0.001 * v)])
 
 
@@ -194,7 +234,11 @@ def zhang_alone(t, x):
         (inner + middle) * a**2 - outer * c * (2 * a + 2 * b + c),
         middle * a**2 + outer * (a + b) ** 2,
     ])  # fmt: skip
-    r, dr, ddr = gain * (np.cos(w * t + 1) + 1), -gain * w * np.sin(w * t + 1), -gain * w**2 * np.cos(w * t + 1)
+    r, dr, ddr = (
+        gain * (np.cos(w * t + 1) + 1),
+        -gain * w * np.sin(w * t + 1),
+        -gain * w**2 * np.cos(w * t + 1),
+    )
     tau = M @ (ddr - 48 * (v - dr) - 1500 * (q - r)) + N
     push = np.array([0.15, 0.18, 0.12]) if t >= 6.0 else 0.0
     return np.concatenate([v, np.linalg.solve(M, tau + push - N)])
@@ -206,7 +250,8 @@ ALONE = {
     "shaw_cortez_2022": (shaw_cortez_alone, 0.0, 4.5),
     "zhang_2022": (zhang_alone, 6.0, 6.9),
 }
-"""Name -> the rate of (q, q') by hand, and from when to when it is held against the file's run: between jumps of the disturbance."""
+"""Name -> the rate of (q, q') by hand, and from when to when it is held against the file's run:
+between jumps of the disturbance."""
 
 
 @pytest.mark.slow
@@ -218,6 +263,14 @@ def test_a_program_of_the_printed_numbers_gives_the_same_motion(name):
     inside = (t >= start - 1e-9) & (t < end)
     assert start > 0 or np.all(states[inside][0] == states[0])
     # A filter's torque has kinks, where a method of a high order gains nothing and loses nothing.
-    found = solve_ivp(rate, (t[inside][0], end), states[inside][0], "DOP853", t_eval=t[inside], rtol=1e-9, atol=1e-11).y.T
+    found = solve_ivp(
+        rate,
+        (t[inside][0], end),
+        states[inside][0],
+        "DOP853",
+        t_eval=t[inside],
+        rtol=1e-9,
+        atol=1e-11,
+    ).y.T
     n = run.n
     assert np.abs(found - states[inside])[:, :n].max() < 1e-7

@@ -58,9 +58,17 @@ def test_what_the_file_leaves_out_follows_from_the_arm(folder):
 
 def test_what_it_says_counts(folder):
     text = (
-        ROBOT + REFERENCE + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n[initial]\nq = [0.1, -1, 1.4, -1.2, -1.5, 0.2]\n'
+        ROBOT
+        + REFERENCE
+        + '[controller]\nkind = "computed_torque"\nKp = 30.0\nKd = 11.0\n[initial]\nq = [0.1, -1,'
+        " 1.4, -1.2, -1.5, 0.2]\n"
     )
-    scenario = ij.load_scenario(written(folder, text + '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n'))
+    scenario = ij.load_scenario(
+        written(
+            folder,
+            text + '[parameters]\n"plant.payload" = 2.0\n"plant.link[forearm_link].mass" = 3.0\n',
+        )
+    )
     assert scenario.controller.law.Kp[3] == 30.0
     assert scenario.initial.q[0] == 0.1
     assert (float(scenario.plant.payload), float(scenario.model.payload)) == (2.0, 0.0)
@@ -68,7 +76,9 @@ def test_what_it_says_counts(folder):
 
 
 def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
-    (folder / "believed.urdf").write_text((folder / "ur5.urdf").read_text().replace('<mass value="2.275" />', '<mass value="2.0" />'))
+    (folder / "believed.urdf").write_text(
+        (folder / "ur5.urdf").read_text().replace('<mass value="2.275" />', '<mass value="2.0" />')
+    )
     both = '[plant]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
     both += '[model]\nfile = "believed.urdf"\ntip = "tool0"\nlocked = { wrist_3_joint = 0.3 }\n'
     reference = REFERENCE.replace(", 0.0]", "]")
@@ -83,14 +93,29 @@ def test_saved_it_needs_no_other_file(folder):
     ij.save_scenario(scenario, folder / "saved.toml")
     again = ij.load_scenario(folder / "saved.toml")
     assert jax.tree.structure(again) == jax.tree.structure(scenario)
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(scenario), strict=True)
+    )
     assert "urdf" not in (folder / "saved.toml").read_text()
 
 
 @pytest.mark.slow
 def test_simulate_from_the_command_line(folder, capsys):
     path = written(folder, ROBOT + REFERENCE + RUN)
-    assert main(["simulate", str(path), "--set", "plant.link[wrist_1_link].mass=1.3", "--out", str(folder / "out")]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                str(path),
+                "--set",
+                "plant.link[wrist_1_link].mass=1.3",
+                "--out",
+                str(folder / "out"),
+            ]
+        )
+        == 0
+    )
     assert "status: ok" in capsys.readouterr().out
     saved = ij.load_scenario(folder / "out" / "scenario.toml")
     assert float(saved.plant.mass[3]) == 1.3
@@ -99,12 +124,27 @@ def test_simulate_from_the_command_line(folder, capsys):
 
 
 def test_studies_and_tuning_read_it_too(folder):
-    study = ROBOT + REFERENCE + RUN + '[perturbations]\n"plant.link[forearm_link].mass" = { factor = "uniform", low = 0.8, high = 1.2 }\n'
+    study = (
+        ROBOT
+        + REFERENCE
+        + RUN
+        + '[perturbations]\n"plant.link[forearm_link].mass" = { factor = "uniform", low = 0.8, high'
+        " = 1.2 }\n"
+    )
     path = written(folder, study + "[study]\nruns = 4\n")
     assert list(load_study_file(path, "study").perturbations) == ["plant.link[forearm_link].mass"]
-    path = written(folder, ROBOT + REFERENCE + RUN + '[sweep]\n[grid]\n"plant.link[forearm_link].mass" = [2.0, 3.0]\n')
+    path = written(
+        folder,
+        ROBOT + REFERENCE + RUN + '[sweep]\n[grid]\n"plant.link[forearm_link].mass" = [2.0, 3.0]\n',
+    )
     assert list(load_study_file(path, "sweep").grid) == ["plant.link[forearm_link].mass"]
-    path = written(folder, ROBOT + REFERENCE + RUN + '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n')
+    path = written(
+        folder,
+        ROBOT
+        + REFERENCE
+        + RUN
+        + '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n',
+    )
     assert load_tuning_file(path)["scenario"].n == 6
 
 
@@ -115,7 +155,10 @@ def test_studies_and_tuning_read_it_too(folder):
         ('[robot]\nfile = "ur5.urdf"\ntip = "hand"\n', r"robot\.file: tip: got 'hand'"),
         ('[robot]\nfile = "ur5.urdf"\nmass = 2.0\n', r"robot\.mass: got an unknown key"),
         ("[robot]\nfile = 3\n", r"robot\.file: got 3, expected a string"),
-        ('[robot]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { elbow = 0.1 }\n', r"robot\.file: .*elbow"),
+        (
+            '[robot]\nfile = "ur5.urdf"\ntip = "tool0"\nlocked = { elbow = 0.1 }\n',
+            r"robot\.file: .*elbow",
+        ),
         (ROBOT + '[plant]\nfile = "ur5.urdf"\n', "beside"),
         ('[model]\nfile = "ur5.urdf"\n', "plant: got nothing"),
     ],

@@ -1,4 +1,5 @@
-"""Robots against independent sources: the closed form, kinetic energy from positions, energy balance, the identities of C."""
+"""Robots against independent sources: the closed form, kinetic energy from positions, energy
+balance, the identities of C."""
 
 from __future__ import annotations
 
@@ -15,7 +16,13 @@ from iblf_jax.simulation import integrators
 def random_links(n, rng):
     mass, length = rng.uniform(0.5, 2, n), rng.uniform(0.2, 0.5, n)
     inertia = mass * length**2 / 12
-    return {"mass": mass, "length": length, "centre": length * rng.uniform(0.3, 0.7, n), "inertia": inertia, "payload": rng.uniform(0, 1)}
+    return {
+        "mass": mass,
+        "length": length,
+        "centre": length * rng.uniform(0.3, 0.7, n),
+        "inertia": inertia,
+        "payload": rng.uniform(0, 1),
+    }
 
 
 @jax.jit
@@ -36,7 +43,11 @@ def test_chain_of_two_is_the_closed_form(seed):
     rng = np.random.default_rng(seed)
     links = random_links(2, rng)
     q, v, u = rng.uniform(-3, 3, (3, 2))
-    for a, b in zip(everything(PlanarChain(**links), q, v, u), everything(TwoLink(**links), q, v, u), strict=True):
+    for a, b in zip(
+        everything(PlanarChain(**links), q, v, u),
+        everything(TwoLink(**links), q, v, u),
+        strict=True,
+    ):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
@@ -66,7 +77,8 @@ def test_closed_form_is_skew_too(rng):
 
 @pytest.mark.parametrize("n", [2, 4])
 def test_kinetic_and_potential_energy_from_positions(n, rng):
-    """1/2 q'^T M q' = sum 1/2 m |velocity of the centre|^2 + 1/2 I omega^2, from where the centres are."""
+    """1/2 q'^T M q' = sum 1/2 m |velocity of the centre|^2 + 1/2 I omega^2, from where the centres
+    are."""
     links = random_links(n, rng)
     robot = PlanarChain(**links)
     q, v = rng.uniform(-3, 3, (2, n))
@@ -90,7 +102,8 @@ def test_lumped_parameters_of_the_customary_arm():
 
 
 def test_energy_of_a_falling_arm_is_kept_and_friction_takes_it(rng):
-    """No torque: dE/dt = 0 along the motion, and with viscous friction dE/dt = -viscous |q'|^2, by RK4 over a second."""
+    """No torque: dE/dt = 0 along the motion, and with viscous friction dE/dt = -viscous |q'|^2, by
+    RK4 over a second."""
     robot = TwoLink(**random_links(2, rng))
 
     @jax.jit
@@ -101,7 +114,10 @@ def test_energy_of_a_falling_arm_is_kept_and_friction_takes_it(rng):
             return v, jnp.linalg.solve(robot.mass_matrix(q), force), viscous * v @ v
 
         def one(x, i):
-            return integrators.step("rk4", lambda t, x: (slope(t, x), None), i * 1e-3, x, 1e-3).state, None
+            return (
+                integrators.step("rk4", lambda t, x: (slope(t, x), None), i * 1e-3, x, 1e-3).state,
+                None,
+            )
 
         x0 = (jnp.asarray([0.3, -0.4]), jnp.asarray([0.5, 1.0]), jnp.zeros(()))
         x1, _ = jax.lax.scan(one, x0, jnp.arange(1000.0))
@@ -120,8 +136,12 @@ def test_payload_hangs_at_the_tip(rng):
     empty, loaded = PlanarChain(**links), PlanarChain(**(links | {"payload": 0.6}))
     q = jnp.asarray(rng.uniform(-3, 3, 3))
     J = np.asarray(empty.jacobian(q))
-    np.testing.assert_allclose(loaded.mass_matrix(q) - empty.mass_matrix(q), 0.6 * J.T @ J, atol=1e-12)
-    np.testing.assert_allclose(loaded.gravity(q) - empty.gravity(q), J.T @ [0, 0.6 * 9.81], atol=1e-12)
+    np.testing.assert_allclose(
+        loaded.mass_matrix(q) - empty.mass_matrix(q), 0.6 * J.T @ J, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        loaded.gravity(q) - empty.gravity(q), J.T @ [0, 0.6 * 9.81], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])

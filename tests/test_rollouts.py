@@ -24,7 +24,12 @@ from iblf_jax.files import scenario as scenario_file
 @pytest.fixture(scope="module")
 def batch(paper) -> ij.Rollout:
     def one(gain):
-        return ij.simulate(ij.with_parameters(paper, {"controller.K2": gain}), duration=0.1, record_every=5, method="euler")
+        return ij.simulate(
+            ij.with_parameters(paper, {"controller.K2": gain}),
+            duration=0.1,
+            record_every=5,
+            method="euler",
+        )
 
     return jax.vmap(one)(jnp.array([10.0, 20.0, 30.0]))
 
@@ -41,7 +46,9 @@ def test_one_run(short_run):
         assert variable.attrs["units"]
         assert variable.attrs["description"]
     np.testing.assert_array_equal(data.observer_state, short_run.observer_state)
-    assert data.sel(joint=1, time=0.1, method="nearest").q.item() == pytest.approx(float(short_run.q[100, 1]))
+    assert data.sel(joint=1, time=0.1, method="nearest").q.item() == pytest.approx(
+        float(short_run.q[100, 1])
+    )
 
 
 def test_the_run_can_be_done_again_from_its_attributes(short_run):
@@ -70,10 +77,14 @@ def test_a_batch(batch):
 @pytest.mark.slow
 def test_batches_of_batches_and_of_different_steps(paper):
     def one(gain, dt):
-        run = ij.simulate(ij.with_parameters(paper, {"controller.K2": gain}), duration=0.01, method="euler")
+        run = ij.simulate(
+            ij.with_parameters(paper, {"controller.K2": gain}), duration=0.01, method="euler"
+        )
         return run, run.t * dt
 
-    runs, t = jax.vmap(jax.vmap(one, (0, None)), (None, 0))(jnp.array([10.0, 20.0]), jnp.array([1.0, 2.0, 3.0]))
+    runs, t = jax.vmap(jax.vmap(one, (0, None)), (None, 0))(
+        jnp.array([10.0, 20.0]), jnp.array([1.0, 2.0, 3.0])
+    )
     assert runs.to_xarray().q.dims == ("run_0", "run_1", "time", "joint")
     data = dataclasses.replace(runs, t=t).to_xarray()
     assert data.t.dims == ("run_0", "run_1", "time")
@@ -128,7 +139,9 @@ def test_a_users_law_is_kept_by_its_parameters(short_run):
         def command(self, t, q, dq, f_hat, setting, state):
             raise NotImplementedError
 
-    run = dataclasses.replace(short_run, scenario=dataclasses.replace(short_run.scenario, controller=Mine(2.0)))
+    run = dataclasses.replace(
+        short_run, scenario=dataclasses.replace(short_run.scenario, controller=Mine(2.0))
+    )
     attributes = run.to_xarray().attrs
     assert "scenario" not in attributes
     assert "Mine" in attributes["scenario_not_saved"]
@@ -149,7 +162,10 @@ def test_bad_arguments(short_run, tmp_path):
     with pytest.raises(ValueError, match="expected a Rollout"):
         ij.save_rollouts({"a": 3}, tmp_path / "a.nc")  # type: ignore[dict-item]
     for runs in (short_run, {"a": short_run}):
-        with pytest.raises(ValueError, match=r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)"):
+        with pytest.raises(
+            ValueError,
+            match=r"path: got \w+, expected a path, after the runs.*save_rollouts\(runs, path\)",
+        ):
             ij.save_rollouts(tmp_path / "a.nc", runs)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="jit"):
         jax.jit(lambda run: rollouts.rollout_to_xarray(run) and 0)(short_run)
@@ -178,7 +194,11 @@ def stored(short_run, tmp_path_factory):
 def _is_same(found, expected):
     if found.keys() != expected.keys():
         return False
-    types = all(found[name][label].dtype == x.dtype for name, one in expected.items() for label, x in one.variables.items())
+    types = all(
+        found[name][label].dtype == x.dtype
+        for name, one in expected.items()
+        for label, x in one.variables.items()
+    )
     return types and all(found[name].identical(one) for name, one in expected.items())
 
 
@@ -228,7 +248,8 @@ def test_the_error_for_a_damaged_file_names_variable_and_remedy(stored, tmp_path
 
 
 def test_files_without_a_digest_load_and_datasets_carry_none(stored, tmp_path):
-    """Files of older versions have none; a Dataset that a user edits and saves must not hold one that has become stale."""
+    """Files of older versions have none; a Dataset that a user edits and saves must not hold one
+    that has become stale."""
     path, expected = stored
     older = xarray.load_dataset(path, engine="scipy")
     assert "digest" in older.attrs
@@ -239,17 +260,23 @@ def test_files_without_a_digest_load_and_datasets_carry_none(stored, tmp_path):
 
 
 def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_path):
-    """A NaN of the other sign, 64-bit integers and truth values are equal after a file of netCDF 3."""
+    """A NaN of the other sign, 64-bit integers and truth values are equal after a file of netCDF
+    3."""
     values = short_run.metrics.values_by_name | {
         "many": jnp.arange(3),
         "is_so": jnp.array(True),
         "none": jnp.array([-jnp.nan, -0.0, jnp.inf]),
     }
-    run = dataclasses.replace(short_run, metrics=dataclasses.replace(short_run.metrics, values_by_name=values))
+    run = dataclasses.replace(
+        short_run, metrics=dataclasses.replace(short_run.metrics, values_by_name=values)
+    )
     ij.save_rollouts(run, tmp_path / "a.nc")
     assert bool(ij.load_rollouts(tmp_path / "a.nc")["run"]["is_so"])
 
 
 def test_the_package_imports_no_labels_and_no_figures():
-    code = "import iblf_jax, sys; assert not {'xarray', 'matplotlib', 'optax', 'pandas', 'tomli_w'} & set(sys.modules)"
+    code = (
+        "import iblf_jax, sys; assert not {'xarray', 'matplotlib', 'optax', 'pandas', 'tomli_w'} &"
+        " set(sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,5 @@
-"""The safety filter: its torque beside a general solver's, what it keeps, and what it says where it cannot."""
+"""The safety filter: its torque beside a general solver's, what it keeps, and what it says where it
+cannot."""
 
 import dataclasses
 import warnings
@@ -21,19 +22,40 @@ def falling(**changes):
     law = controllers.PDGravity(Kp=30.0, Kd=0.4)
     scenario = ij.presets.zhang_yan_2024(law="pd", reading="corrected")
     rest = ij.references.Sinusoid(offset=[0.4, 0.5], amplitude=0.0)
-    walls = bounds.Bounds(lower=bounds.Sinusoid(0.2, [0.02, 0.0], 2.0), upper=bounds.Sinusoid(0.9, [0.0, 0.05], 3.0))
-    parts = {"controller": law, "reference": rest, "bounds": walls, "initial": ij.Initial([0.75, 0.3], [0.4, -0.1])}
+    walls = bounds.Bounds(
+        lower=bounds.Sinusoid(0.2, [0.02, 0.0], 2.0), upper=bounds.Sinusoid(0.9, [0.0, 0.05], 3.0)
+    )
+    parts = {
+        "controller": law,
+        "reference": rest,
+        "bounds": walls,
+        "initial": ij.Initial([0.75, 0.3], [0.4, -0.1]),
+    }
     return ij.with_parts(scenario, **(parts | {"disturbance": ij.disturbances.Nothing()} | changes))
 
 
 def filtered(scenario, **options):
-    return ij.with_parts(scenario, controller=controllers.SafetyFilter(law=scenario.controller, **options))
+    return ij.with_parts(
+        scenario, controller=controllers.SafetyFilter(law=scenario.controller, **options)
+    )
 
 
 def walls_at(t):
     """Bounds of `falling` with two rates, by hand: (3, 2) each."""
-    lower = np.array([[0.2 + 0.02 * np.sin(2 * t), 0.2], [0.04 * np.cos(2 * t), 0.0], [-0.08 * np.sin(2 * t), 0.0]])
-    upper = np.array([[0.9, 0.9 + 0.05 * np.sin(3 * t)], [0.0, 0.15 * np.cos(3 * t)], [0.0, -0.45 * np.sin(3 * t)]])
+    lower = np.array(
+        [
+            [0.2 + 0.02 * np.sin(2 * t), 0.2],
+            [0.04 * np.cos(2 * t), 0.0],
+            [-0.08 * np.sin(2 * t), 0.0],
+        ]
+    )
+    upper = np.array(
+        [
+            [0.9, 0.9 + 0.05 * np.sin(3 * t)],
+            [0.0, 0.15 * np.cos(3 * t)],
+            [0.0, -0.45 * np.sin(3 * t)],
+        ]
+    )
     return lower, upper
 
 
@@ -47,7 +69,13 @@ def alone():
         return ij.simulate(falling(), **RUN)
 
 
-@pytest.mark.parametrize("options", [{"nearest": "acceleration"}, pytest.param(LIMITED | {"method": "euler"}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"nearest": "acceleration"},
+        pytest.param(LIMITED | {"method": "euler"}, marks=pytest.mark.slow),
+    ],
+)
 def test_it_keeps_what_the_law_breaks(alone, options):
     assert float(jnp.min(alone.metrics.margin)) < -0.01
     options = dict(options)
@@ -73,16 +101,24 @@ def commands(scenario, t, q, dq):
 
 
 def random_places(rng, count):
-    return rng.uniform(0, 3, count), rng.uniform([0.23, 0.21], [0.88, 0.84], (count, 2)), rng.uniform(-2, 2, (count, 2))
+    return (
+        rng.uniform(0, 3, count),
+        rng.uniform([0.23, 0.21], [0.88, 0.84], (count, 2)),
+        rng.uniform(-2, 2, (count, 2)),
+    )
 
 
 def _elsewhere(qpsolvers, *args):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return qpsolvers.solve_qp(*args, solver="clarabel", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
+        return qpsolvers.solve_qp(
+            *args, solver="clarabel", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12
+        )
 
 
-@pytest.mark.parametrize("options", [{"nearest": "acceleration"}, {}, LIMITED | {"nearest": "acceleration"}])
+@pytest.mark.parametrize(
+    "options", [{"nearest": "acceleration"}, {}, LIMITED | {"nearest": "acceleration"}]
+)
 def test_the_torque_is_the_nearest_by_a_general_solver(options, rng):
     qpsolvers = pytest.importorskip("qpsolvers")
     import scipy.sparse as sp
@@ -93,13 +129,22 @@ def test_the_torque_is_the_nearest_by_a_general_solver(options, rng):
     for k in range(len(t)):
         M = np.asarray(scenario.model.mass_matrix(q[k]))
         inverse = np.linalg.inv(M)
-        rest = np.asarray(scenario.model.coriolis(q[k], dq[k], dq[k]) + scenario.model.gravity(q[k]))
+        rest = np.asarray(
+            scenario.model.coriolis(q[k], dq[k], dq[k]) + scenario.model.gravity(q[k])
+        )
         low, high = box_at(t[k], q[k], dq[k])
         H = np.eye(2) if options.get("nearest") != "acceleration" else inverse.T @ inverse
         H = H / np.max(H)
         G, h = [inverse, -inverse], [high + inverse @ rest, -low - inverse @ rest]
         if "limit" in options:
-            G, h = [*G, np.eye(2), -np.eye(2)], [*h, np.array(options["limit"]), np.array(options["limit"])]
+            G, h = (
+                [*G, np.eye(2), -np.eye(2)],
+                [
+                    *h,
+                    np.array(options["limit"]),
+                    np.array(options["limit"]),
+                ],
+            )
         G, h = np.concatenate(G), np.concatenate(h)
         args = (sp.csc_matrix(H), -H @ np.asarray(bare[k]), sp.csc_matrix(G), h)
         other = _elsewhere(qpsolvers, *args)
@@ -117,7 +162,9 @@ def test_the_torque_is_the_nearest_by_a_general_solver(options, rng):
 
 def test_the_law_is_passed_on_where_it_is_safe():
     scenario = filtered(falling())
-    tau, bare, slack = commands(scenario, jnp.zeros(()), jnp.array([0.5, 0.5]), jnp.array([0.01, -0.01]))
+    tau, bare, slack = commands(
+        scenario, jnp.zeros(()), jnp.array([0.5, 0.5]), jnp.array([0.01, -0.01])
+    )
     np.testing.assert_array_equal(tau, bare)
     np.testing.assert_array_equal(slack, 0.0)
 
@@ -129,25 +176,37 @@ def test_velocity_bounds_are_kept_too():
         bare = ij.simulate(scenario, **RUN)
     assert float(jnp.min(bare.metrics.velocity_margin)) < -0.1
     run = ij.simulate(filtered(scenario, nearest="acceleration"), **RUN)
-    assert not int(run.status) & int(ij.Status.VELOCITY_VIOLATED | ij.Status.BOUND_VIOLATED | ij.Status.FILTER_INFEASIBLE)
+    assert not int(run.status) & int(
+        ij.Status.VELOCITY_VIOLATED | ij.Status.BOUND_VIOLATED | ij.Status.FILTER_INFEASIBLE
+    )
     assert float(jnp.min(run.metrics.velocity_margin)) > 0
 
 
 def test_an_empty_box_is_flagged_with_its_slack():
     narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
-    scenario = filtered(falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
-    with pytest.warns(ij.SimulationWarning, match=r"safety filter's conditions could not all be met.*rad/s\^2"):
-        run = ij.simulate(ij.with_parts(scenario, initial=ij.Initial([0.75, 0.84], [0.45, 0.45])), **RUN)
+    scenario = filtered(
+        falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0
+    )
+    with pytest.warns(
+        ij.SimulationWarning, match=r"safety filter's conditions could not all be met.*rad/s\^2"
+    ):
+        run = ij.simulate(
+            ij.with_parts(scenario, initial=ij.Initial([0.75, 0.84], [0.45, 0.45])), **RUN
+        )
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     worst = np.unravel_index(np.argmax(run.slack), run.slack.shape)
-    low, high = scenario.controller.box(run.t[worst[0]], run.q[worst[0]], run.dq[worst[0]], scenario.setting)
+    low, high = scenario.controller.box(
+        run.t[worst[0]], run.q[worst[0]], run.dq[worst[0]], scenario.setting
+    )
     assert float(run.slack[worst]) == pytest.approx(0.5 * float(low[worst[1]] - high[worst[1]]))
 
 
 @pytest.mark.slow
 def test_too_little_torque_is_flagged_and_never_exceeded():
     with pytest.warns(ij.SimulationWarning, match="safety filter"):
-        run = ij.simulate(filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler", backend="xla")
+        run = ij.simulate(
+            filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler", backend="xla"
+        )
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([7.0, 2.0]) * (1 + 1e-9))
     assert float(jnp.max(run.slack)) > 0.1
@@ -158,7 +217,9 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
     scenario = filtered(falling(), **LIMITED)
     options = {"runs": 4, "duration": 0.05, "dt": 1e-3, "method": "euler", "progress": False}
     perturbations = {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}
-    native, xla = (ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "xla"))
+    native, xla = (
+        ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "xla")
+    )
     for name in ("margin", "peak_torque", "ise"):
         np.testing.assert_allclose(native.metrics[name], xla.metrics[name], rtol=1e-7, atol=1e-10)
     again_at = 3
@@ -168,20 +229,29 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
 
 def test_a_study_tells_the_largest_slack():
     narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
-    scenario = filtered(falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0)
-    starts = {"initial.q": ij.value(ij.uniform([0.7, 0.8], [0.87, 0.87])), "initial.dq": ij.value(ij.uniform(0.0, 0.48))}
+    scenario = filtered(
+        falling(velocity_bounds=narrow), nearest="acceleration", a1=40.0, a2=40.0, a3=1.0
+    )
+    starts = {
+        "initial.q": ij.value(ij.uniform([0.7, 0.8], [0.87, 0.87])),
+        "initial.dq": ij.value(ij.uniform(0.0, 0.48)),
+    }
     study = ij.monte_carlo(scenario, starts, runs=16, duration=0.2, dt=1e-3, progress=False)
     broken = np.asarray(study.metrics.largest_slack).max(axis=1) > 0
     np.testing.assert_array_equal(broken, study.status & int(ij.Status.FILTER_INFEASIBLE) != 0)
     assert 0 < broken.sum() < 16
     worst = int(study.worst(1, "largest_slack")[0])
-    np.testing.assert_allclose(study.replay(worst).slack.max(axis=0), study.metrics.largest_slack[worst], rtol=1e-6)
+    np.testing.assert_allclose(
+        study.replay(worst).slack.max(axis=0), study.metrics.largest_slack[worst], rtol=1e-6
+    )
     with pytest.raises(ValueError, match="a law with a filter"):
         ij.simulate(falling(), **RUN, metrics=(ij.metrics.Slack(),))
 
 
 def test_it_is_sampled_and_saved(tmp_path):
-    scenario = ij.with_parts(filtered(falling(), nearest="acceleration"), sampling=ij.Sampling(period=2e-3, delay=1e-3))
+    scenario = ij.with_parts(
+        filtered(falling(), nearest="acceleration"), sampling=ij.Sampling(period=2e-3, delay=1e-3)
+    )
     run = ij.simulate(scenario, **RUN)
     assert float(jnp.min(run.metrics.margin)) > 0
     assert run.slack.shape == run.q.shape
@@ -206,15 +276,23 @@ def test_a_gradient_is_the_difference():
 
 
 def test_theorem_2_claims_nothing_while_it_works():
-    """The certificate of a barrier law within a filter leaves out the samples at which the torque was changed."""
-    base = dataclasses.replace(ij.presets.zhang_yan_2024(reading="corrected"), initial=ij.Initial([0.95, 0.6], [0.5, 0.0]))
+    """The certificate of a barrier law within a filter leaves out the samples at which the torque
+    was changed."""
+    base = dataclasses.replace(
+        ij.presets.zhang_yan_2024(reading="corrected"), initial=ij.Initial([0.95, 0.6], [0.5, 0.0])
+    )
     scenario = filtered(base, nearest="acceleration", a1=20.0, a2=20.0)
     certificate = ij.certify(scenario, duration=0.3, dt=1e-3)
     assert 0 < certificate.numbers["samples_left_out"] < certificate.numbers["samples"]
 
 
 @pytest.mark.parametrize(
-    ("options", "words"), [({"nearest": "jerk"}, "acceleration"), ({"a1": -1.0}, "> 0"), ({"law": 3}, "SafetyFilter.law")]
+    ("options", "words"),
+    [
+        ({"nearest": "jerk"}, "acceleration"),
+        ({"a1": -1.0}, "> 0"),
+        ({"law": 3}, "SafetyFilter.law"),
+    ],
 )
 def test_bad_ones_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
@@ -225,7 +303,9 @@ def test_bad_ones_are_refused(options, words):
 @pytest.mark.parametrize("shape2", ["linear", "cubic"])
 def test_the_box_of_shaped_conditions(shape1, shape2, rng):
     scenario, eta = falling(), np.array([0.3, 0.7])
-    law = controllers.SafetyFilter(law=scenario.controller, a1=2.0, a2=3.0, shape1=shape1, shape2=shape2, margin=eta)
+    law = controllers.SafetyFilter(
+        law=scenario.controller, a1=2.0, a2=3.0, shape1=shape1, shape2=shape2, margin=eta
+    )
     A = {"linear": lambda h: h, "atan": np.arctan}[shape1]
     B = {"linear": lambda z: z, "cubic": lambda z: z**3}[shape2]
     for t, q, dq in zip(*random_places(rng, 5), strict=True):
@@ -234,7 +314,10 @@ def test_the_box_of_shaped_conditions(shape1, shape2, rng):
             # h and z along a motion with this acceleration; z' by differences.
             def z_at(s, q=q, dq=dq, t=t, ddq=ddq, sign=sign, side=side):
                 wall = walls_at(t + s)[side]
-                h, dh = sign * (q + s * dq + s**2 / 2 * ddq - wall[0]), sign * (dq + s * ddq - wall[1])
+                h, dh = (
+                    sign * (q + s * dq + s**2 / 2 * ddq - wall[0]),
+                    sign * (dq + s * ddq - wall[1]),
+                )
                 return dh + 2.0 * A(h)
 
             rate = (z_at(1e-6) - z_at(-1e-6)) / 2e-6
@@ -255,5 +338,7 @@ def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law
     with pytest.raises(ValueError, match="Assumption 2"):
         ij.simulate(falling(**parts), duration=0.3, dt=1e-3)
     law = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1)
-    certificate = ij.certify(filtered(falling(controller=law, **parts), nearest="acceleration"), duration=0.3, dt=1e-3)
+    certificate = ij.certify(
+        filtered(falling(controller=law, **parts), nearest="acceleration"), duration=0.3, dt=1e-3
+    )
     assert certificate["reference inside"].verdict == certificate.verdict == "fails"

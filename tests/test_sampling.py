@@ -1,5 +1,5 @@
-"""The loop of a robot: sampled, told by sensors, delayed, driven.  Held against programs of SciPy that share nothing with the package
-but the law, the observer's equations and the arm."""
+"""The loop of a robot: sampled, told by sensors, delayed, driven.  Held against programs of SciPy
+that share nothing with the package but the law, the observer's equations and the arm."""
 
 from __future__ import annotations
 
@@ -32,10 +32,18 @@ from iblf_jax.tuning.result import AtLimit
 PAPER = ij.presets.zhang_yan_2024(reading="corrected")
 SLOW = ij.with_parameters(PAPER, {"controller.K2": 4.0, "observer.kf": 4.0})
 """Slow enough for a filter and a drive in the loop."""
-MOTOR = ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0, limit=[15.0, 5.0], stall=[14.0, 6.0], no_load_speed=[6.0, 8.0])
+MOTOR = ij.actuators.Motor(
+    bandwidth=600.0,
+    rate_limit=900.0,
+    limit=[15.0, 5.0],
+    stall=[14.0, 6.0],
+    no_load_speed=[6.0, 8.0],
+)
 OFFSET = np.array([1e-3, -2e-3])
 MOVED = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-ENCODER = ij.sensors.Encoder(counts=65536, offset=OFFSET, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+ENCODER = ij.sensors.Encoder(
+    counts=65536, offset=OFFSET, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
+)
 
 
 class Independent:
@@ -50,7 +58,12 @@ class Independent:
             f_hat = eta + scenario.observer.kf * (model.mass_matrix(q) @ dq)
             command, _ = scenario.controller.command(t, q, dq, f_hat, setting, ())
             # (3.11), corrected, whose rate is linear in eta
-            rest = command.tau - model.coriolis(q, dq, dq) - model.gravity(q) + scenario.observer.kf * (model.mass_matrix(q) @ dq)
+            rest = (
+                command.tau
+                - model.coriolis(q, dq, dq)
+                - model.gravity(q)
+                + scenario.observer.kf * (model.mass_matrix(q) @ dq)
+            )
             moved = jax.jvp(model.mass_matrix, (q,), (dq,))[1] @ dq
             a = jnp.exp(-scenario.observer.kf * scenario.sampling.period)
             return command.tau, a * eta - (1 - a) * (rest + moved)
@@ -58,7 +71,9 @@ class Independent:
         @jax.jit
         def acceleration(t, q, dq, tau):
             push = scenario.disturbance.torque(t, q, dq, plant, model)
-            return jnp.linalg.solve(plant.mass_matrix(q), tau + push - plant.coriolis(q, dq, dq) - plant.gravity(q))
+            return jnp.linalg.solve(
+                plant.mass_matrix(q), tau + push - plant.coriolis(q, dq, dq) - plant.gravity(q)
+            )
 
         self.law, self.acceleration = law, acceleration
 
@@ -90,9 +105,21 @@ class Independent:
                     return np.concatenate([x[2:4], self.acceleration(t, x[:2], x[2:4], tau), dy])
 
                 inside = grid[(grid >= a - 1e-12) & (grid < b - 1e-12)]
-                found = solve_ivp(rate, (a, b), x, method="DOP853", rtol=1e-11, atol=1e-12, t_eval=np.append(inside, b).clip(a, b))
+                found = solve_ivp(
+                    rate,
+                    (a, b),
+                    x,
+                    method="DOP853",
+                    rtol=1e-11,
+                    atol=1e-12,
+                    t_eval=np.append(inside, b).clip(a, b),
+                )
                 states += list(found.y.T[: len(inside)])
-                torques += [self.delivered(asked, y[4:], y[2:4])[0] for y in states[-len(inside) :]] if len(inside) else []
+                torques += (
+                    [self.delivered(asked, y[4:], y[2:4])[0] for y in states[-len(inside) :]]
+                    if len(inside)
+                    else []
+                )
                 x = found.y[:, -1]
         return np.array(states), np.array(torques)
 
@@ -122,7 +149,9 @@ class WithDrive(Independent):
 
     def delivered(self, asked, y, dq):
         line = np.maximum(np.array([14.0, 6.0]) * (1 - np.abs(dq) / [6.0, 8.0]), 0)
-        return np.clip(y, -line, line), np.clip(600.0 * (np.clip(asked, [-15.0, -5.0], [15.0, 5.0]) - y), -900.0, 900.0)
+        return np.clip(y, -line, line), np.clip(
+            600.0 * (np.clip(asked, [-15.0, -5.0], [15.0, 5.0]) - y), -900.0, 900.0
+        )
 
 
 def agree(scenario, program, duration=0.3, dt=5e-4, q=1e-7, tau=1e-5):
@@ -136,7 +165,8 @@ def agree(scenario, program, duration=0.3, dt=5e-4, q=1e-7, tau=1e-5):
 
 @pytest.mark.parametrize("delay", [0.0, pytest.param(3.7e-3, marks=pytest.mark.slow)])
 def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_program(delay):
-    """In steps as long as the period: the jump is within one, where its error was 5e-3 rad and its estimate 3e-5 rad."""
+    """In steps as long as the period: the jump is within one, where its error was 5e-3 rad and its
+    estimate 3e-5 rad."""
     late = ij.disturbances.Step(size=[20.0, 5.0], time=0.2137)
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-2, delay=delay), disturbance=late)
     run = agree(scenario, Independent, dt=1e-2, q=1e-6, tau=1e-3)
@@ -145,17 +175,30 @@ def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_prog
 
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 2e-3])
 def test_a_sampled_loop_is_that_of_an_independent_program(delay):
-    agree(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3 if delay == 1e-3 else 2e-3, delay=min(delay, 1e-3))), Independent)
+    agree(
+        ij.with_parts(
+            PAPER,
+            sampling=ij.Sampling(period=1e-3 if delay == 1e-3 else 2e-3, delay=min(delay, 1e-3)),
+        ),
+        Independent,
+    )
 
 
 @pytest.mark.parametrize("delay", [7e-4, 2.7e-3])
 def test_a_delay_may_be_of_any_length(delay):
-    agree(ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=delay)), Independent, q=1e-9, tau=1e-7)
+    agree(
+        ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=delay)),
+        Independent,
+        q=1e-9,
+        tau=1e-7,
+    )
 
 
 def test_an_encoder_and_a_lag_are_those_of_an_independent_program():
     actuator = ij.actuators.Motor(bandwidth=600.0)
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=1.3e-3), sensor=ENCODER, actuator=actuator)
+    scenario = ij.with_parts(
+        SLOW, sampling=ij.Sampling(period=2e-3, delay=1.3e-3), sensor=ENCODER, actuator=actuator
+    )
     run = agree(scenario, WithEncoder, dt=1.25e-4, tau=2e-6)
     assert run.metrics.relative_numerical_error < 1e-5
     assert np.any(run.measured.q != run.q)
@@ -163,7 +206,13 @@ def test_an_encoder_and_a_lag_are_those_of_an_independent_program():
 
 def test_a_drive_with_limits_is_that_of_an_independent_program():
     """A limit that sets in within a step costs some accuracy."""
-    run = agree(ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=7e-4), actuator=MOTOR), WithDrive, dt=2.5e-4, q=1e-6, tau=1e-2)
+    run = agree(
+        ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, delay=7e-4), actuator=MOTOR),
+        WithDrive,
+        dt=2.5e-4,
+        q=1e-6,
+        tau=1e-2,
+    )
     assert int(run.status) & int(Status.TORQUE_SATURATED)
 
 
@@ -171,24 +220,38 @@ def test_a_short_period_is_the_continuous_loop():
     continuous = ij.simulate(SLOW, duration=0.2, dt=2.5e-4).q
     errors = []
     for period in (1e-3, 5e-4, 2.5e-4):
-        run = ij.simulate(ij.with_parts(SLOW, sampling=ij.Sampling(period=period)), duration=0.2, dt=2.5e-4)
+        run = ij.simulate(
+            ij.with_parts(SLOW, sampling=ij.Sampling(period=period)), duration=0.2, dt=2.5e-4
+        )
         errors.append(float(np.max(np.abs(run.q - continuous))))
     assert 1.7 < errors[0] / errors[1] < 2.3 and 1.7 < errors[1] / errors[2] < 2.3
 
 
-VELOCITIES = [ij.sensors.FilteredDifference(cutoff=700.0), ij.sensors.Tracking(bandwidth=500.0), ij.sensors.Measured(noise=0.01)]
+VELOCITIES = [
+    ij.sensors.FilteredDifference(cutoff=700.0),
+    ij.sensors.Tracking(bandwidth=500.0),
+    ij.sensors.Measured(noise=0.01),
+]
 
 
 @pytest.mark.parametrize("velocity", VELOCITIES)
 def test_batches_are_single_runs_and_backends_agree(velocity):
     sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=velocity)
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
-    timing = {"duration": 0.1, "dt": 5e-4, "method": "heun" if velocity is VELOCITIES[0] else "euler"}
-    study = ij.monte_carlo(scenario, {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}, runs=3, seed=4, **timing)
+    timing = {
+        "duration": 0.1,
+        "dt": 5e-4,
+        "method": "heun" if velocity is VELOCITIES[0] else "euler",
+    }
+    study = ij.monte_carlo(
+        scenario, {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}, runs=3, seed=4, **timing
+    )
     run = study.replay(2)
     assert np.allclose(run.metrics.rmse, study.metrics["rmse"][2], rtol=1e-12)
     again = np.sqrt(np.mean(run.e1**2, axis=0))
-    assert np.allclose(again, study.metrics["rmse"][2], rtol=1e-2), "the trajectory has the run's own noise"
+    assert np.allclose(again, study.metrics["rmse"][2], rtol=1e-2), (
+        "the trajectory has the run's own noise"
+    )
     first = ij.simulate(scenario, seed=4, **timing)
     other = ij.simulate(scenario, seed=5, **timing)
     assert np.any(first.measured.dq != other.measured.dq)
@@ -202,7 +265,11 @@ def test_batches_are_single_runs_and_backends_agree(velocity):
 
 def test_noise_is_white_and_normal():
     keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(3), i))(jnp.arange(100))
-    draw = jax.jit(jax.vmap(jax.vmap(lambda key, k: normals(key, k, 2, 2), in_axes=(None, 0)), in_axes=(0, None)))
+    draw = jax.jit(
+        jax.vmap(
+            jax.vmap(lambda key, k: normals(key, k, 2, 2), in_axes=(None, 0)), in_axes=(0, None)
+        )
+    )
     x = np.asarray(draw(keys, jnp.arange(4000))).reshape(100, 4000, 4)
     far = 5 / np.sqrt(x.size)
     assert abs(x.mean()) < far and abs(x.std() - 1) < far and abs(np.mean(x**4) - 3) < 10 * far
@@ -213,15 +280,25 @@ def test_noise_is_white_and_normal():
 def test_derivatives_are_differences():
     sensor = ij.sensors.Encoder(noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
     scenario = ij.with_parts(
-        SLOW, sampling=ij.Sampling(period=1e-3, delay=7e-4), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=800.0)
+        SLOW,
+        sampling=ij.Sampling(period=1e-3, delay=7e-4),
+        sensor=sensor,
+        actuator=ij.actuators.Motor(bandwidth=800.0),
     )
     scenario = canonical(scenario)
 
     def loss(values):
         changed = ij.with_parameters(scenario, values)
-        return jnp.sum(ij.simulate(changed, duration=0.1, dt=5e-4, record_every=200, seed=2).metrics.ise)
+        return jnp.sum(
+            ij.simulate(changed, duration=0.1, dt=5e-4, record_every=200, seed=2).metrics.ise
+        )
 
-    for path, step in (("controller.K2", 1e-4), ("sampling.delay", 1e-7), ("actuator.bandwidth", 1e-2), ("sensor.velocity.cutoff", 1e-2)):
+    for path, step in (
+        ("controller.K2", 1e-4),
+        ("sampling.delay", 1e-7),
+        ("actuator.bandwidth", 1e-2),
+        ("sensor.velocity.cutoff", 1e-2),
+    ):
         here = ij.paths.get(scenario, path)
         unit = jnp.ones_like(here)
         slope = jax.grad(lambda x, path=path, unit=unit: loss({path: x * unit}))(jnp.ravel(here)[0])
@@ -233,13 +310,21 @@ def test_derivatives_are_differences():
 def test_derivatives_beside_a_batch_are_those_of_every_backend():
     sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
     motor = ij.actuators.Motor(bandwidth=800.0)
-    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=7e-4), sensor=sensor, actuator=motor))
+    scenario = canonical(
+        ij.with_parts(
+            SLOW, sampling=ij.Sampling(period=1e-3, delay=7e-4), sensor=sensor, actuator=motor
+        )
+    )
     directions = {"controller.K2": np.eye(3, 2), "sampling.delay": np.eye(3)[2]}
     varied, folds = {"initial.q": scenario.initial.q + jnp.asarray([[0.0], [0.01]])}, standard()[:1]
 
     def pushed(backend):
         run = Run(40, "heun")
-        return jax.jit(lambda v: run_batch_jvp(scenario, v, directions, folds, jnp.asarray(5e-4), run, backend=backend))(varied)
+        return jax.jit(
+            lambda v: run_batch_jvp(
+                scenario, v, directions, folds, jnp.asarray(5e-4), run, backend=backend
+            )
+        )(varied)
 
     (_, expected, _), (_, found, _) = pushed("vmap"), pushed("native")
     assert np.all(np.any(expected["rmse"] != 0, axis=-1))
@@ -251,24 +336,32 @@ def test_derivatives_beside_a_batch_are_those_of_every_backend():
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 def test_a_run_says_the_same_alone_as_in_a_batch_to_the_bit():
     scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(period=4e-3, delay=1.3e-3)))
-    varied = {"initial.q": scenario.initial.q + 0.01 * jnp.arange(11.0)[:, None], "plant.mass[1]": jnp.linspace(0.6, 1.1, 11)}
+    varied = {
+        "initial.q": scenario.initial.q + 0.01 * jnp.arange(11.0)[:, None],
+        "plant.mass[1]": jnp.linspace(0.6, 1.1, 11),
+    }
 
     @jax.jit
     def runs(varied):
-        found = run_batch(scenario, varied, standard()[:1], jnp.asarray(1e-3), Run(400, "rk4"), backend="native")
+        found = run_batch(
+            scenario, varied, standard()[:1], jnp.asarray(1e-3), Run(400, "rk4"), backend="native"
+        )
         return found.metrics | {"mode": found.fastest_mode}
 
     together = runs(varied)
     for i in range(11):
         for name, x in runs({path: values[i : i + 1] for path, values in varied.items()}).items():
-            # The estimate of the step's error, 1e-9 rad, is rounded by XLA, which compiles the start of a lone run in another way.
+            # The estimate of the step's error, 1e-9 rad, is rounded by XLA, which compiles the
+            # start of a lone run in another way.
             rtol = 1e-14 if "numerical_error" in name else 0
             np.testing.assert_allclose(together[name][i], x[0], rtol=rtol, err_msg=name)
 
 
 def test_rounding_is_left_out_of_derivatives():
     encoder = ij.sensors.Encoder(counts=100, velocity=ij.sensors.Measured())
-    slope = jax.grad(lambda q: encoder.measure(q, q, jnp.zeros((1, 2)), jnp.asarray(1e-3), ())[0].q.sum())(jnp.array([0.3, 0.4]))
+    slope = jax.grad(
+        lambda q: encoder.measure(q, q, jnp.zeros((1, 2)), jnp.asarray(1e-3), ())[0].q.sum()
+    )(jnp.array([0.3, 0.4]))
     assert np.array_equal(slope, [1.0, 1.0])
 
 
@@ -283,7 +376,10 @@ def test_the_radius_is_that_of_the_map():
         u, eta = program.law(0.0, q, dq, eta)
         x = z[:4]
         for a, b, tau in ((0.0, 1e-3, old), (1e-3, 2e-3, np.asarray(u))):
-            rate = lambda t, x, tau=tau: np.concatenate([x[2:], program.acceleration(t, x[:2], x[2:], tau)])  # noqa: E731
+
+            def rate(t, x, tau=tau):
+                return np.concatenate([x[2:], program.acceleration(t, x[:2], x[2:], tau)])
+
             x = solve_ivp(rate, (a, b), x, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
         return np.concatenate([x, eta, u])
 
@@ -298,13 +394,16 @@ def test_the_radius_is_that_of_the_map():
 
 def test_what_is_sampled_too_slowly_says_so():
     fine, late, slow = (
-        ij.with_parts(PAPER, sampling=ij.Sampling(period=period, delay=delay)) for period, delay in ((2e-3, 0.0), (2e-3, 2e-3), (4e-3, 0.0))
+        ij.with_parts(PAPER, sampling=ij.Sampling(period=period, delay=delay))
+        for period, delay in ((2e-3, 0.0), (2e-3, 2e-3), (4e-3, 0.0))
     )
     assert ij.simulate(fine, duration=0.5, dt=5e-4).ok
     for bad in (late, slow):
         with pytest.warns(ij.engine.simulate.SimulationWarning, match="recommended_period"):
             run = ij.simulate(bad, duration=0.5, dt=5e-4)
-        assert int(run.status) & int(Status.SAMPLING_TOO_SLOW) and int(run.status) & int(Status.BOUND_VIOLATED)
+        assert int(run.status) & int(Status.SAMPLING_TOO_SLOW) and int(run.status) & int(
+            Status.BOUND_VIOLATED
+        )
     assert ij.recommended_period(PAPER) == 5e-4
     assert ij.recommended_period(SLOW) > 1e-3
 
@@ -321,7 +420,10 @@ LAGGING = ij.with_parts(
 LIMITED = {
     "controller.weight": (LATE, {"controller.weight": [60.0, 20.0]}),
     "controller.K2": (LATE, {"controller.K2": 40.0}),
-    "observer.kf": (ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, observer="euler")), {"observer.kf": 1200.0}),
+    "observer.kf": (
+        ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3, observer="euler")),
+        {"observer.kf": 1200.0},
+    ),
     "sampling.delay": (VERY_LATE, {}),
     "sensor.velocity.cutoff": (LAGGING, {"sensor.velocity.cutoff": 8.0}),
     "actuator.bandwidth": (LAGGING, {"actuator.bandwidth": 20.0}),
@@ -330,15 +432,22 @@ QUICK = ("controller.weight",)
 LAGS = ("sensor.velocity.cutoff", "actuator.bandwidth")
 
 
-@pytest.mark.parametrize("limiting", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LIMITED])
+@pytest.mark.parametrize(
+    "limiting", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LIMITED]
+)
 def test_the_warning_names_the_one_term_that_limits_the_loop(limiting):
-    """Scaled as the warning says that term makes the loop stable, and no other term does so by a smaller change."""
+    """Scaled as the warning says that term makes the loop stable, and no other term does so by a
+    smaller change."""
     base, changes = LIMITED[limiting]
     scenario = ij.with_parameters(base, changes)
 
     def radius(path=limiting, scale=1.0):
-        moved = ij.with_parameters(scenario, {path: np.asarray(ij.simulation.paths.get(scenario, path)) * scale})
-        return radius_at(canonical(moved), float(scenario.sampling.period), np.array([0.0, 0.025, 0.05]))
+        moved = ij.with_parameters(
+            scenario, {path: np.asarray(ij.simulation.paths.get(scenario, path)) * scale}
+        )
+        return radius_at(
+            canonical(moved), float(scenario.sampling.period), np.array([0.0, 0.025, 0.05])
+        )
 
     with pytest.warns(ij.SimulationWarning, match="limits this loop") as caught:
         ij.simulate(scenario, duration=0.05, dt=1e-3)
@@ -358,17 +467,26 @@ def test_nothing_is_claimed_of_a_sampled_loop():
     certificate = ij.certify(scenario, duration=0.2, dt=1e-3)
     assert certificate.verdict == "not applicable"
     claimed = [line for line in certificate.lines if line.counts]
-    assert claimed and all(line.verdict == "not applicable" and "sampled" in line.note for line in claimed)
-    assert -1e-12 < certificate["V2, sampled less continuous"].value < 0.1  # at the start they are alike, to rounding
+    assert claimed and all(
+        line.verdict == "not applicable" and "sampled" in line.note for line in claimed
+    )
+    assert (
+        -1e-12 < certificate["V2, sampled less continuous"].value < 0.1
+    )  # at the start they are alike, to rounding
     assert -0.01 < certificate["margin, sampled less continuous"].value < 0.01
 
 
 def test_parts_go_through_files(tmp_path):
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=2.5e-3), sensor=ENCODER, actuator=MOTOR)
+    scenario = ij.with_parts(
+        SLOW, sampling=ij.Sampling(period=1e-3, delay=2.5e-3), sensor=ENCODER, actuator=MOTOR
+    )
     ij.save_scenario(scenario, tmp_path / "lab.toml")
     loaded = ij.load_scenario(tmp_path / "lab.toml")
     assert jax.tree.structure(loaded) == jax.tree.structure(scenario) and loaded.sampling.queue == 3
-    assert np.array_equal(ij.simulate(loaded, duration=0.02, dt=5e-4).q, ij.simulate(scenario, duration=0.02, dt=5e-4).q)
+    assert np.array_equal(
+        ij.simulate(loaded, duration=0.02, dt=5e-4).q,
+        ij.simulate(scenario, duration=0.02, dt=5e-4).q,
+    )
 
 
 @pytest.mark.parametrize(
@@ -384,8 +502,16 @@ def test_parts_go_through_files(tmp_path):
         (lambda: ij.actuators.Motor(stall=1.0), "no_load_speed"),
         (lambda: ij.with_parts(PAPER, sensor=ENCODER), "Sampling"),
         (lambda: ij.with_parts(PAPER, sampling=2e-3), "Sampling"),
-        (lambda: ij.vector_field(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3))), "at every instant"),
-        (lambda: ij.simulate(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3)), duration=0.1, dt=4e-4), r"Take dt=0.000333"),
+        (
+            lambda: ij.vector_field(ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3))),
+            "at every instant",
+        ),
+        (
+            lambda: ij.simulate(
+                ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3)), duration=0.1, dt=4e-4
+            ),
+            r"Take dt=0.000333",
+        ),
     ],
 )
 def test_bad_parts_are_refused(make, words):
@@ -395,29 +521,62 @@ def test_bad_parts_are_refused(make, words):
 
 def test_a_study_may_not_lengthen_the_delay_beyond_the_queue():
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=1e-3))
-    study = ij.monte_carlo(scenario, {"sampling.delay": ij.value(ij.uniform(2.1e-3, 2.9e-3))}, runs=2, duration=0.05, dt=5e-4)
+    study = ij.monte_carlo(
+        scenario,
+        {"sampling.delay": ij.value(ij.uniform(2.1e-3, 2.9e-3))},
+        runs=2,
+        duration=0.05,
+        dt=5e-4,
+    )
     assert np.all(np.asarray(study.status) & int(Status.NOT_FINITE))
     roomy = dataclasses.replace(scenario, sampling=dataclasses.replace(scenario.sampling, queue=3))
-    study = ij.monte_carlo(roomy, {"sampling.delay": ij.value(ij.uniform(2.1e-3, 2.9e-3))}, runs=2, duration=0.05, dt=5e-4)
+    study = ij.monte_carlo(
+        roomy,
+        {"sampling.delay": ij.value(ij.uniform(2.1e-3, 2.9e-3))},
+        runs=2,
+        duration=0.05,
+        dt=5e-4,
+    )
     assert not np.any(np.asarray(study.status) & int(Status.NOT_FINITE))
 
 
 def test_tuning_hears_the_noise():
-    sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
+    sensor = ij.sensors.Encoder(
+        counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
+    )
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
     objective = ij.objectives.tracking() + 0.1 * ij.objectives.torque_rate()
-    result = ij.tune(scenario, ["controller.K2"], objective, duration=0.2, dt=5e-4, runs=4, iterations=4)
+    result = ij.tune(
+        scenario, ["controller.K2"], objective, duration=0.2, dt=5e-4, runs=4, iterations=4
+    )
     assert float(result.tuned[0]) != 4.0 and np.isfinite(result.objective)
     _, box = layout(canonical(scenario), ["controller.K2"], 5e-4, "rk4")
     high = np.exp(np.max(box.high))
-    assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 0.9 * high})), 1e-3, np.linspace(0, 6, 7)) < 1.0
-    assert radius_at(canonical(ij.with_parameters(scenario, {"controller.K2": 1.1 * high})), 1e-3, np.linspace(0, 6, 7)) >= 1.0
+    assert (
+        radius_at(
+            canonical(ij.with_parameters(scenario, {"controller.K2": 0.9 * high})),
+            1e-3,
+            np.linspace(0, 6, 7),
+        )
+        < 1.0
+    )
+    assert (
+        radius_at(
+            canonical(ij.with_parameters(scenario, {"controller.K2": 1.1 * high})),
+            1e-3,
+            np.linspace(0, 6, 7),
+        )
+        >= 1.0
+    )
 
 
 def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
     scenario = ij.with_parts(
-        SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0)
+        SLOW,
+        sampling=ij.Sampling(period=1e-3),
+        sensor=sensor,
+        actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=900.0),
     )
     gains = ["controller.k1", "controller.K2", "observer.kf"]
     blocks, box = layout(canonical(scenario), gains, 1e-3, "rk4")
@@ -425,14 +584,18 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     assert TOGETHER in str(AtLimit(1.0, "upper", 1.0, box.reasons[0][1]))
 
     def rate_for_a_count(factor):
-        """The largest rate that the motor is asked for when one joint moves on by a count, with the sensor as it rounds."""
+        """The largest rate that the motor is asked for when one joint moves on by a count, with the
+        sensor as it rounds."""
         values = {b.path: factor * np.exp(box.high[b.start : b.start + b.size]) for b in blocks}
         changed = canonical(ij.with_parameters(scenario, values))
         count, rates = 2 * np.pi / 65536, []
         states = start_and_along(changed, jnp.asarray(TIMES))
         for i, t in enumerate([0.0, *TIMES]):
             state = jax.tree.map(lambda x, i=i: x[i], states)
-            commands = [sampled(changed, t, state._replace(q=q), jnp.zeros((0, 2))).held.commands[0] for q in state.q + count * MOVED]
+            commands = [
+                sampled(changed, t, state._replace(q=q), jnp.zeros((0, 2))).held.commands[0]
+                for q in state.q + count * MOVED
+            ]
             rates.append(600.0 * np.max(np.abs(np.stack(commands[1:]) - commands[0])))
         return max(rates)
 
@@ -446,22 +609,39 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
 
 def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3), sensor=ENCODER)
-    run, driven = (ij.simulate(ij.with_parts(scenario, actuator=a), duration=0.1, dt=1e-3) for a in (scenario.actuator, MOTOR))
-    (lines, others) = ({line.get_label(): line for line in ij.plotting.torques(r).axes[0].get_lines()} for r in (run, driven))
+    run, driven = (
+        ij.simulate(ij.with_parts(scenario, actuator=a), duration=0.1, dt=1e-3)
+        for a in (scenario.actuator, MOTOR)
+    )
+    lines, others = (
+        {line.get_label(): line for line in ij.plotting.torques(r).axes[0].get_lines()}
+        for r in (run, driven)
+    )
     assert lines[r"$\tau$"].get_drawstyle() == "steps-post"
     assert others[r"$\tau$"].get_drawstyle() == "default"
     lines = {line.get_label(): line for line in ij.plotting.velocities(run).axes[0].get_lines()}
     np.testing.assert_array_equal(lines["measured"].get_ydata(), run.measured.dq[:, 0])
     assert lines["measured"].get_drawstyle() == "steps-post"
-    assert any(line.get_label() == "measured" for axes in run.plot().axes for line in axes.get_lines())
+    assert any(
+        line.get_label() == "measured" for axes in run.plot().axes for line in axes.get_lines()
+    )
 
 
 def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
-    """Where the loop grows from sample to sample its gradient points nowhere: the search begins at gains with which it does not."""
+    """Where the loop grows from sample to sample its gradient points nowhere: the search begins at
+    gains with which it does not."""
     scenario = ij.with_parts(PAPER, sampling=ij.Sampling(period=4e-3))
     assert ij.simulate(scenario, duration=0.1, dt=1e-3, metrics=()).metrics.sampling_radius > 1
     goal = ij.objectives.tracking() + 0.3 * ij.objectives.effort()
-    best = ij.tune(scenario, ["controller.K2", "observer.kf"], goal, duration=0.2, dt=1e-3, iterations=6, progress=False)
+    best = ij.tune(
+        scenario,
+        ["controller.K2", "observer.kf"],
+        goal,
+        duration=0.2,
+        dt=1e-3,
+        iterations=6,
+        progress=False,
+    )
     run = ij.simulate(best.scenario, duration=0.1, dt=1e-3, metrics=())
     assert run.metrics.sampling_radius < 1
     assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)
@@ -469,7 +649,11 @@ def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
 
 @pytest.mark.parametrize(
     "observer",
-    [ij.observers.Momentum(kf=[50.0, 300.0]), ij.observers.ExtendedState(bandwidth=100.0), ij.observers.ExtendedState(l1=100.0, l2=6000.0)],
+    [
+        ij.observers.Momentum(kf=[50.0, 300.0]),
+        ij.observers.ExtendedState(bandwidth=100.0),
+        ij.observers.ExtendedState(l1=100.0, l2=6000.0),
+    ],
     ids=["momentum", "double pole", "complex poles"],
 )
 def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias(observer):
@@ -480,10 +664,18 @@ def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias(obse
     else:
         (l1, l2), (g1, g2) = observer._gains, stepped._gains
         poles = np.exp(T * np.roots([1.0, float(l1), float(l2)]))
-        assert np.allclose(np.sort_complex(np.roots([1.0, float(T * g1) - 2.0, 1.0 - float(T * g1 - T * T * g2)])), np.sort_complex(poles))
+        assert np.allclose(
+            np.sort_complex(np.roots([1.0, float(T * g1) - 2.0, 1.0 - float(T * g1 - T * T * g2)])),
+            np.sort_complex(poles),
+        )
     ways = ("exact", "poles", "euler")
     scenario = ij.with_parts(SLOW, observer=observer)
-    runs = [ij.simulate(ij.with_parts(scenario, sampling=ij.Sampling(T, observer=way)), duration=0.3, dt=1e-3) for way in ways]
+    runs = [
+        ij.simulate(
+            ij.with_parts(scenario, sampling=ij.Sampling(T, observer=way)), duration=0.3, dt=1e-3
+        )
+        for way in ways
+    ]
     exact, poles, euler = (float(np.max(run.metrics.estimate_rmse)) for run in runs)
     assert poles < 0.5 * exact, "f_hat lags by the robot's motion over a period otherwise"
     assert poles < 1.2 * euler
@@ -491,15 +683,26 @@ def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias(obse
 
 def test_a_sampled_step_is_explained():
     sensor = ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Tracking(bandwidth=100.0))
-    counts = [ij.explain(ij.with_parts(PAPER, sampling=ij.Sampling(2e-3), sensor=s)).counts for s in (ij.sensors.Ideal(), sensor)]
+    counts = [
+        ij.explain(ij.with_parts(PAPER, sampling=ij.Sampling(2e-3), sensor=s)).counts
+        for s in (ij.sensors.Ideal(), sensor)
+    ]
     plain, noisy = (sum(sum(counter.values()) for counter in c.values()) for c in counts)
     assert 0 < plain < noisy
 
 
-@pytest.mark.parametrize("velocity", [ij.sensors.FilteredDifference(cutoff=[300.0, 2000.0]), ij.sensors.Tracking(bandwidth=2000.0)])
+@pytest.mark.parametrize(
+    "velocity",
+    [ij.sensors.FilteredDifference(cutoff=[300.0, 2000.0]), ij.sensors.Tracking(bandwidth=2000.0)],
+)
 def test_a_filter_above_the_nyquist_frequency_is_told_with_the_number(velocity):
-    scenario = ij.with_parts(SLOW, sampling=ij.Sampling(2e-3), sensor=ij.sensors.Encoder(velocity=velocity))
-    with pytest.warns(UserWarning, match=r"2000 rad/s is above the Nyquist frequency of sampling.period, 1571 rad/s"):
+    scenario = ij.with_parts(
+        SLOW, sampling=ij.Sampling(2e-3), sensor=ij.sensors.Encoder(velocity=velocity)
+    )
+    with pytest.warns(
+        UserWarning,
+        match=r"2000 rad/s is above the Nyquist frequency of sampling.period, 1571 rad/s",
+    ):
         canonical(scenario)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,4 +1,5 @@
-"""Scenario files: what is saved comes back equal, and what is wrong is a ValueError that says where."""
+"""Scenario files: what is saved comes back equal, and what is wrong is a ValueError that says
+where."""
 
 from __future__ import annotations
 
@@ -66,7 +67,10 @@ def scenarios(draw) -> ij.Scenario:
     decades = 30 if dtype == "float32" else 300
 
     def other(x):
-        return jnp.asarray(np.abs(rng.standard_normal(x.shape)) * 10.0 ** rng.uniform(-decades, decades, x.shape), dtype)
+        return jnp.asarray(
+            np.abs(rng.standard_normal(x.shape)) * 10.0 ** rng.uniform(-decades, decades, x.shape),
+            dtype,
+        )
 
     return scenario if draw(st.booleans()) else jax.tree.map(other, scenario)
 
@@ -78,7 +82,9 @@ def test_a_saved_scenario_comes_back_equal(scenario):
     back = scenario_file.from_dict(tomllib.loads(text))
     assert_equal(scenario, back.scenario)
     assert back.run == {"duration": 1.0}
-    assert tomllib.loads(text) == scenario_file.scenario_to_dict(scenario) | {"run": {"duration": 1.0}}
+    assert tomllib.loads(text) == scenario_file.scenario_to_dict(scenario) | {
+        "run": {"duration": 1.0}
+    }
 
 
 @pytest.mark.parametrize("robot", ["chain_1", "chain_3"])
@@ -121,9 +127,12 @@ def test_scalars_and_defaults_are_filled_in(paper):
 
 def test_a_preset_with_arguments_and_parameters(tmp_path):
     (tmp_path / "a.toml").write_text(
-        'preset = "zhang_yan_2024"\n[arguments]\nlaw = "log"\np = 2\n[parameters]\n"robot.mass[1]" = 1.1\ncontroller.K2 = 30\n'
+        'preset = "zhang_yan_2024"\n[arguments]\nlaw = "log"\np = 2\n[parameters]\n"robot.mass[1]"'
+        " = 1.1\ncontroller.K2 = 30\n"
     )
-    expected = ij.with_parameters(ij.presets.zhang_yan_2024(law="log", p=2), {"robot.mass[1]": 1.1, "controller.K2": 30.0})
+    expected = ij.with_parameters(
+        ij.presets.zhang_yan_2024(law="log", p=2), {"robot.mass[1]": 1.1, "controller.K2": 30.0}
+    )
     assert_equal(ij.load_scenario(tmp_path / "a.toml"), expected)
 
 
@@ -142,7 +151,13 @@ def test_users_classes_are_refused_until_they_have_a_name(paper, monkeypatch):
             return command._replace(tau=self.factor * command.tau), rate
 
     mine = dataclasses.replace(paper, controller=Doubled(paper.controller))
-    with pytest.raises(ValueError, match=r"controller: got an object of class Doubled.*backstepping.*MEMBERS\[.my_name.\] = Doubled"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"controller: got an object of class Doubled.*backstepping.*MEMBERS\[.my_name.\] ="
+            r" Doubled"
+        ),
+    ):
         scenario_file.scenario_to_dict(mine)
     monkeypatch.setitem(ij.controllers.MEMBERS, "doubled", Doubled)
     text = scenario_file.scenario_to_toml(mine)
@@ -204,10 +219,22 @@ def changed(tables: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
 WRONG = [
     ("contrller", {}, "contrller: got an unknown key, .*Did you mean controller"),
     ("controller.K3", 1.0, r"controller\.K3: got an unknown key, .*There are: k1, K2"),
-    ("controller.kind", ..., r"controller\.kind: got nothing, expected the name of one of the controllers: backstepping"),
-    ("controller.kind", "back_stepping", r"controller\.kind: got 'back_stepping', .*Did you mean backstepping"),
+    (
+        "controller.kind",
+        ...,
+        r"controller\.kind: got nothing, expected the name of one of the controllers: backstepping",
+    ),
+    (
+        "controller.kind",
+        "back_stepping",
+        r"controller\.kind: got 'back_stepping', .*Did you mean backstepping",
+    ),
     ("controller.kind", 3, r"controller\.kind: got 3"),
-    ("controller.K2", "20", r"controller\.K2: got '20', expected a number or a list of numbers \[N m s/rad\]"),
+    (
+        "controller.K2",
+        "20",
+        r"controller\.K2: got '20', expected a number or a list of numbers \[N m s/rad\]",
+    ),
     ("controller.K2", True, r"controller\.K2: got True"),
     ("controller.K2", ..., r"controller\.K2: got nothing, .*Add K2 to \[controller\]"),
     ("controller.K2", -1.0, r"controller\.K2: got -1.*> 0"),
@@ -218,7 +245,11 @@ WRONG = [
     ("controller.reading", ["printed"], r"controller\.reading: .*a string, not a list"),
     ("controller.barrier", "log", r"controller\.barrier: got 'log', expected a table"),
     ("controller.barrier.kind", "lg", r"controller\.barrier\.kind: .*Did you mean log"),
-    ("controller.barrier.guard", "small", r"controller\.barrier\.guard: got 'small', expected a finite number"),
+    (
+        "controller.barrier.guard",
+        "small",
+        r"controller\.barrier\.guard: got 'small', expected a finite number",
+    ),
     ("controller.barrier.guard", float("inf"), r"controller\.barrier\.guard: got inf"),
     ("bounds.lower", ..., r"bounds\.lower: got nothing"),
     ("bounds.kind", "bounds", r"bounds\.kind: got an unknown key"),
@@ -229,9 +260,21 @@ WRONG = [
     ("initial.q", 10**400, r"initial\.q: .*fits into a float"),
     ("initial.q", [], r"initial\.q: .*shape is \(0,\)"),
     ("disturbance", {"kind": "sum", "parts": 3}, r"disturbance\.parts: got 3, expected a list"),
-    ("disturbance", {"kind": "sum", "parts": [{"kind": "step", "size": 1.0}]}, r"disturbance\.parts\[0\]\.time: got nothing"),
-    ("reference", {"kind": "waypoint_spline", "times": [0.0, 1.0], "waypoints": [[0.0, 1.0]]}, r"reference\.waypoints: .*shape \(2, n\)"),
-    ("reference", {"kind": "waypoint_spline", "times": [1.0, "2"], "waypoints": [[0.0, 1.0]]}, r"reference\.times\[1\]: got '2'"),
+    (
+        "disturbance",
+        {"kind": "sum", "parts": [{"kind": "step", "size": 1.0}]},
+        r"disturbance\.parts\[0\]\.time: got nothing",
+    ),
+    (
+        "reference",
+        {"kind": "waypoint_spline", "times": [0.0, 1.0], "waypoints": [[0.0, 1.0]]},
+        r"reference\.waypoints: .*shape \(2, n\)",
+    ),
+    (
+        "reference",
+        {"kind": "waypoint_spline", "times": [1.0, "2"], "waypoints": [[0.0, 1.0]]},
+        r"reference\.times\[1\]: got '2'",
+    ),
     ("run.dt", 0, r"run\.dt: got 0"),
     ("run.method", "rk5", r"run\.method: got 'rk5'"),
     ("run.steps", 1, r"run\.steps: got an unknown key"),
@@ -243,7 +286,9 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("key", "value", "message"), WRONG, ids=[f"{key}={value}"[:40] for key, value, _ in WRONG])
+@pytest.mark.parametrize(
+    ("key", "value", "message"), WRONG, ids=[f"{key}={value}"[:40] for key, value, _ in WRONG]
+)
 def test_what_is_wrong_is_said(key, value, message, paper, tmp_path):
     path = tmp_path / "wrong.toml"
     path.write_text(tomli_w.dumps(changed(scenario_file.scenario_to_dict(paper), key, value)))
@@ -256,10 +301,19 @@ def test_what_is_wrong_is_said(key, value, message, paper, tmp_path):
     [
         ('preset = "zhang_yan"', "preset: got 'zhang_yan'.*zhang_yan_2024"),
         ("preset = 3", "preset: got 3"),
-        ('preset = "zhang_yan_2024"\n[arguments]\nlw = "log"', r"arguments\.lw: .*Did you mean law"),
-        ('preset = "zhang_yan_2024"\n[arguments]\np = "2"', r"arguments\.p: got '2', expected a whole number"),
+        (
+            'preset = "zhang_yan_2024"\n[arguments]\nlw = "log"',
+            r"arguments\.lw: .*Did you mean law",
+        ),
+        (
+            'preset = "zhang_yan_2024"\n[arguments]\np = "2"',
+            r"arguments\.p: got '2', expected a whole number",
+        ),
         ('preset = "zhang_yan_2024"\n[arguments]\nlaw = "lag"', r"law: got 'lag'"),
-        ('preset = "zhang_yan_2024"\n[argument]\nlaw = "log"', r"argument: got an unknown key, .*arguments"),
+        (
+            'preset = "zhang_yan_2024"\n[argument]\nlaw = "log"',
+            r"argument: got an unknown key, .*arguments",
+        ),
         ("a = ", "not a TOML file"),
         ("\x00", "not a TOML file"),
         ("", "robot: got nothing"),
@@ -296,8 +350,17 @@ JUNK = st.one_of(
     st.floats(),
     st.text(max_size=5),
     st.dates(),
-    st.lists(st.one_of(st.floats(), st.integers(), st.text(max_size=2), st.lists(st.floats(), max_size=3)), max_size=4),
-    st.dictionaries(st.sampled_from(["kind", "a", "mass"]), st.sampled_from(["log", "sum", "none", 1.0]), max_size=2),
+    st.lists(
+        st.one_of(
+            st.floats(), st.integers(), st.text(max_size=2), st.lists(st.floats(), max_size=3)
+        ),
+        max_size=4,
+    ),
+    st.dictionaries(
+        st.sampled_from(["kind", "a", "mass"]),
+        st.sampled_from(["log", "sum", "none", 1.0]),
+        max_size=2,
+    ),
     st.just(...),
 )
 
@@ -312,7 +375,11 @@ def paper_file() -> str:
 @hypothesis.given(data=st.data())
 def test_malformed_files_are_value_errors_only(data):
     tables = tomllib.loads(paper_file()) | {"run": {"duration": 1.0}}
-    key = data.draw(st.sampled_from([*_keys(tables), "controller.x", "x", "parameters", "arguments", "preset", "dtype"]))
+    key = data.draw(
+        st.sampled_from(
+            [*_keys(tables), "controller.x", "x", "parameters", "arguments", "preset", "dtype"]
+        )
+    )
     value = data.draw(JUNK)
     hypothesis.assume(value is not ... or key in _keys(tables))
     text = tomli_w.dumps(changed(tables, key, value))
@@ -326,7 +393,9 @@ def test_damaged_texts_are_value_errors_only(place, cut, insert, tmp_path_factor
     text = paper_file()
     place %= len(text)
     path = tmp_path_factory.getbasetemp() / "damaged.toml"
-    path.write_text(text[:place] + insert + text[place + cut :], encoding="utf-8", errors="surrogatepass")
+    path.write_text(
+        text[:place] + insert + text[place + cut :], encoding="utf-8", errors="surrogatepass"
+    )
     error = refusal(lambda: ij.load_scenario(path))
     assert error is None or error.startswith(str(path))
 

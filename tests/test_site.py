@@ -23,7 +23,11 @@ PAGES = [
     page
     for page in [
         *sorted(ROOT.glob("*.md")),
-        *(page for folder in ("docs", "benchmarks", "examples") for page in sorted((ROOT / folder).rglob("*.md"))),
+        *(
+            page
+            for folder in ("docs", "benchmarks", "examples")
+            for page in sorted((ROOT / folder).rglob("*.md"))
+        ),
     ]
     if run_page.blocks(page.read_text(encoding="utf-8"))
 ]
@@ -48,7 +52,15 @@ def test_a_script_of_the_gallery_makes_its_page(script):
 
 
 def test_the_pages_that_readers_start_with_are_among_them():
-    assert {"README", "guide", "start", "own_law", "own_robot", "own_parts", "read_a_certificate"} <= {page.stem for page in PAGES}
+    assert {
+        "README",
+        "guide",
+        "start",
+        "own_law",
+        "own_robot",
+        "own_parts",
+        "read_a_certificate",
+    } <= {page.stem for page in PAGES}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -59,14 +71,20 @@ def test_every_name_on_a_page_exists(page):
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=LONG if page.stem == "guide" else pytest.mark.slow) for page in PAGES if page.stem not in ELSEWHERE],
+    [
+        pytest.param(page, marks=LONG if page.stem == "guide" else pytest.mark.slow)
+        for page in PAGES
+        if page.stem not in ELSEWHERE
+    ],
     ids=lambda page: page.stem,
 )
 def test_every_block_of_a_page_runs_in_a_process_of_its_own(page, tmp_path):
-    """Nothing of this test reaches the page: neither its `__future__` flags, nor its settings of JAX, nor its names.
+    """Nothing of this test reaches the page: neither its `__future__` flags, nor its settings of
+    JAX, nor its names.
 
-    The tests run on the oldest supported Python, 3.11, which evaluates annotations at once.  On 3.14 and later `run_page` evaluates them
-    after each block, so that a name which is missing from the package fails there too.
+    The tests run on the oldest supported Python, 3.11, which evaluates annotations at once.  On
+    3.14 and later `run_page` evaluates them after each block, so that a name which is missing from
+    the package fails there too.
     """
     if page.stem == "sweep_on_a_cluster":
         pytest.importorskip("zarr")
@@ -92,7 +110,9 @@ class Law:
 """
 
 
-@pytest.mark.parametrize("first_line", ["", "from __future__ import annotations"], ids=["at-once", "lazily"])
+@pytest.mark.parametrize(
+    "first_line", ["", "from __future__ import annotations"], ids=["at-once", "lazily"]
+)
 def test_a_page_whose_annotation_names_nothing_fails(first_line, tmp_path):
     page = tmp_path / "page.md"
     page.write_text(PAGE_OF_A_CLASS.format(first_line=first_line, name="Leaf"))
@@ -115,7 +135,9 @@ def test_a_run_raises_its_flag(name):
 
 
 def test_every_public_name_is_in_the_reference():
-    listed = {name for _, names in reference.PAGES.values() for name in names.split()} | set(reference.FAMILIES)
+    listed = {name for _, names in reference.PAGES.values() for name in names.split()} | set(
+        reference.FAMILIES
+    )
     classes = {name for name in dir(ij) if not name.startswith("_")}
     modules = {name for name in classes if type(getattr(ij, name)).__name__ == "module"}
     missing = classes - listed - modules - {"TYPE_CHECKING"}
@@ -127,8 +149,14 @@ def test_every_public_name_is_in_the_reference():
     [
         ("s = e1 / cos(theta)^2", r"s = e_{1} / \cos (\theta )^{2}"),
         ("f_hat = eta + kf M0 q'", r"\hat{f} = \eta  + k_{f}\,M_{0}\,q'"),
-        ("V1 = int_0^xi 2 s ds    (2.6), (3.1)", r"V_{1} = \int _{0}^{\xi } 2 s\,\mathrm{d} s\quad\text{(2.6), (3.1)}"),
-        ("k = k_u if e1 > 0,   z_(k+1) <= 1", "k = k_{u}\\ \\text{if}\\ e_{1} > 0, \\\\\nz_{k+1} \\le  1"),
+        (
+            "V1 = int_0^xi 2 s ds    (2.6), (3.1)",
+            r"V_{1} = \int _{0}^{\xi } 2 s\,\mathrm{d} s\quad\text{(2.6), (3.1)}",
+        ),
+        (
+            "k = k_u if e1 > 0,   z_(k+1) <= 1",
+            "k = k_{u}\\ \\text{if}\\ e_{1} > 0, \\\\\nz_{k+1} \\le  1",
+        ),
     ],
 )
 def test_an_equation_for_terminals_is_one_in_tex(text, expected):
@@ -137,18 +165,34 @@ def test_an_equation_for_terminals_is_one_in_tex(text, expected):
 
 def test_every_equation_of_the_reference_is_shown_as_one():
     members = [cls for family in reference.FAMILIES for cls in getattr(ij, family).MEMBERS.values()]
-    pages = [reference.page_of(thing, thing.__name__) for thing in [*members, ij.simulate, ij.identify, ij.Sampling]]
+    pages = [
+        reference.page_of(thing, thing.__name__)
+        for thing in [*members, ij.simulate, ij.identify, ij.Sampling]
+    ]
     shown = [text for page in pages for text in re.findall(r"\$\$\n(.*?)\n\$\$", page, re.DOTALL)]
     assert len(shown) > len(members) / 2
-    assert all(text.count("{") == text.count("}") for text in (shown_text.replace(r"\{", "").replace(r"\}", "") for shown_text in shown))
+    assert all(
+        text.count("{") == text.count("}")
+        for text in (shown_text.replace(r"\{", "").replace(r"\}", "") for shown_text in shown)
+    )
 
 
 def test_dead_links_and_pages_out_of_reach_are_named(tmp_path):
     (tmp_path / "deep").mkdir()
-    chain = {"index": "a.html", "a": "deep/b.html#here", "deep/b": "../c.html", "c": "d.html", "d": "#nowhere"}
+    chain = {
+        "index": "a.html",
+        "a": "deep/b.html#here",
+        "deep/b": "../c.html",
+        "c": "d.html",
+        "d": "#nowhere",
+    }
     for name, to in chain.items():
-        (tmp_path / f"{name}.html").write_text(f'<h1 id="here">x</h1><a href="{to}">y</a><a href="https://example.org/z">z</a>')
-    (tmp_path / "a.html").write_text('<a href="deep/b.html#here">y</a><img src="gone.png"><a href="#here">z</a>')
+        (tmp_path / f"{name}.html").write_text(
+            f'<h1 id="here">x</h1><a href="{to}">y</a><a href="https://example.org/z">z</a>'
+        )
+    (tmp_path / "a.html").write_text(
+        '<a href="deep/b.html#here">y</a><img src="gone.png"><a href="#here">z</a>'
+    )
     assert set(links.faults(tmp_path)) == {
         "a.html: #here has no such place",
         "a.html: there is no gone.png",

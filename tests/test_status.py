@@ -1,4 +1,5 @@
-"""What goes wrong in a run is flagged, with the physics in the message, and every number stays finite."""
+"""What goes wrong in a run is flagged, with the physics in the message, and every number stays
+finite."""
 
 from __future__ import annotations
 
@@ -25,7 +26,21 @@ def quiet(scenario, **options) -> ij.Rollout:
 
 def all_finite(run) -> bool:
     may_be_infinite = ("settling_time", "first_violation_time")
-    arrays = [getattr(run, f) for f in ("q", "dq", "tau", "e1", "e2", "xi", "alpha", "disturbance", "disturbance_estimate", "V")]
+    arrays = [
+        getattr(run, f)
+        for f in (
+            "q",
+            "dq",
+            "tau",
+            "e1",
+            "e2",
+            "xi",
+            "alpha",
+            "disturbance",
+            "disturbance_estimate",
+            "V",
+        )
+    ]
     arrays += [v for k, v in run.metrics.items() if k not in may_be_infinite]
     return all(np.all(np.isfinite(x)) for x in arrays)
 
@@ -60,8 +75,13 @@ def test_violation_with_joint_and_time(thrown):
 
 
 def test_the_guard_alone_is_not_a_failure(paper):
-    wide = ij.with_parts(paper, controller=dataclasses.replace(paper.controller, barrier=ij.barriers.Integral(guard=0.05)))
-    near = ij.with_parameters(wide, {"initial.q": [0.5 + 0.9505 * 0.54, 0.8], "initial.dq": [-2.0, 0.0]})  # xi is 0.9505, for an instant
+    wide = ij.with_parts(
+        paper,
+        controller=dataclasses.replace(paper.controller, barrier=ij.barriers.Integral(guard=0.05)),
+    )
+    near = ij.with_parameters(
+        wide, {"initial.q": [0.5 + 0.9505 * 0.54, 0.8], "initial.dq": [-2.0, 0.0]}
+    )  # xi is 0.9505, for an instant
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = ij.simulate(near, **SHORT)
@@ -76,7 +96,10 @@ def test_a_step_too_large_is_found_and_a_step_that_works_is_named(paper):
     assert int(run.status) & Status.STEP_TOO_LARGE
     assert int(run.status) & Status.NOT_FINITE
     assert all_finite(run)
-    with pytest.warns(ij.SimulationWarning, match=r"fastest mode .* 1/s, so rk4 is stable up to dt = .* Take dt=0\.0001"):
+    with pytest.warns(
+        ij.SimulationWarning,
+        match=r"fastest mode .* 1/s, so rk4 is stable up to dt = .* Take dt=0\.0001",
+    ):
         ij.simulate(stiff, **SHORT)
     with pytest.raises(ij.SimulationError, match="time step is too large"):
         ij.simulate(stiff, **SHORT, throw=True)
@@ -93,7 +116,8 @@ def test_recommended_dt_and_the_measured_mode(paper, short_run):
 
 
 def test_the_fastest_mode_is_the_largest_spectral_radius(paper, short_run):
-    """Of the closed loop's exact Jacobian at the start, where the run was nearest to a bound and at the end."""
+    """Of the closed loop's exact Jacobian at the start, where the run was nearest to a bound and at
+    the end."""
     flat, whole = ravel_pytree(initial_state(paper))
 
     @jax.jit
@@ -114,7 +138,9 @@ def test_a_run_away_state_is_frozen_at_its_last_good_value(paper):
     q = np.asarray(run.q)
     moving = np.flatnonzero(np.any(np.diff(q, axis=0) != 0, axis=1))
     assert moving[-1] < 400  # it stands still from somewhere on
-    np.testing.assert_array_equal(q[moving[-1] + 1 :], np.broadcast_to(q[-1], q[moving[-1] + 1 :].shape))
+    np.testing.assert_array_equal(
+        q[moving[-1] + 1 :], np.broadcast_to(q[-1], q[moving[-1] + 1 :].shape)
+    )
     assert all_finite(run)
     assert np.max(np.abs(run.dq)) < 1e4
 
@@ -122,9 +148,18 @@ def test_a_run_away_state_is_frozen_at_its_last_good_value(paper):
 @pytest.mark.slow
 def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
     """It touches the bound of joint 1 between recorded samples only, long after the start."""
-    close = dataclasses.replace(paper.bounds, upper=dataclasses.replace(paper.bounds.upper, offset=[0.9, 0.5 + 0.14 * np.sqrt(2) - 1e-7]))
+    close = dataclasses.replace(
+        paper.bounds,
+        upper=dataclasses.replace(paper.bounds.upper, offset=[0.9, 0.5 + 0.14 * np.sqrt(2) - 1e-7]),
+    )
     scenario = dataclasses.replace(paper, bounds=close, initial=ij.Initial(q=[0.8, 0.6]))
-    with pytest.raises(ValueError, match=r"reference of joint 1: got .* inside the bounds .* at t = (5\.49|11\.78|18\.06).*Assumption 2"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"reference of joint 1: got .* inside the bounds .* at t ="
+            r" (5\.49|11\.78|18\.06).*Assumption 2"
+        ),
+    ):
         quiet(scenario, **PAPER)
 
 
@@ -148,4 +183,6 @@ def test_gains_below_the_theorem_are_advised_against(paper):
         with pytest.warns(UserWarning, match=rf"{path} = .*Theorem 2 needs {name} > 1/2"):
             ij.simulate(weak, **SHORT)
         part = weak.controller if name == "K2" else weak.observer
-        assert jax.jit(lambda p: len(p.advice()))(part) == 0  # nothing to say about a number that is not known yet
+        assert (
+            jax.jit(lambda p: len(p.advice()))(part) == 0
+        )  # nothing to say about a number that is not known yet

@@ -40,14 +40,21 @@ def command(capsys, monkeypatch, tmp_path):
 
 def test_files_are_the_arguments_of_the_functions():
     file = study_file.study_from_dict(tomllib.loads(SWEEP), "sweep")
-    assert file.options == {"duration": 0.02, "method": "euler", "runs": 300, "seed": 3, "unit": 256}
+    assert file.options == {
+        "duration": 0.02,
+        "method": "euler",
+        "runs": 300,
+        "seed": 3,
+        "unit": 256,
+    }
     assert file.grid == {"controller.K2": [10.0, 20.0, 40.0], "observer.kf": [10.0, 20.0]}
     expected = cases.perturbations()
     assert list(file.perturbations) == list(expected)
     for path, found in file.perturbations.items():
         assert found.kind == expected[path].kind
         np.testing.assert_allclose(
-            found.distribution.quantile(np.array([0.1, 0.7])), expected[path].distribution.quantile(np.array([0.1, 0.7]))
+            found.distribution.quantile(np.array([0.1, 0.7])),
+            expected[path].distribution.quantile(np.array([0.1, 0.7])),
         )
 
 
@@ -55,7 +62,15 @@ def test_files_are_the_arguments_of_the_functions():
 def test_montecarlo(command, tmp_path):
     code, out, err = command("montecarlo", "study.toml", "--out", "runs.nc", "--quiet")
     assert code == 1, err
-    for word in ("300 runs", "95% interval", "worst runs", "rank correlation", "plant.mass[1]", "initial.q[1]", "settling_time"):
+    for word in (
+        "300 runs",
+        "95% interval",
+        "worst runs",
+        "rank correlation",
+        "plant.mass[1]",
+        "initial.q[1]",
+        "settling_time",
+    ):
         assert word in out
     xarray = pytest.importorskip("xarray")
     data = xarray.load_dataset(tmp_path / "runs.nc", engine="scipy")
@@ -142,7 +157,9 @@ sys.argv[1:] = ["montecarlo", "study.toml"]
 cli.entry()
 """
     # As users compile: at the tests' own settings it could be over before the signal comes.
-    process = cases.start_python(tmp_path / "nothing_compiled", "-c", code, XLA_FLAGS=os.environ["TESTER_XLA_FLAGS"])
+    process = cases.start_python(
+        tmp_path / "nothing_compiled", "-c", code, XLA_FLAGS=os.environ["TESTER_XLA_FLAGS"]
+    )
     assert process.communicate(timeout=60) == ("", "iblf-jax: error: interrupted\n")
     assert process.returncode == 130
 
@@ -161,7 +178,11 @@ cli.entry()
         ("study", ("std = 0.1 }", "std = -0.1 }"), "perturbations.plant.mass.*std"),
         ("study", ("std = 0.1 }", 'std = 0.1, offset = "normal" }'), "factor and offset"),
         ("study", ("std = 0.1 }", "std = 0.1, shared = 1 }"), "shared"),
-        ("study", ('factor = "normal", mean = 1.0, std = 0.1', 'factor = "uniform", low = 1.0'), "high"),
+        (
+            "study",
+            ('factor = "normal", mean = 1.0, std = 0.1', 'factor = "uniform", low = 1.0'),
+            "high",
+        ),
         ("sweep", ("[10.0, 20.0, 40.0]", '["a"]'), "grid.controller.K2"),
         ("sweep", ("unit = 256", "unit = true"), "sweep.unit"),
     ],
@@ -192,7 +213,11 @@ HEADS = {
 def perturbations_in(kind, ways, path):
     """The perturbations of a file of one of the three kinds."""
     path.write_text(f'preset = "zhang_yan_2024"\n[run]\nduration = 0.01\n{ways}\n{HEADS[kind]}\n')
-    return load_tuning_file(path)["perturbations"] if kind == "tune" else study_file.load_study_file(path, kind).perturbations
+    return (
+        load_tuning_file(path)["perturbations"]
+        if kind == "tune"
+        else study_file.load_study_file(path, kind).perturbations
+    )
 
 
 def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
@@ -213,18 +238,32 @@ def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
     ("old", "new"),
     [
         ("{ factor = { uniform = [0.7, 1.3] } }", '{ factor = "uniform", low = 0.7, high = 1.3 }'),
-        ("{ offset = { normal = [0.0, 2e-3] }, shared = true }", '{ offset = "normal", mean = 0.0, std = 0.002, shared = true }'),
-        ("{ value = { log_uniform = [1, [2.5, 3]] } }", '{ value = "log_uniform", low = 1, high = [2.5, 3] }'),
-        ("{ value = { choice = [0.5, 0.25, 4] } }", '{ value = "choice", values = [0.5, 0.25, 4] }'),
+        (
+            "{ offset = { normal = [0.0, 2e-3] }, shared = true }",
+            '{ offset = "normal", mean = 0.0, std = 0.002, shared = true }',
+        ),
+        (
+            "{ value = { log_uniform = [1, [2.5, 3]] } }",
+            '{ value = "log_uniform", low = 1, high = [2.5, 3] }',
+        ),
+        (
+            "{ value = { choice = [0.5, 0.25, 4] } }",
+            '{ value = "choice", values = [0.5, 0.25, 4] }',
+        ),
         ("{ factor = { uniform = [0.9] } }", '{ factor = "uniform", low = 0.9, high = ... }'),
     ],
 )
 @pytest.mark.parametrize("kind", HEADS)
 def test_the_old_spelling_is_told_the_new_one(kind, old, new, tmp_path):
-    with pytest.raises(ValueError, match=rf"file.toml: perturbations.plant.mass.*{re.escape(f'This is now written {new}.')}"):
+    with pytest.raises(
+        ValueError,
+        match=rf"file.toml: perturbations.plant.mass.*{re.escape(f'This is now written {new}.')}",
+    ):
         perturbations_in(kind, f"[perturbations]\nplant.mass = {old}", tmp_path / "file.toml")
     if "..." not in new:
-        assert perturbations_in(kind, f"[perturbations]\nplant.mass = {new}", tmp_path / "file.toml").keys() == {"plant.mass"}
+        assert perturbations_in(
+            kind, f"[perturbations]\nplant.mass = {new}", tmp_path / "file.toml"
+        ).keys() == {"plant.mass"}
 
 
 def test_a_distribution_of_ones_own_is_named_in_files(tmp_path, monkeypatch):
@@ -242,7 +281,11 @@ def test_a_distribution_of_ones_own_is_named_in_files(tmp_path, monkeypatch):
             return np.asarray(self.low), np.asarray(self.high)
 
     monkeypatch.setitem(distributions.MEMBERS, "triangle", Triangle)
-    (found,) = perturbations_in("tune", '[perturbations]\nplant.mass = { factor = "triangle", low = 1, high = 2 }', tmp_path / "a").values()
+    (found,) = perturbations_in(
+        "tune",
+        '[perturbations]\nplant.mass = { factor = "triangle", low = 1, high = 2 }',
+        tmp_path / "a",
+    ).values()
     assert isinstance(found.distribution, Triangle) and found.kind == "factor"
 
 
@@ -266,5 +309,16 @@ def test_bad_commands_end_with_2_and_one_line(command, words):
 
 
 def test_ij_names_are_there():
-    names = ("monte_carlo", "sweep", "load_sweep", "sensitivity", "Study", "StoreError", "uniform", "normal", "log_uniform", "choice")
+    names = (
+        "monte_carlo",
+        "sweep",
+        "load_sweep",
+        "sensitivity",
+        "Study",
+        "StoreError",
+        "uniform",
+        "normal",
+        "log_uniform",
+        "choice",
+    )
     assert all(hasattr(ij, name) for name in (*names, "factor", "offset", "value", "distributed"))

@@ -1,4 +1,5 @@
-"""What a study says about its runs adds up: counts, starts outside the bounds, what statistics are over, progress."""
+"""What a study says about its runs adds up: counts, starts outside the bounds, what statistics are
+over, progress."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from iblf_jax.studies import monte_carlo, sensitivity
 
 @pytest.fixture(scope="module")
 def study():
-    """600 runs, some of which start outside their bounds, and then some with flags of every kind."""
+    """600 runs, some of which start outside their bounds, and then some with flags of every
+    kind."""
     found = cases.study()
     status = np.array(found.status)
     calm = np.flatnonzero(status == 0)
@@ -33,7 +35,10 @@ def test_the_counts_add_up(study):
     counts = study.status_counts
     assert counts["OK"] + counts["FLAGGED"] + counts["FAILED"] == len(study)
     assert counts["FLAGGED"] == np.sum((study.status != 0) & (study.status & int(FAILED) == 0)) >= 5
-    assert f"failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok: {counts['OK']}" in repr(study)
+    assert (
+        f"failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok:"
+        f" {counts['OK']}" in repr(study)
+    )
 
 
 def test_starts_outside_are_told_from_violations_of_the_law(study):
@@ -42,12 +47,18 @@ def test_starts_outside_are_told_from_violations_of_the_law(study):
     outside = np.any((q <= np.asarray(tube.lower)) | (q >= np.asarray(tube.upper)), axis=1)
     assert outside.any()
     np.testing.assert_array_equal(study.started_outside, outside)
-    np.testing.assert_array_equal(study.started_outside[outside], np.asarray(study.metrics.first_violation_time)[outside] == 0)
+    np.testing.assert_array_equal(
+        study.started_outside[outside], np.asarray(study.metrics.first_violation_time)[outside] == 0
+    )
     counts = study.status_counts
     assert counts["STARTED_OUTSIDE"] == outside.sum() == counts["BOUND_VIOLATED"] - 3
     assert f"{outside.sum()} of them at t = 0, because they started outside" in repr(study)
-    assert f"{outside.sum()} of them because they started outside" in study.plot(runs=256).get_suptitle().replace("\n", " ")
-    with pytest.warns(ij.SimulationWarning, match="joint 1 was drawn .* rad beyond one at t = 0.*not the law's"):
+    assert f"{outside.sum()} of them because they started outside" in study.plot(
+        runs=256
+    ).get_suptitle().replace("\n", " ")
+    with pytest.warns(
+        ij.SimulationWarning, match="joint 1 was drawn .* rad beyond one at t = 0.*not the law's"
+    ):
         study.replay(int(np.flatnonzero(outside)[0]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -56,7 +67,10 @@ def test_starts_outside_are_told_from_violations_of_the_law(study):
 
 def test_what_statistics_are_over_is_said(study):
     failed = study.status_counts["FAILED"]
-    assert f"statistics are over 600 runs, {failed} failed ones included (exclude_failed=True leaves them out)" in repr(study)
+    assert (
+        f"statistics are over 600 runs, {failed} failed ones included (exclude_failed=True leaves"
+        " them out)" in repr(study)
+    )
     said = study.quantiles().attrs
     assert (said["runs"], said["failed_included"], said["excluded"]) == (600, failed, 0)
     said = study.quantiles(exclude_failed=True).attrs
@@ -74,11 +88,16 @@ def test_a_progress_bar_ends_where_it_should(monkeypatch, runs):
     monkeypatch.setattr(monte_carlo, "bar", bar)
     monkeypatch.setattr(sensitivity, "bar", bar)
     cases.study(runs)
-    ij.sensitivity(ij.presets.zhang_yan_2024(), cases.perturbations(0.01, 0.003), points=64, **cases.options())
+    ij.sensitivity(
+        ij.presets.zhang_yan_2024(), cases.perturbations(0.01, 0.003), points=64, **cases.options()
+    )
     assert [(x.n, x.total) for x in shown] == [(runs, runs), (320, 320)]
 
 
-@pytest.mark.parametrize(("watched", "seconds", "line"), [(True, 0.3, "iblf_jax: g++ compiles\n"), (True, 0.0, ""), (False, 0.3, "")])
+@pytest.mark.parametrize(
+    ("watched", "seconds", "line"),
+    [(True, 0.3, "iblf_jax: g++ compiles\n"), (True, 0.0, ""), (False, 0.3, "")],
+)
 def test_what_takes_long_is_told_to_who_watches(monkeypatch, capsys, watched, seconds, line):
     monkeypatch.setattr(progress, "SLOW", 0.1)
     monkeypatch.setattr(progress, "_has_reader", lambda: watched)

@@ -1,4 +1,5 @@
-"""Sweeps: the labelled result, common random numbers, designs, refusals; stores: killed, torn, foreign, full, unwritable."""
+"""Sweeps: the labelled result, common random numbers, designs, refusals; stores: killed, torn,
+foreign, full, unwritable."""
 
 from __future__ import annotations
 
@@ -55,7 +56,12 @@ def once(**more):
 
 @pytest.mark.slow
 def test_dataset_is_labelled(table):
-    assert dict(table.margin.sizes) == {"controller.K2": 3, "observer.kf": 2, "run": 500, "joint": 2}
+    assert dict(table.margin.sizes) == {
+        "controller.K2": 3,
+        "observer.kf": 2,
+        "run": 500,
+        "joint": 2,
+    }
     assert table["controller.K2"].attrs["units"] == "N m s/rad"
     assert table.margin.attrs["units"] == "rad"
     assert table["plant.mass[1]"].dims == ("run",)
@@ -74,7 +80,9 @@ def test_points_are_the_studies_of_their_scenarios(table):
         point = table.sel({"controller.K2": K2, "observer.kf": kf})
         np.testing.assert_allclose(point.margin, study.metrics.margin, atol=1e-6)
         np.testing.assert_array_equal(point.status, study.status)
-        np.testing.assert_allclose(table["plant.mass[1]"], study.samples["plant.mass[1]"], rtol=1e-6)
+        np.testing.assert_allclose(
+            table["plant.mass[1]"], study.samples["plant.mass[1]"], rtol=1e-6
+        )
 
 
 @pytest.mark.parametrize("chunk", [1, 700])
@@ -84,7 +92,10 @@ def test_chunk_changes_nothing(table, chunk):
 
 @pytest.mark.slow
 def test_designs_and_vectors():
-    ways = {"controller.K2": ij.uniform(10.0, 40.0), "observer.kf": ij.factor(ij.log_uniform(0.5, 2.0), shared=True)}
+    ways = {
+        "controller.K2": ij.uniform(10.0, 40.0),
+        "observer.kf": ij.factor(ij.log_uniform(0.5, 2.0), shared=True),
+    }
     for design in ("random", "latin_hypercube"):
         found = once(grid=ways, design=design, points=5)
         assert found.sizes == {"point": 5, "joint": 2}
@@ -97,7 +108,9 @@ def test_vectors_in_a_grid_and_a_point_that_cannot_work():
     assert found["controller.K2_values"].values.tolist() == [[10, 20], [30, 40]]
     assert found.margin.sizes == {"controller.K2": 2, "initial.q": 2, "joint": 2}
     assert np.all(found.status.sel({"initial.q": 0.8}) == 0)
-    assert np.all(found.status.sel({"initial.q": 2.0}) & int(ij.Status.BOUND_VIOLATED)), "a flag, not an error"
+    assert np.all(found.status.sel({"initial.q": 2.0}) & int(ij.Status.BOUND_VIOLATED)), (
+        "a flag, not an error"
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,13 +174,23 @@ def test_another_configuration_is_refused(finished, change, message):
 def test_another_scenario_law_or_backend_is_refused(finished):
     ways, options = cases.perturbations(), cases.options() | {"runs": cases.RUNS, "store": finished}
     heavier = ij.with_parameters(SCENARIO, {"plant.payload": 1.0})
-    with pytest.raises(ij.StoreError, match=r"scenario.plant.payload: the store has 0.0, this call 1.0"):
+    with pytest.raises(
+        ij.StoreError, match=r"scenario.plant.payload: the store has 0.0, this call 1.0"
+    ):
         ij.sweep(heavier, cases.GRID, perturbations=ways, **options)
     with pytest.raises(ij.StoreError, match=r"structure.controller.*corrected"):
-        ij.sweep(ij.presets.zhang_yan_2024(reading="corrected"), cases.GRID, perturbations=ways, **options)
+        ij.sweep(
+            ij.presets.zhang_yan_2024(reading="corrected"),
+            cases.GRID,
+            perturbations=ways,
+            **options,
+        )
     with pytest.raises(ij.StoreError, match="backend"):
         ij.sweep(SCENARIO, cases.GRID, perturbations=ways, **options, backend="vmap")
-    assert ij.load_sweep(finished).attrs["backend"] in ("native", "xla"), "what it ran on, not what was asked for"
+    assert ij.load_sweep(finished).attrs["backend"] in (
+        "native",
+        "xla",
+    ), "what it ran on, not what was asked for"
 
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
@@ -175,7 +198,10 @@ def test_another_processor_is_named(finished, table, monkeypatch):
     if ij.load_sweep(finished).attrs["backend"] != "native":
         pytest.skip("the store is not tied to a processor")
     monkeypatch.setattr(toolchain, "processor", lambda: "model name : Another 9000\nflags : avx")
-    with pytest.raises(ij.StoreError, match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*xla") as caught:
+    with pytest.raises(
+        ij.StoreError,
+        match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*xla",
+    ) as caught:
         cases.table(store=finished)
     assert "program" not in str(caught.value)
 
@@ -237,11 +263,27 @@ class Payload:
 def crafted(path, marker, kind):
     """A store, written by hand, in which the chunks of `margin` are unpickled."""
     attributes = {"iblf_jax_store": 1, "config": {}, "cases": 1, "unit": 1, "variables": ["margin"]}
-    array = {"zarr_format": 2, "shape": [1], "chunks": [1], "dtype": "<f8", "fill_value": 0, "order": "C"}
+    array = {
+        "zarr_format": 2,
+        "shape": [1],
+        "chunks": [1],
+        "dtype": "<f8",
+        "fill_value": 0,
+        "order": "C",
+    }
     done = array | {"dtype": "<u8", "fill_value": 1, "compressor": None, "filters": None}
-    array |= {"dtype": "|O", "fill_value": "", "compressor": None, "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}
+    array |= {
+        "dtype": "|O",
+        "fill_value": "",
+        "compressor": None,
+        "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}],
+    }
     group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-    inline = {"kind": "inline", "must_understand": False, "metadata": {"margin": array, "done": done}}
+    inline = {
+        "kind": "inline",
+        "must_understand": False,
+        "metadata": {"margin": array, "done": done},
+    }
     for folder, each in (("margin", array), ("done", done)):
         (path / folder).mkdir(parents=True)
         (path / folder / ".zarray").write_text(json.dumps(each))
@@ -249,22 +291,33 @@ def crafted(path, marker, kind):
         (path / ".zgroup").write_text('{"zarr_format": 2}')
         (path / ".zattrs").write_text(json.dumps(attributes))
     else:
-        (path / "zarr.json").write_text(json.dumps(group | ({"consolidated_metadata": inline} if kind == "hidden in format 3" else {})))
+        (path / "zarr.json").write_text(
+            json.dumps(
+                group | ({"consolidated_metadata": inline} if kind == "hidden in format 3" else {})
+            )
+        )
     (path / "margin" / "0").write_bytes(pickle.dumps(Payload(marker)))
 
 
-@pytest.mark.parametrize("kind", ["format 2", "hidden in format 3", "format 2 in a group of format 3"])
+@pytest.mark.parametrize(
+    "kind", ["format 2", "hidden in format 3", "format 2 in a group of format 3"]
+)
 def test_a_store_that_would_run_code_is_not_opened(tmp_path, monkeypatch, kind):
-    """Issue 12: metadata of zarr's older format may name the codec `pickle`, which numcodecs before 0.16.6 obeys, later where told."""
+    """Issue 12: metadata of zarr's older format may name the codec `pickle`, which numcodecs before
+    0.16.6 obeys, later where told."""
     import numcodecs.pickles
     import zarr
 
     monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
     path, marker = tmp_path / "sweep.zarr", tmp_path / "marker"
     crafted(path, marker, kind)
-    with zarr.config.set({"array.allow_unsafe_pickle_decode": True}):  # asked for by zarr too, since 3.4
+    with zarr.config.set(
+        {"array.allow_unsafe_pickle_decode": True}
+    ):  # asked for by zarr too, since 3.4
         for read in (ij.load_sweep, lambda place: cases.table(store=place)):
-            with pytest.raises(ij.StoreError, match=r"sweep.zarr.*(not a store|is damaged)") as caught:
+            with pytest.raises(
+                ij.StoreError, match=r"sweep.zarr.*(not a store|is damaged)"
+            ) as caught:
                 read(path)
             assert "\n" not in str(caught.value)
         assert not marker.exists()
@@ -298,7 +351,9 @@ def test_a_store_that_would_run_code_is_not_opened(tmp_path, monkeypatch, kind):
     ],
 )
 def test_a_description_that_is_wrong_is_refused(finished, change):
-    group, margin = (json.loads((finished / name / "zarr.json").read_text()) for name in ("", "margin"))
+    group, margin = (
+        json.loads((finished / name / "zarr.json").read_text()) for name in ("", "margin")
+    )
     change(group["attributes"], margin)
     (finished / "zarr.json").write_text(json.dumps(group))
     (finished / "margin" / "zarr.json").write_text(json.dumps(margin))
@@ -318,7 +373,10 @@ def test_an_empty_grid_is_one_point():
 @pytest.mark.slow
 def test_starts_outside_the_bounds_are_told_from_violations_as_a_study_tells_them(tmp_path):
     """Some runs start outside and some do not; the store says the same."""
-    ways = {"initial.q": ij.offset(ij.uniform(-0.5, 0.5)), "controller.K2": ij.factor(ij.uniform(0.5, 1.5))}
+    ways = {
+        "initial.q": ij.offset(ij.uniform(-0.5, 0.5)),
+        "controller.K2": ij.factor(ij.uniform(0.5, 1.5)),
+    }
     options = {"perturbations": ways, "runs": 64, "seed": 3, "duration": 0.05, "dt": 1e-3}
     data = ij.sweep(SCENARIO, {}, **options, store=tmp_path / "x.zarr")
     study = ij.monte_carlo(SCENARIO, ways, runs=64, seed=3, duration=0.05, dt=1e-3)
@@ -333,7 +391,9 @@ def test_unwritable_paths_are_refused(tmp_path, finished, monkeypatch):
         cases.table(store=tmp_path / "file" / "sweep.zarr")
     if os.getuid() == 0:
         plain = os.access
-        monkeypatch.setattr(store.os, "access", lambda path, mode: Path(path) != finished and plain(path, mode))
+        monkeypatch.setattr(
+            store.os, "access", lambda path, mode: Path(path) != finished and plain(path, mode)
+        )
     else:
         finished.chmod(0o500)
     with pytest.raises(ij.StoreError, match=r"cannot be written \(Permission denied\)"):
@@ -371,11 +431,14 @@ def test_disk_full_keeps_what_was_written(tmp_path, table, monkeypatch):
 def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
     """RLIMIT_FSIZE: the kernel itself refuses to write more."""
     code = (
-        "import resource, sys; sys.path.insert(0, sys.argv[1]); import study_cases as c; c.table()\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)); c.table(store=sys.argv[2])"
+        "import resource, sys; sys.path.insert(0, sys.argv[1]); import study_cases as c;"
+        " c.table()\nresource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000));"
+        " c.table(store=sys.argv[2])"
     )
     command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "sweep.zarr")]
-    done = subprocess.run(command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 1
     assert "StoreWriteError" in done.stderr
     assert "no space left" in done.stderr
@@ -399,11 +462,15 @@ def cut_in(monkeypatch, count, deed):
 
 @pytest.mark.parametrize("count", [1, 6, 9, 25])
 def test_a_store_that_is_deleted_meanwhile_is_begun_anew(tmp_path, table, monkeypatch, count):
-    """Noticed at the unit at hand; nothing of it stays that would be in the way of the same call."""
+    """Noticed at the unit at hand; nothing of it stays that would be in the way of the same
+    call."""
     path = tmp_path / "sweep.zarr"
     with monkeypatch.context() as patch:
         cut_in(patch, count, lambda: shutil.rmtree(path))
-        with pytest.raises(store.StoreWriteError, match=r"was deleted while it was in use\. Start the same call again"):
+        with pytest.raises(
+            store.StoreWriteError,
+            match=r"was deleted while it was in use\. Start the same call again",
+        ):
             cases.table(store=path)
     assert list(tmp_path.iterdir()) == []
     assert cases.table(store=path).identical(table)
@@ -437,19 +504,27 @@ def test_a_store_that_is_changed_meanwhile_is_not_written_on(tmp_path, finished,
             (path / "zarr.json").write_text(json.dumps(settings))
 
     cut_in(monkeypatch, 9, deed)
-    with pytest.raises(store.StoreWriteError, match="lost arrays" if what == "an array" else "was replaced"):
+    with pytest.raises(
+        store.StoreWriteError, match="lost arrays" if what == "an array" else "was replaced"
+    ):
         cases.table(store=path)
 
 
 def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
-    """At once, not after an hour; the store's name may hold what a pattern would mean something else by."""
+    """At once, not after an hour; the store's name may hold what a pattern would mean something
+    else by."""
     path = tmp_path / "sweep[1].zarr"
     code = (
-        "import os, signal, sys; from pathlib import Path; from iblf_jax.studies import store\n"
-        "os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "store.open_store(Path(sys.argv[1]), {}, {'x': store.Variable((2,), 'float64', ('joint',), 'rad')}, 4, 2)"
+        "import os, signal, sys; from pathlib import Path; from iblf_jax.studies import"
+        " store\nos.rename = lambda *_: os.kill(os.getpid(),"
+        " signal.SIGKILL)\nstore.open_store(Path(sys.argv[1]), {}, {'x': store.Variable((2,),"
+        " 'float64', ('joint',), 'rad')}, 4, 2)"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(path)], env=cases.environment(tmp_path / "compiled"), timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        env=cases.environment(tmp_path / "compiled"),
+        timeout=300,
+    )
     assert done.returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     assert left.name.endswith(".partial")
@@ -467,7 +542,9 @@ def killed_until_done(path, compiled, table, kills, seed):
     with cases.Forks(compiled, errors) as forks:
         for count in range(kills):
             process = forks.start(str(out), "--store", str(path), "--slow", "0.15")
-            first = forks.line() if count % 2 else ""  # every second time, not before a unit is written
+            first = (
+                forks.line() if count % 2 else ""
+            )  # every second time, not before a unit is written
             assert not first.startswith("ended"), errors.read_text()
             time.sleep(rng.uniform(0.0, 1.0 if first else 4.0))
             with contextlib.suppress(ProcessLookupError):
@@ -491,20 +568,30 @@ def test_many_kills(tmp_path, compiled, table, kills):
 @pytest.mark.slow
 def test_killed_after_a_unit_only_the_rest_is_computed(tmp_path, compiled, table):
     path = tmp_path / "sweep.zarr"
-    process = cases.start(compiled, str(tmp_path / "x.npz"), "--store", str(path), "--die-after", "5")
+    process = cases.start(
+        compiled, str(tmp_path / "x.npz"), "--store", str(path), "--die-after", "5"
+    )
     process.communicate(timeout=300)
     assert process.returncode == -signal.SIGKILL
     assert ij.load_sweep(path).attrs["computed_cases"] == 5 * cases.UNIT
     computed = []
     plain = store.Store.write
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store.Store, "write", lambda self, unit, data: (computed.append(unit), plain(self, unit, data)))
+        patch.setattr(
+            store.Store,
+            "write",
+            lambda self, unit, data: (computed.append(unit), plain(self, unit, data)),
+        )
         assert cases.table(store=path).identical(table)
     assert computed == list(range(5, 12))
 
 
-@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
-def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(tmp_path, table, monkeypatch, capsys, number, word):
+@pytest.mark.parametrize(
+    ("number", "word"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")]
+)
+def test_a_signal_stops_after_the_unit_and_says_how_to_go_on(
+    tmp_path, table, monkeypatch, capsys, number, word
+):
     path, plain = tmp_path / "sweep.zarr", store.Store.write
 
     def write(self, unit, data):

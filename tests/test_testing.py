@@ -1,4 +1,5 @@
-"""The checkers themselves: they name what is wrong with a broken member, and accept classes that a user wrote."""
+"""The checkers themselves: they name what is wrong with a broken member, and accept classes that a
+user wrote."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ TWO_LINK = ij.robots.TwoLink
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PlainLaw:
-    """A user's law, registered by hand: gravity compensation and a damped spring to the reference."""
+    """A user's law, registered by hand: gravity compensation and a damped spring to the
+    reference."""
 
     gain: jax.Array
 
@@ -31,7 +33,11 @@ class PlainLaw:
 
     def command(self, t, q, dq, f_hat, setting, state):
         tube = setting.tube(t)
-        tau = setting.model.gravity(q) - self.gain * (q - tube.q_d) - 0.2 * self.gain * (dq - tube.dq_d)
+        tau = (
+            setting.model.gravity(q)
+            - self.gain * (q - tube.q_d)
+            - 0.2 * self.gain * (dq - tube.dq_d)
+        )
         no = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, jnp.zeros_like(q), no, no), ()
 
@@ -61,7 +67,9 @@ def changed(base, **methods):
 
 
 def arm(**methods):
-    return changed(TWO_LINK, **methods)(mass=[2.0, 0.85], length=[0.35, 0.31], centre=[0.2, 0.15], inertia=[0.06, 0.02])
+    return changed(TWO_LINK, **methods)(
+        mass=[2.0, 0.85], length=[0.35, 0.31], centre=[0.2, 0.15], inertia=[0.06, 0.02]
+    )
 
 
 def test_not_a_component_at_all():
@@ -74,9 +82,23 @@ def test_missing_methods_are_listed_with_their_meaning():
     class Nothing:
         pass
 
-    rejects(ij.testing.check_robot, Nothing(), "mass_matrix(q) is missing", "gravity(q) is missing", "n", "[kg m^2]")
-    rejects(ij.testing.check_law, Nothing(), "command(t, q, dq, f_hat, setting, state) is missing", "init(q, dq, setting) is missing")
-    rejects(ij.testing.check_fold, Nothing(), "'units' is missing", "update(acc, sample) is missing")
+    rejects(
+        ij.testing.check_robot,
+        Nothing(),
+        "mass_matrix(q) is missing",
+        "gravity(q) is missing",
+        "n",
+        "[kg m^2]",
+    )
+    rejects(
+        ij.testing.check_law,
+        Nothing(),
+        "command(t, q, dq, f_hat, setting, state) is missing",
+        "init(q, dq, setting) is missing",
+    )
+    rejects(
+        ij.testing.check_fold, Nothing(), "'units' is missing", "update(acc, sample) is missing"
+    )
 
 
 def test_a_check_in_post_init_is_found():
@@ -101,54 +123,131 @@ def test_a_check_in_post_init_is_found():
     [
         ({"gravity": lambda self, q: jnp.zeros(3)}, ("gravity(q) has shape (3,)", "(2,)")),
         ({"gravity": lambda self, q: -TWO_LINK.gravity(self, q)}, ("gravity(q) is not dU/dq",)),
-        ({"mass_matrix": lambda self, q: -TWO_LINK.mass_matrix(self, q)}, ("not positive definite", "does not follow from M")),
-        ({"coriolis": lambda self, q, v, u: TWO_LINK.coriolis(self, q, v, v)}, ("not linear in u",)),
-        ({"coriolis": lambda self, q, v, u: TWO_LINK.coriolis(self, q, v, u) + v[::-1] * u}, ("not skew-symmetric",)),
-        ({"jacobian": lambda self, q: TWO_LINK.jacobian(self, q).T}, ("jacobian(q) is not d tip/dq",)),
+        (
+            {"mass_matrix": lambda self, q: -TWO_LINK.mass_matrix(self, q)},
+            ("not positive definite", "does not follow from M"),
+        ),
+        (
+            {"coriolis": lambda self, q, v, u: TWO_LINK.coriolis(self, q, v, v)},
+            ("not linear in u",),
+        ),
+        (
+            {"coriolis": lambda self, q, v, u: TWO_LINK.coriolis(self, q, v, u) + v[::-1] * u},
+            ("not skew-symmetric",),
+        ),
+        (
+            {"jacobian": lambda self, q: TWO_LINK.jacobian(self, q).T},
+            ("jacobian(q) is not d tip/dq",),
+        ),
         ({"potential": lambda self, q: float(q[0])}, ("potential(q) raised", "use jax.numpy")),
         (
-            {"tip": lambda self, q: jnp.where(q[0] > 9, jnp.zeros(2), jax.lax.stop_gradient(TWO_LINK.tip(self, q)))},
+            {
+                "tip": lambda self, q: jnp.where(
+                    q[0] > 9, jnp.zeros(2), jax.lax.stop_gradient(TWO_LINK.tip(self, q))
+                )
+            },
             ("derivative of tip(q)",),
         ),
-        ({"potential": lambda self, q: TWO_LINK.potential(self, q) + jnp.zeros((), "float64")}, ("potential(q) is float64",)),
+        (
+            {"potential": lambda self, q: TWO_LINK.potential(self, q) + jnp.zeros((), "float64")},
+            ("potential(q) is float64",),
+        ),
     ],
-    ids=["shape", "sign", "negative", "not-linear", "not-skew", "transposed", "python-float", "stopped", "float64"],
+    ids=[
+        "shape",
+        "sign",
+        "negative",
+        "not-linear",
+        "not-skew",
+        "transposed",
+        "python-float",
+        "stopped",
+        "float64",
+    ],
 )
 def test_broken_robots(methods, words):
     rejects(ij.testing.check_robot, arm(**methods), *words)
 
 
 def test_broken_reference_and_bound():
-    kink = changed(ij.references.Sinusoid, position=lambda self, t: self.offset + self.amplitude * jnp.abs(t - 3.3))
-    rejects(ij.testing.check_reference, kink(offset=[0.5, 0.5], amplitude=[0.01, 0.02]), "the rate of position(t) jumps at t = 3.3")
-    root = changed(ij.bounds.Constant, at=lambda self, t, q_d: self.value + 0.1 * jnp.sqrt(t) + 0 * q_d)
+    kink = changed(
+        ij.references.Sinusoid,
+        position=lambda self, t: self.offset + self.amplitude * jnp.abs(t - 3.3),
+    )
+    rejects(
+        ij.testing.check_reference,
+        kink(offset=[0.5, 0.5], amplitude=[0.01, 0.02]),
+        "the rate of position(t) jumps at t = 3.3",
+    )
+    root = changed(
+        ij.bounds.Constant, at=lambda self, t, q_d: self.value + 0.1 * jnp.sqrt(t) + 0 * q_d
+    )
     rejects(ij.testing.check_side, root([0.5, 0.5]), "not finite at t = 0")
 
 
 def test_an_undeclared_jump_is_found():
     silent = changed(ij.disturbances.Step, jump_times=lambda self: jnp.zeros(0))
-    rejects(ij.testing.check_disturbance, silent(size=[1.0, 0.0], time=4.567), "jumps at t = 4.567", "jump_times")
+    rejects(
+        ij.testing.check_disturbance,
+        silent(size=[1.0, 0.0], time=4.567),
+        "jumps at t = 4.567",
+        "jump_times",
+    )
 
 
 @pytest.mark.parametrize(
     ("methods", "words"),
     [
-        ({"slope": lambda self, tube, q: -ij.barriers.Integral.slope(self, tube, q)}, ("slope points outward", "not dV1/dq")),
-        ({"value": lambda self, tube, q: -jnp.log(1 - tube.xi(q) ** 2)}, ("value is not finite at xi",)),
-        ({"virtual_velocity": lambda self, tube, q, k1, o: tube.dq_d + k1 * (q - tube.q_d)}, ("V1 grows",)),
-        ({"virtual_velocity": lambda self, tube, q, k1, o: tube.dq_d - k1 * (q - tube.q_d)[::-1]}, ("virtual_velocity mixes joints",)),
-        ({"decay_rate": lambda self, k1: 10.0 * k1}, ("decay_rate V1 reaches", "Claim a smaller rate")),
+        (
+            {"slope": lambda self, tube, q: -ij.barriers.Integral.slope(self, tube, q)},
+            ("slope points outward", "not dV1/dq"),
+        ),
+        (
+            {"value": lambda self, tube, q: -jnp.log(1 - tube.xi(q) ** 2)},
+            ("value is not finite at xi",),
+        ),
+        (
+            {"virtual_velocity": lambda self, tube, q, k1, o: tube.dq_d + k1 * (q - tube.q_d)},
+            ("V1 grows",),
+        ),
+        (
+            {
+                "virtual_velocity": (
+                    lambda self, tube, q, k1, o: tube.dq_d - k1 * (q - tube.q_d)[::-1]
+                )
+            },
+            ("virtual_velocity mixes joints",),
+        ),
+        (
+            {"decay_rate": lambda self, k1: 10.0 * k1},
+            ("decay_rate V1 reaches", "Claim a smaller rate"),
+        ),
         ({"decay_rate": lambda self, k1: k1[0]}, ("decay_rate(k1) has shape ()",)),
-        ({"xi_bound": lambda self, V, tube: 0.5 * ij.barriers.Integral.xi_bound(self, V, tube)}, ("beyond xi_bound",)),
+        (
+            {"xi_bound": lambda self, V, tube: 0.5 * ij.barriers.Integral.xi_bound(self, V, tube)},
+            ("beyond xi_bound",),
+        ),
     ],
-    ids=["outward", "no-guard", "wrong-sign", "mixed", "rate-too-large", "rate-of-no-joint", "bound-too-small"],
+    ids=[
+        "outward",
+        "no-guard",
+        "wrong-sign",
+        "mixed",
+        "rate-too-large",
+        "rate-of-no-joint",
+        "bound-too-small",
+    ],
 )
 def test_broken_barriers(methods, words):
-    rejects(ij.testing.check_barrier, changed(ij.barriers.Integral, uses_o=True, **methods)(), *words)
+    rejects(
+        ij.testing.check_barrier, changed(ij.barriers.Integral, uses_o=True, **methods)(), *words
+    )
 
 
 def test_broken_observer():
-    wrong = changed(ij.observers.Momentum, derivative=lambda self, t, q, dq, tau, model, state: (state,))
+    wrong = changed(
+        ij.observers.Momentum, derivative=lambda self, t, q, dq, tau, model, state: (state,)
+    )
     rejects(ij.testing.check_observer, wrong(kf=20.0), "derivative", "structure")
     wide = changed(ij.observers.Momentum, init=lambda self, q, dq, model: jnp.zeros(2, "float64"))
     rejects(ij.testing.check_observer, wide(kf=20.0), "estimate is float64 for float32")
@@ -157,10 +256,21 @@ def test_broken_observer():
 def test_broken_law():
     no_pair = changed(PlainLaw, command=lambda self, *args: PlainLaw.command(self, *args)[0])
     rejects(ij.testing.check_law, no_pair(3.0), "pair (Command, rate of the state)")
-    integer = changed(PlainLaw, command=lambda self, *a: (PlainLaw.command(self, *a)[0]._replace(saturated=jnp.zeros(2, int)), ()))
+    integer = changed(
+        PlainLaw,
+        command=lambda self, *a: (
+            PlainLaw.command(self, *a)[0]._replace(saturated=jnp.zeros(2, int)),
+            (),
+        ),
+    )
     rejects(ij.testing.check_law, integer(3.0), "Command.saturated", "bool")
 
-    rejects(ij.testing.check_law, unguarded(0.7), "not finite at xi = -0.9995, 0.9995, inside the bounds", "guarded_error")
+    rejects(
+        ij.testing.check_law,
+        unguarded(0.7),
+        "not finite at xi = -0.9995, 0.9995, inside the bounds",
+        "guarded_error",
+    )
 
 
 def unguarded(reach):
@@ -186,7 +296,11 @@ def published(power=1.0, delta=0.0):
         slow, fast = setting.speed_limits(t)
         e2 = dq - alpha
         inner = tube._replace(q_d=alpha, lower=slow, upper=fast)
-        powered = jnp.sign(e2) * jnp.abs(e2) ** power if delta == 0.0 else e2 * (e2**2 + delta**2) ** ((power - 1.0) / 2)
+        powered = (
+            jnp.sign(e2) * jnp.abs(e2) ** power
+            if delta == 0.0
+            else e2 * (e2**2 + delta**2) ** ((power - 1.0) / 2)
+        )
         tau = model.gravity(q) - slope(tube, q - tube.q_d) - slope(inner, e2) - 5.0 * powered
         no = jnp.zeros(q.shape, bool)
         return Command(tau, alpha, (q - tube.q_d) ** 2, no, no), ()
@@ -220,7 +334,9 @@ class Stating(PlainLaw):
 
     def lyapunov(self, t, q, dq, f_tilde, setting, state):
         tube = setting.tube(t)
-        return 0.5 * dq * (setting.model.mass_matrix(q) @ dq) + 0.5 * self.gain * (q - tube.q_d) ** 2
+        return (
+            0.5 * dq * (setting.model.mass_matrix(q) @ dq) + 0.5 * self.gain * (q - tube.q_d) ** 2
+        )
 
     def decay(self, t, q, dq, f_tilde, setting, state):
         return 0.2 * self.gain * dq**2
@@ -240,9 +356,18 @@ def test_broken_claims_of_a_law():
     with pytest.raises(ContractError, match="it has lyapunov and no decay"):
         claims_of(half(3.0))
     wide = changed(Stating, decay=lambda self, t, q, dq, *args: jnp.zeros(3))
-    with pytest.raises(ContractError, match=r"decay\(t, q, dq, f_tilde, setting, state\) gives .*must be an array of shape \(\) or \(2,\)"):
+    with pytest.raises(
+        ContractError,
+        match=(
+            r"decay\(t, q, dq, f_tilde, setting, state\) gives .*must be an array of shape \(\) or"
+            r" \(2,\)"
+        ),
+    ):
         claims_of(wide(3.0))
-    terms = changed(Stating, disturbance_terms=lambda self, t, q, dq, f_tilde, df, setting, state: df.astype("float64"))
+    terms = changed(
+        Stating,
+        disturbance_terms=lambda self, t, q, dq, f_tilde, df, setting, state: df.astype("float64"),
+    )
     with pytest.raises(ContractError, match=r"disturbance_terms.* gives float64 for float32"):
         claims_of(terms(3.0))
 
@@ -306,11 +431,15 @@ def without_memory(self, asked, dq, state):
 
 def washed_out(self, asked, dq, state):
     """It delivers what changes, and in the end nothing."""
-    return ij.actuators.Delivered(asked - state, jnp.zeros(asked.shape, bool), self.R * (asked - state))
+    return ij.actuators.Delivered(
+        asked - state, jnp.zeros(asked.shape, bool), self.R * (asked - state)
+    )
 
 
 def with_wrong_sign(self, asked, dq, state):
-    return ij.actuators.Delivered(self.Kt * state, jnp.zeros(asked.shape, bool), (asked + self.R * state) / self.L)
+    return ij.actuators.Delivered(
+        self.Kt * state, jnp.zeros(asked.shape, bool), (asked + self.R * state) / self.L
+    )
 
 
 def per_joint(n):
@@ -326,9 +455,15 @@ def test_an_actuator_of_one_joint_whose_input_is_a_voltage():
 @pytest.mark.parametrize(
     ("methods", "words"),
     [
-        ({"init": lambda self, tau: 0.7 * tau / self.Kt}, ("no input makes it deliver that torque", "`init` must return")),
+        (
+            {"init": lambda self, tau: 0.7 * tau / self.Kt},
+            ("no input makes it deliver that torque", "`init` must return"),
+        ),
         ({"deliver": with_wrong_sign}, ("its state grows by itself", "sign of its rate")),
-        ({"deliver": lambda self, asked, dq, state: (state, state, state)}, ("iblf_jax.actuators.Delivered",)),
+        (
+            {"deliver": lambda self, asked, dq, state: (state, state, state)},
+            ("iblf_jax.actuators.Delivered",),
+        ),
     ],
     ids=["init", "sign", "no-record"],
 )
@@ -337,28 +472,52 @@ def test_broken_actuators(methods, words):
 
 
 @pytest.mark.parametrize(
-    "methods", [{"init": lambda self, tau: (), "deliver": without_memory}, {"init": lambda self, tau: 0.0 * tau, "deliver": washed_out}]
+    "methods",
+    [
+        {"init": lambda self, tau: (), "deliver": without_memory},
+        {"init": lambda self, tau: 0.0 * tau, "deliver": washed_out},
+    ],
 )
-@pytest.mark.parametrize("n", [pytest.param(n, marks=[pytest.mark.slow] if n > 1 else []) for n in (1, 3, 6)])
+@pytest.mark.parametrize(
+    "n", [pytest.param(n, marks=[pytest.mark.slow] if n > 1 else []) for n in (1, 3, 6)]
+)
 def test_actuators_with_other_inputs_and_without_a_steady_state(methods, n):
     ij.testing.check_actuator(changed(VoltageMotor, **methods)(R=per_joint(n)))
 
 
 def test_a_sensor_without_its_record_is_refused():
-    broken = changed(ij.sensors.Ideal, measure=lambda self, q, dq, normal, period, state: ((q, dq), state))
+    broken = changed(
+        ij.sensors.Ideal, measure=lambda self, q, dq, normal, period, state: ((q, dq), state)
+    )
     rejects(ij.testing.check_sensor, broken(), "iblf_jax.sensors.Measurement")
 
 
 MEMBERS_OF_JOINTS = {
     "actuator": (ij.testing.check_actuator, lambda k: VoltageMotor(R=k)),
-    "sensor": (ij.testing.check_sensor, lambda k: ij.sensors.Encoder(counts=4096, velocity=ij.sensors.FilteredDifference(cutoff=200 * k))),
+    "sensor": (
+        ij.testing.check_sensor,
+        lambda k: ij.sensors.Encoder(
+            counts=4096, velocity=ij.sensors.FilteredDifference(cutoff=200 * k)
+        ),
+    ),
     "observer": (ij.testing.check_observer, lambda k: ij.observers.Momentum(kf=20 * k)),
-    "disturbance": (ij.testing.check_disturbance, lambda k: ij.disturbances.Friction(viscous=0.1 * k)),
-    "reference": (ij.testing.check_reference, lambda k: ij.references.Sinusoid(offset=0.5 * k, amplitude=0.1)),
+    "disturbance": (
+        ij.testing.check_disturbance,
+        lambda k: ij.disturbances.Friction(viscous=0.1 * k),
+    ),
+    "reference": (
+        ij.testing.check_reference,
+        lambda k: ij.references.Sinusoid(offset=0.5 * k, amplitude=0.1),
+    ),
     "side": (ij.testing.check_side, ij.bounds.Constant),
     "fold": (ij.testing.check_fold, lambda k: ij.metrics.Settling(tolerance=0.01 * k)),
     "objective": (ij.testing.check_objective, lambda k: WeightedSquare(weight=k)),
-    "law": (ij.testing.check_law, lambda k: ij.controllers.Saturated(ij.controllers.PDGravity(Kp=60 * k, Kd=20 * k), limit=90.0)),
+    "law": (
+        ij.testing.check_law,
+        lambda k: ij.controllers.Saturated(
+            ij.controllers.PDGravity(Kp=60 * k, Kd=20 * k), limit=90.0
+        ),
+    ),
     "law-by-hand": (ij.testing.check_law, lambda k: PlainLaw(jnp.asarray(20.0 * k))),
     "barrier": (ij.testing.check_barrier, lambda k: WeightedMapping(weight=k)),
 }
@@ -367,7 +526,8 @@ MEMBERS_OF_JOINTS = {
 
 @ij.component
 class WeightedMapping:
-    """A barrier of a user's with a leaf of one number a joint: the mapping barrier with a weight."""
+    """A barrier of a user's with a leaf of one number a joint: the mapping barrier with a
+    weight."""
 
     weight: ij.Leaf = ij.leaf("1", sign="positive")
     guard: float = ij.static(default=1e-3)
@@ -406,7 +566,12 @@ QUICK_AT = {"sensor": 3, "disturbance": 6, "side": 1}
 @pytest.mark.parametrize(
     ("family", "n"),
     [
-        pytest.param(family, n, id=f"{family}-{n}", marks=[] if QUICK_AT.get(family) == n else [pytest.mark.slow])
+        pytest.param(
+            family,
+            n,
+            id=f"{family}-{n}",
+            marks=[] if QUICK_AT.get(family) == n else [pytest.mark.slow],
+        )
         for family in MEMBERS_OF_JOINTS
         for n in (1, 2, 3, 6)
     ],
@@ -421,24 +586,53 @@ def test_the_number_of_joints_is_that_of_the_leaves(n):
     from iblf_jax.testing.joints import joints_of, scenario_of
 
     assert joints_of(VoltageMotor(R=per_joint(n))) == n
-    assert joints_of(ij.controllers.Saturated(ij.controllers.PDGravity(Kp=per_joint(n), Kd=1.0), limit=2.0)) == n
+    assert (
+        joints_of(
+            ij.controllers.Saturated(ij.controllers.PDGravity(Kp=per_joint(n), Kd=1.0), limit=2.0)
+        )
+        == n
+    )
     assert joints_of(PlainLaw(jnp.asarray(per_joint(n)))) == n
-    assert joints_of(ij.disturbances.Sum((ij.disturbances.Step(size=per_joint(n), time=1.0), ij.disturbances.Friction()))) == n
+    assert (
+        joints_of(
+            ij.disturbances.Sum(
+                (ij.disturbances.Step(size=per_joint(n), time=1.0), ij.disturbances.Friction())
+            )
+        )
+        == n
+    )
     # Coordinates of the tip, and waypoints, are not one number a joint.
     assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
     scenario = scenario_of(n)
     assert scenario.n == n
     tube = scenario.setting.tube(jnp.asarray(0.0))
-    assert bool(jnp.all((tube.lower < tube.q_d) & (tube.q_d < tube.upper) & (tube.lower < 0.8) & (tube.upper > 0.8)))
+    assert bool(
+        jnp.all(
+            (tube.lower < tube.q_d)
+            & (tube.q_d < tube.upper)
+            & (tube.lower < 0.8)
+            & (tube.upper > 0.8)
+        )
+    )
 
 
 def test_leaves_of_different_numbers_of_joints_are_a_finding():
-    rejects(ij.testing.check_actuator, VoltageMotor(R=[1.0, 2.0, 3.0], Kt=[0.1, 0.2]), "its leaves are for 2 and 3 joints")
+    rejects(
+        ij.testing.check_actuator,
+        VoltageMotor(R=[1.0, 2.0, 3.0], Kt=[0.1, 0.2]),
+        "its leaves are for 2 and 3 joints",
+    )
 
 
-@pytest.mark.parametrize("check", [ij.testing.check_law, ij.testing.check_observer, ij.testing.check_disturbance])
+@pytest.mark.parametrize(
+    "check", [ij.testing.check_law, ij.testing.check_observer, ij.testing.check_disturbance]
+)
 def test_a_number_of_joints_beside_a_robot_must_be_its_own(check, paper):
-    member = {"check_law": paper.controller, "check_observer": paper.observer}.get(check.__name__, paper.disturbance)
-    beside = {"check_law": {"scenario": paper}, "check_observer": {"model": paper.model}}.get(check.__name__, {"plant": paper.plant})
+    member = {"check_law": paper.controller, "check_observer": paper.observer}.get(
+        check.__name__, paper.disturbance
+    )
+    beside = {"check_law": {"scenario": paper}, "check_observer": {"model": paper.model}}.get(
+        check.__name__, {"plant": paper.plant}
+    )
     with pytest.raises(ValueError, match=r"n: got 3, expected 2"):
         check(member, n=3, **beside)

@@ -1,4 +1,5 @@
-"""The compiler and the cache of kernels: whatever is wrong with either, a kernel is right or is not there."""
+"""The compiler and the cache of kernels: whatever is wrong with either, a kernel is right or is not
+there."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { re
 OTHER = SOURCE.replace("41", "42")
 
 ZIG_CACHE = os.environ.get("ZIG_GLOBAL_CACHE_DIR") or str(Path.home() / ".cache" / "zig")
-"""Where ziglang keeps what it makes of its own libraries, which takes it four seconds; of one place for all tests."""
+"""Where ziglang keeps what it makes of its own libraries, which takes it four seconds; of one place
+for all tests."""
 
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 
@@ -75,17 +77,32 @@ def flipped(data: bytes, bit: int) -> bytes:
 
 
 def damages():
-    """Ways in which a file comes to hold something else, as functions of the folder and the file."""
+    """Ways in which a file comes to hold something else, as functions of the folder and the
+    file."""
     draw = random.Random(0)
     cuts, bits = [0.0, *(draw.random() for _ in range(4)), -1.0], [draw.random() for _ in range(8)]
-    ways = {f"cut at {x:.3f}": lambda _, f, x=x: f.write_bytes(f.read_bytes()[: int(x * f.stat().st_size) if x >= 0 else -1]) for x in cuts}
-    ways |= {f"bit at {x:.3f}": lambda _, f, x=x: f.write_bytes(flipped(f.read_bytes(), int(x * 8 * f.stat().st_size))) for x in bits}
+    ways = {
+        f"cut at {x:.3f}": lambda _, f, x=x: f.write_bytes(
+            f.read_bytes()[: int(x * f.stat().st_size) if x >= 0 else -1]
+        )
+        for x in cuts
+    }
+    ways |= {
+        f"bit at {x:.3f}": lambda _, f, x=x: f.write_bytes(
+            flipped(f.read_bytes(), int(x * 8 * f.stat().st_size))
+        )
+        for x in bits
+    }
     ways |= {
         "text": lambda _, f: f.write_text("this is no library\n"),
         "longer": lambda _, f: f.write_bytes(f.read_bytes() + b"\0"),
         "zeros": lambda _, f: f.write_bytes(bytes(f.stat().st_size)),
-        "another kernel": lambda folder, f: shutil.copy(next(x for x in folder.iterdir() if x != f), f),
-        "another library": lambda _, f: shutil.copy(Path(jax.__file__).parents[1] / "jaxlib" / "_jax.so", f),
+        "another kernel": lambda folder, f: shutil.copy(
+            next(x for x in folder.iterdir() if x != f), f
+        ),
+        "another library": lambda _, f: shutil.copy(
+            Path(jax.__file__).parents[1] / "jaxlib" / "_jax.so", f
+        ),
         "a folder": lambda _, f: (f.unlink(), f.mkdir(), (f / "x").write_text("")),
         "a pipe": lambda _, f: (f.unlink(), os.mkfifo(f)),
         "gone": lambda _, f: f.unlink(),
@@ -100,12 +117,16 @@ DAMAGES = damages()
 @needs_compiler
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_kernel_is_built_again(library, damage):
-    """Never loaded, in this process or a later one: truncated it kills, with one bit flipped it may return anything."""
+    """Never loaded, in this process or a later one: truncated it kills, with one bit flipped it may
+    return anything."""
     DAMAGES[damage](library.parent, library)
     assert toolchain._checked(library) is None, "the damage is seen"
     assert value() == 41
     assert toolchain._checked(library) is not None
-    assert sorted(x.suffix for x in library.parent.iterdir()) == [".so", ".so"], "nothing temporary stays"
+    assert sorted(x.suffix for x in library.parent.iterdir()) == [
+        ".so",
+        ".so",
+    ], "nothing temporary stays"
     assert stat.S_IMODE(library.stat().st_mode) == 0o700
 
 
@@ -118,7 +139,8 @@ def test_a_whole_kernel_is_not_built_again(library, monkeypatch):
 
 @needs_compiler
 def test_what_was_checked_is_loaded(library):
-    """A file that is damaged between the check and the load is not loaded; one that is damaged after it does no harm."""
+    """A file that is damaged between the check and the load is not loaded; one that is damaged
+    after it does no harm."""
     loaded = toolchain.loaded(library, "value")
     with open(library, "r+b") as file:
         file.truncate(100)  # a library that was mapped from this file would now kill with SIGBUS
@@ -143,7 +165,8 @@ def test_machine_code_of_gpus_is_checked_too(cache, monkeypatch):
 
 @needs_compiler
 def test_links_in_the_cache_are_not_followed(library, tmp_path):
-    """Neither one in a kernel's place, nor one that poses as a draft, nor one to the cache itself."""
+    """Neither one in a kernel's place, nor one that poses as a draft, nor one to the cache
+    itself."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "file").write_bytes(library.read_bytes())
@@ -166,7 +189,11 @@ def test_a_compiler_that_leaves_a_link(cache, tmp_path, monkeypatch, link):
     target.mkdir() if link == "to a folder" else target.write_text("precious")
     target.chmod(0o750)
     words = "ln" if link == "hard" else "ln -s"
-    fake(tmp_path, monkeypatch, f'echo "fake 1"; for o; do [ "$p" = -o ] && {words} {target} "$o"; p=$o; done; exit 0')
+    fake(
+        tmp_path,
+        monkeypatch,
+        f'echo "fake 1"; for o; do [ "$p" = -o ] && {words} {target} "$o"; p=$o; done; exit 0',
+    )
     with pytest.raises(ToolchainError):
         value()
     assert stat.S_IMODE(target.lstat().st_mode) == 0o750
@@ -217,11 +244,18 @@ def test_files_and_folders_of_others_are_not_used(cache, monkeypatch):
 
 
 def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
-    """A file that is no program of ours or JAX's stays, and so does what another process may be about to load."""
+    """A file that is no program of ours or JAX's stays, and so does what another process may be
+    about to load."""
     cache.mkdir(parents=True)
     now, days = time.time(), 24 * 3600.0
     (cache / "xla-abc").mkdir()
-    for name, age in (("a.so", 9 * days), ("xla-abc/b-cache", 7 * days), ("c.so", 5 * days), ("d.so", 60.0), ("notes.txt", 99 * days)):
+    for name, age in (
+        ("a.so", 9 * days),
+        ("xla-abc/b-cache", 7 * days),
+        ("c.so", 5 * days),
+        ("d.so", 60.0),
+        ("notes.txt", 99 * days),
+    ):
         (cache / name).write_bytes(bytes(1000))
         os.utime(cache / name, (now - age, now - age))
     monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 2500)
@@ -234,15 +268,22 @@ def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
 
 
 def test_programs_of_another_processor_are_apart(cache, monkeypatch):
-    """A home that machines share must give no machine another's instructions; where XLA refuses its own, nothing is kept."""
+    """A home that machines share must give no machine another's instructions; where XLA refuses its
+    own, nothing is kept."""
     folders = set()
     for flags in ("sse avx", "sse avx avx512f"):
-        monkeypatch.setattr("iblf_jax.core.cache._cpuinfo", lambda flags=flags: ["model name : Same 9000", f"flags : {flags}"])
+        monkeypatch.setattr(
+            "iblf_jax.core.cache._cpuinfo",
+            lambda flags=flags: ["model name : Same 9000", f"flags : {flags}"],
+        )
         processor.cache_clear()
         folders.add(chosen_cache(monkeypatch)[0])
     processor.cache_clear()
     assert len(folders - {None}) == 2
-    monkeypatch.setattr("iblf_jax.core.cache._cpuinfo", lambda: ["model name : Same 9000", "bugs : spectre_v2 gds mds"])
+    monkeypatch.setattr(
+        "iblf_jax.core.cache._cpuinfo",
+        lambda: ["model name : Same 9000", "bugs : spectre_v2 gds mds"],
+    )
     assert chosen_cache(monkeypatch, badly=_reloads_badly()) == (None, [])
 
 
@@ -261,7 +302,11 @@ def test_nothing_is_removed_through_a_link(cache, tmp_path, monkeypatch):
 @pytest.fixture
 def programs(cache):
     """The folder in which JAX keeps what it compiles, as in a user's process."""
-    names = ("compilation_cache_dir", "enable_compilation_cache", "persistent_cache_min_compile_time_secs")
+    names = (
+        "compilation_cache_dir",
+        "enable_compilation_cache",
+        "persistent_cache_min_compile_time_secs",
+    )
     names = [f"jax_{name}" for name in (*names, "persistent_cache_min_entry_size_bytes")]
     before = {name: getattr(jax.config, name) for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
@@ -276,7 +321,8 @@ def programs(cache):
 
 
 def values_of_programs():
-    """What three programs give that JAX has not compiled in this process; two of them take the same arguments."""
+    """What three programs give that JAX has not compiled in this process; two of them take the same
+    arguments."""
     x = np.arange(3.0)
     return [
         float(jax.jit(lambda x, y: x + y)(x, 2.0)[1]),
@@ -298,9 +344,12 @@ def at_most(seconds):
 
 
 @pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
-@pytest.mark.parametrize("damage", ["swapped", "a pipe", "a folder", "text", "cut at -1.000", "longer", "zeros"])
+@pytest.mark.parametrize(
+    "damage", ["swapped", "a pipe", "a folder", "text", "cut at -1.000", "longer", "zeros"]
+)
 def test_a_damaged_program_of_jax_is_compiled_again(programs, damage):
-    """Of another program, it ends in a foreign ValueError, or gives that program's numbers; at a pipe, a reader waits."""
+    """Of another program, it ends in a foreign ValueError, or gives that program's numbers; at a
+    pipe, a reader waits."""
     expected = values_of_programs()
     entries = sorted(programs.glob("*-cache"))
     whole = [entry.read_bytes() for entry in entries]
@@ -316,7 +365,9 @@ def test_a_damaged_program_of_jax_is_compiled_again(programs, damage):
         assert values_of_programs() == expected
         made = [entry.lstat().st_mtime_ns for entry in entries]
         assert values_of_programs() == expected
-    assert [entry.lstat().st_mtime_ns for entry in entries] == made, "what was compiled again is kept"
+    assert [entry.lstat().st_mtime_ns for entry in entries] == made, (
+        "what was compiled again is kept"
+    )
 
 
 @pytest.mark.skipif(_reloads_badly(), reason="XLA refuses its own programs on this processor")
@@ -346,7 +397,11 @@ def test_what_is_built_ahead_is_built_once(cache, tmp_path, monkeypatch):
     assert value() == 41
     assert calls.read_text().split() == ["once"]
     calls.unlink()
-    fake(tmp_path, monkeypatch, compiles(f"echo once >> {calls}; sleep 0.2; echo error: no >&2; exit 1"))
+    fake(
+        tmp_path,
+        monkeypatch,
+        compiles(f"echo once >> {calls}; sleep 0.2; echo error: no >&2; exit 1"),
+    )
     toolchain.build_ahead(OTHER)
     wait_for(calls)
     for tries in (1, 2):
@@ -390,10 +445,18 @@ print(repr(jax.config.jax_compilation_cache_dir), [sum(e.endswith(x) for e in ev
 
 
 def fresh(tmp_path, **more: str) -> list[str]:
-    """What a user's script prints in a process of its own: JAX's folder at the import and after a run, hits and misses."""
+    """What a user's script prints in a process of its own: JAX's folder at the import and after a
+    run, hits and misses."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environment |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT), **more}
-    done = subprocess.run([sys.executable, "-c", FRESH], env=environment, check=True, capture_output=True, text=True, timeout=250)
+    done = subprocess.run(
+        [sys.executable, "-c", FRESH],
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=250,
+    )
     return done.stdout.split(" ", 2)
 
 
@@ -434,7 +497,11 @@ def in_proc(base, monkeypatch):
 
 def no_home(base, monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("Could not determine home directory.")))
+    monkeypatch.setattr(
+        Path,
+        "home",
+        lambda: (_ for _ in ()).throw(RuntimeError("Could not determine home directory.")),
+    )
 
 
 def a_name_too_long(base, monkeypatch):
@@ -484,7 +551,9 @@ UNUSABLE = {
 def test_an_unusable_cache_is_one_line_and_xla(tmp_path, monkeypatch, way):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "base"))
     UNUSABLE[way](tmp_path / "base", monkeypatch)
-    assert falls_back(lambda: toolchain.built(SOURCE)).startswith("The native backend is not available (the cache ")
+    assert falls_back(lambda: toolchain.built(SOURCE)).startswith(
+        "The native backend is not available (the cache "
+    )
     chosen_cache(monkeypatch)
 
 
@@ -512,15 +581,21 @@ def falls_back(work):
 def fake(folder, monkeypatch, script):
     """Puts a shell script in the compiler's place; $REAL is the real one."""
     path = folder / "fake-compiler"
-    path.write_bytes(b"#!/bin/sh\n" + (script.encode() if isinstance(script, str) else script) + b"\n")
+    path.write_bytes(
+        b"#!/bin/sh\n" + (script.encode() if isinstance(script, str) else script) + b"\n"
+    )
     path.chmod(0o755)
     monkeypatch.setenv("REAL", shutil.which("c++") or shutil.which("g++") or "")
     monkeypatch.setenv("CXX", str(path))
 
 
 def compiles(script: str, version: str = "echo fake 1.0") -> str:
-    """A compiler that says its version and else does what `script` does, with $out the file that it is to write."""
-    return f'[ "$1" = --version ] && {{ {version}; exit 0; }}\nfor o; do [ "$p" = -o ] && out=$o; p=$o; done\n{script}'
+    """A compiler that says its version and else does what `script` does, with $out the file that it
+    is to write."""
+    return (
+        f'[ "$1" = --version ] && {{ {version}; exit 0; }}\nfor o; do [ "$p" = -o ] && out=$o;'
+        f" p=$o; done\n{script}"
+    )
 
 
 def ziglang_script(folder: Path) -> str:
@@ -534,9 +609,13 @@ def ziglang_script(folder: Path) -> str:
 VERSIONS = {
     "c++ (Debian 12.2.0-14) 12.2.0\nCopyright (C) 2022 Free Software Foundation, Inc.": "gcc",
     "clang-less (GCC) 14.1\nCopyright (C) 2024 Free Software Foundation, Inc.": "gcc",
-    "Debian clang version 14.0.6\nTarget: x86_64-pc-linux-gnu\nThread model: posix\nInstalledDir: /usr/bin": "clang",
+    "Debian clang version 14.0.6\nTarget: x86_64-pc-linux-gnu\nThread model: posix\nInstalledDir: /usr/bin": (
+        "clang"
+    ),
     "Apple clang version 15.0.0 (clang-1500.3.9.4)\nTarget: arm64-apple-darwin23": "clang",
-    "Intel(R) oneAPI DPC++/C++ Compiler 2024.0\nTarget: x86_64\nInstalledDir: /opt/intel/bin": "clang",
+    "Intel(R) oneAPI DPC++/C++ Compiler 2024.0\nTarget: x86_64\nInstalledDir: /opt/intel/bin": (
+        "clang"
+    ),
     "\n  a wrapper 1.0\n": "other",
 }
 
@@ -544,14 +623,18 @@ VERSIONS = {
 @pytest.mark.parametrize("text", VERSIONS)
 def test_the_flags_follow_the_kind_of_compiler(text):
     version = toolchain.Version.of(text)
-    assert (version.line, version.kind) == (next(filter(None, text.splitlines())).strip(), VERSIONS[text])
+    assert (version.line, version.kind) == (
+        next(filter(None, text.splitlines())).strip(),
+        VERSIONS[text],
+    )
     flags = toolchain.flags_of(version.kind)
     assert ("-fcaller-saves" in flags) == (version.kind == "gcc")
     assert ("-fslp-vectorize" in flags) == (version.kind == "clang")
 
 
 @pytest.mark.parametrize(
-    ("machine", "kind", "flag"), [("arm64", "clang", "-mcpu"), ("aarch64", "gcc", "-march"), ("x86_64", "clang", "-march")]
+    ("machine", "kind", "flag"),
+    [("arm64", "clang", "-mcpu"), ("aarch64", "gcc", "-march"), ("x86_64", "clang", "-march")],
 )
 def test_the_flag_of_the_processor(monkeypatch, machine, kind, flag):
     monkeypatch.setattr(toolchain.platform, "machine", lambda: machine)
@@ -562,7 +645,11 @@ def test_the_flag_of_the_processor(monkeypatch, machine, kind, flag):
 def test_a_compiler_is_identified_once(cache, tmp_path, monkeypatch):
     """Not at the import; again where another program has taken its place."""
     for _ in range(2):
-        fake(tmp_path, monkeypatch, compiles('exec "$REAL" "$@"', f"echo once >> {tmp_path}/calls; echo fake 1.0"))
+        fake(
+            tmp_path,
+            monkeypatch,
+            compiles('exec "$REAL" "$@"', f"echo once >> {tmp_path}/calls; echo fake 1.0"),
+        )
         os.utime(os.environ["CXX"], ns=(len(os.listdir(tmp_path)),) * 2)
         assert [value(), value(OTHER)] == [41, 42]
     assert (tmp_path / "calls").read_text().split() == ["once", "once"]
@@ -604,7 +691,10 @@ COMPILERS = {
     "makes an empty file": (compiles(': > "$out"'), "left no file"),
     "makes a pipe": (compiles('mkfifo "$out"'), "left no file"),
     "makes text": (compiles('echo hello > "$out"'), "does not load"),
-    "lacks the symbol": (compiles('echo "int x;" | "$REAL" -x c++ -shared -fPIC - -o "$out"'), "undefined symbol"),
+    "lacks the symbol": (
+        compiles('echo "int x;" | "$REAL" -x c++ -shared -fPIC - -o "$out"'),
+        "undefined symbol",
+    ),
     "says very much": (compiles("yes error >&2; exit 1"), "failed: error"),
     "hangs": (compiles("sleep 100"), "longer than 0.5 s"),
     "hangs in a child": (compiles("sleep 100 | cat"), "longer than 0.5 s"),
@@ -649,7 +739,10 @@ def is_running(number):
         return False
 
 
-BUILD = "import sys; from iblf_jax.kernels import toolchain as t; print(t.loaded(t.built(sys.argv[1])[0]).value())"
+BUILD = (
+    "import sys; from iblf_jax.kernels import toolchain as t;"
+    " print(t.loaded(t.built(sys.argv[1])[0]).value())"
+)
 
 
 @needs_compiler
@@ -664,7 +757,12 @@ def test_two_processes_build_at_once_and_one_is_killed(cache, tmp_path, monkeypa
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     monkeypatch.delenv("CXX")
-    both = [subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    both = [
+        subprocess.Popen(
+            command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
     assert [process.communicate(timeout=60)[0] for process in both] == ["41\n", "41\n"]
     assert [x.suffix for x in cache.iterdir()] == [".so"]
 
@@ -687,7 +785,9 @@ with drafts.draft(pathlib.Path(sys.argv[2]), "x"):
 
 
 def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, drafts.__file__, str(tmp_path)], stdout=subprocess.PIPE)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, drafts.__file__, str(tmp_path)], stdout=subprocess.PIPE
+    )
     assert holder.stdout.readline() == b"there\n"
     (held,) = drafts_in(tmp_path)
     with drafts.draft(tmp_path, "x"):
@@ -715,12 +815,16 @@ def test_drafts_of_other_machines_go_by_age(tmp_path, monkeypatch):
 # ----------------------------------------------------------------------------------------------------------------------- threads
 
 
-@pytest.mark.parametrize("wanted", ["99999999999", "9" * 5000, "257", "²", "0", "000", "-1", "abc", "1.5", " 2", "٣"])
+@pytest.mark.parametrize(
+    "wanted", ["99999999999", "9" * 5000, "257", "²", "0", "000", "-1", "abc", "1.5", " 2", "٣"]
+)
 def test_a_number_of_threads_that_is_none_is_one_line(monkeypatch, wanted):
     monkeypatch.delenv("IBLF_JAX_THREADS", raising=False)
     usual = toolchain.threads()
     monkeypatch.setenv("IBLF_JAX_THREADS", wanted)
-    with pytest.warns(UserWarning, match="IBLF_JAX_THREADS: got .*, expected a whole number from 1 to 256") as said:
+    with pytest.warns(
+        UserWarning, match="IBLF_JAX_THREADS: got .*, expected a whole number from 1 to 256"
+    ) as said:
         assert toolchain.threads() == (256 if wanted[0] in "92" else usual)
     assert len(said) == 1
     assert len(str(said[0].message)) < 200

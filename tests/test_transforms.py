@@ -1,4 +1,5 @@
-"""`simulate` under jit, vmap, grad and jacfwd; new gains do not recompile; runs of a batch do not touch each other."""
+"""`simulate` under jit, vmap, grad and jacfwd; new gains do not recompile; runs of a batch do not
+touch each other."""
 
 from __future__ import annotations
 
@@ -17,12 +18,40 @@ from iblf_jax.engine import execute, native, plan, step, transformable
 from iblf_jax.kernels.program import UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
-PATHS = ("controller.k1", "controller.K2", "controller.o", "observer.kf", "plant.mass", "initial.q", "initial.dq", "disturbance.phase")
+PATHS = (
+    "controller.k1",
+    "controller.K2",
+    "controller.o",
+    "observer.kf",
+    "plant.mass",
+    "initial.q",
+    "initial.dq",
+    "disturbance.phase",
+)
 NOMINAL = (2.0, 20.0, 0.1, 20.0, 1.5, 0.8, 0.0, 0.0)
 RUN = {"duration": 0.1, "dt": 1e-3}
 
-STARTS = (0.34001, 0.36, 0.9, 1.0, 1.03, 1.0399, 1.03999999, 1.04, 1.0400001, 1.05, 1.3, 3.0, 50.0, 0.34, 0.3, -2.0, -300.0)
-"""Initial positions of both joints; the bounds of joint 0 are (0.34, 1.04) at t = 0, those of joint 1 (0.2, 0.9)."""
+STARTS = (
+    0.34001,
+    0.36,
+    0.9,
+    1.0,
+    1.03,
+    1.0399,
+    1.03999999,
+    1.04,
+    1.0400001,
+    1.05,
+    1.3,
+    3.0,
+    50.0,
+    0.34,
+    0.3,
+    -2.0,
+    -300.0,
+)
+"""Initial positions of both joints; the bounds of joint 0 are (0.34, 1.04) at t = 0, those of joint
+1 (0.2, 0.9)."""
 
 
 def loss(values, scenario):
@@ -45,9 +74,11 @@ def loss(values, scenario):
 
 @pytest.fixture(scope="module")
 def gradients(paper):
-    """Value, status, reverse gradient and forward derivative along a direction, of a batch of parameter vectors; compiled once.
+    """Value, status, reverse gradient and forward derivative along a direction, of a batch of
+    parameter vectors; compiled once.
 
-    The compiler's optimisations are off: what takes long here is compiling, and the numbers are the same.
+    The compiler's optimisations are off: what takes long here is compiling, and the numbers are the
+    same.
     """
 
     def one(values, direction):
@@ -58,7 +89,9 @@ def gradients(paper):
     compiled = jax.jit(jax.vmap(one), compiler_options={"xla_backend_optimization_level": 0})
 
     def run(rows, directions=()):
-        return compiled(filled(rows, vector()), filled(directions, np.maximum(np.abs(NOMINAL), 0.1)))
+        return compiled(
+            filled(rows, vector()), filled(directions, np.maximum(np.abs(NOMINAL), 0.1))
+        )
 
     return run
 
@@ -68,7 +101,9 @@ def batch(paper):
     """A batch of three short runs of given gains and starts, compiled once."""
 
     def one(K2, q):
-        return ij.simulate(ij.with_parameters(paper, {"controller.K2": K2, "initial.q": q}), **SHORT)
+        return ij.simulate(
+            ij.with_parameters(paper, {"controller.K2": K2, "initial.q": q}), **SHORT
+        )
 
     return jax.jit(jax.vmap(one))
 
@@ -93,7 +128,9 @@ def test_gradient_in_both_modes_is_the_finite_difference(gradients):
     n = len(PATHS)
     steps = 1e-5 * np.maximum(np.abs(NOMINAL), 0.1)
     shifted = [vector() + sign * np.diag(steps)[i] for i in range(n) for sign in (1, -1)]
-    value, status, reverse, forward = (np.asarray(x) for x in gradients([vector()] * n + shifted, list(np.eye(n))))
+    value, status, reverse, forward = (
+        np.asarray(x) for x in gradients([vector()] * n + shifted, list(np.eye(n)))
+    )
     assert int(status[0]) == Status.OK
     np.testing.assert_allclose(reverse[0], forward[:n], rtol=1e-7, atol=1e-9)
     difference = (value[n : 3 * n : 2] - value[n + 1 : 3 * n : 2]) / (2 * steps)
@@ -117,7 +154,9 @@ def test_values_and_gradients_are_finite_wherever_a_run_starts(gradients):
 
 @pytest.mark.slow
 def test_run_away_states_have_finite_gradients(gradients):
-    rows = [vector(controller__K2=k) for k in (200.0, 1e3, 1e4, 1e6)] + [vector(observer__kf=k) for k in (1e4, 1e5)]
+    rows = [vector(controller__K2=k) for k in (200.0, 1e3, 1e4, 1e6)] + [
+        vector(observer__kf=k) for k in (1e4, 1e5)
+    ]
     rows += [vector(plant__mass=m) for m in (1e-6, 1e6)]
     value, status, reverse, forward = (np.asarray(x) for x in gradients(rows))
     assert np.all(status[:6] & Status.NOT_FINITE)
@@ -143,29 +182,52 @@ def test_jit_and_vmap_give_what_simulate_gives(paper, short_run, batch):
     assert len(runs) == 3
     assert runs.q.shape == (3, 501, 2)
     for name in ("q", "dq", "tau", "V", "e2", "disturbance_estimate"):
-        np.testing.assert_allclose(getattr(runs[0], name), getattr(short_run, name), rtol=1e-7, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(runs[0], name), getattr(short_run, name), rtol=1e-7, atol=1e-9, err_msg=name
+        )
     for name in short_run.metrics:
-        np.testing.assert_allclose(runs[0].metrics[name], short_run.metrics[name], rtol=1e-7, err_msg=name)
+        np.testing.assert_allclose(
+            runs[0].metrics[name], short_run.metrics[name], rtol=1e-7, err_msg=name
+        )
     alone = ij.simulate(ij.with_parameters(paper, {"controller.K2": 12.0}), **SHORT)
     np.testing.assert_allclose(runs[1].q, alone.q, rtol=1e-7, atol=1e-9)
 
 
 needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 
-LEAVES = ("controller.K2", "observer.kf", "plant.mass", "plant.g", "initial.q", "disturbance.phase", "bounds.upper")
+LEAVES = (
+    "controller.K2",
+    "observer.kf",
+    "plant.mass",
+    "plant.g",
+    "initial.q",
+    "disturbance.phase",
+    "bounds.upper",
+)
 """Gains, the robot, the start, the world: one of every kind of leaf."""
-LIGHT = {"duration": 0.03, "dt": 1e-3, "method": "euler", "metrics": [ij.metrics.Tracking(), ij.metrics.Torque()]}
+LIGHT = {
+    "duration": 0.03,
+    "dt": 1e-3,
+    "method": "euler",
+    "metrics": [ij.metrics.Tracking(), ij.metrics.Torque()],
+}
 """A run whose derivatives by the scan compile soon."""
 
 
 def everything(scenario, **options):
     """Records and metrics of a run, the floats of them, as a function of the leaves LEAVES."""
-    start = {path: x for path, _, _, x in ij.parameters(scenario, named=False) if path.startswith(LEAVES)}
+    start = {
+        path: x for path, _, _, x in ij.parameters(scenario, named=False) if path.startswith(LEAVES)
+    }
 
     def run(values):
         made = ij.simulate(ij.with_parameters(scenario, values), **LIGHT, **options)
         recorded = set(ALWAYS)
-        return {name: x for name, x in {**vars(made), **made.metrics}.items() if name in recorded or name in made.metrics}
+        return {
+            name: x
+            for name, x in {**vars(made), **made.metrics}.items()
+            if name in recorded or name in made.metrics
+        }
 
     def floats(values):
         return {name: x for name, x in run(values).items() if jnp.issubdtype(x.dtype, jnp.floating)}
@@ -175,17 +237,24 @@ def everything(scenario, **options):
 
 @needs_compiler
 def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeypatch):
-    """Of all that is recorded and measured, by leaves of every kind, in both modes, in a batch and inside jit."""
+    """Of all that is recorded and measured, by leaves of every kind, in both modes, in a batch and
+    inside jit."""
     plain, start = everything(paper, backend="xla")
     expected, value = jax.jacfwd(plain)(start), plain(start)
     assert len(start) >= 10 and len(expected) > 20
     calls = []
-    monkeypatch.setattr(transformable, "_plain", lambda *args: calls.append(1) or (_ for _ in ()).throw(AssertionError("the scan")))
+    monkeypatch.setattr(
+        transformable,
+        "_plain",
+        lambda *args: calls.append(1) or (_ for _ in ()).throw(AssertionError("the scan")),
+    )
     run, _ = everything(paper)
 
     def all_close(found, wanted, rtol=1e-9):
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-            np.testing.assert_allclose(a, b, rtol=rtol, atol=1e-9 * max(1.0, float(np.max(np.abs(b), initial=0.0))))
+            np.testing.assert_allclose(
+                a, b, rtol=rtol, atol=1e-9 * max(1.0, float(np.max(np.abs(b), initial=0.0)))
+            )
 
     all_close(jax.jacfwd(run)(start), expected)
     found, pulled = jax.vjp(run, start)
@@ -199,33 +268,48 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
     two = jax.tree.map(lambda x: jnp.stack([x, x * (1 + 1e-3)]), start)
     batched = jax.jit(jax.vmap(lambda values: jax.jvp(run, (values,), (along,))[1]))(two)
     all_close(jax.tree.map(lambda x: x[0], batched), pushed)
-    all_close(jax.tree.map(lambda x: x[1], batched), jax.jvp(run, (jax.tree.map(lambda x: x[1], two),), (along,))[1])
+    all_close(
+        jax.tree.map(lambda x: x[1], batched),
+        jax.jvp(run, (jax.tree.map(lambda x: x[1], two),), (along,))[1],
+    )
     assert calls == []
 
 
 @needs_compiler
 def test_second_derivatives_are_the_kernels(paper, monkeypatch):
-    monkeypatch.setattr(transformable, "_plain", lambda *args: (_ for _ in ()).throw(AssertionError("the scan")))
+    monkeypatch.setattr(
+        transformable, "_plain", lambda *args: (_ for _ in ()).throw(AssertionError("the scan"))
+    )
 
     def ise(values):
-        return ij.simulate(ij.with_parameters(paper, {"controller.K2": values[:2], "plant.mass": values[2:]}), **LIGHT).metrics.ise.sum()
+        return ij.simulate(
+            ij.with_parameters(paper, {"controller.K2": values[:2], "plant.mass": values[2:]}),
+            **LIGHT,
+        ).metrics.ise.sum()
 
     at, width = jnp.asarray([20.0, 15.0, 1.5, 1.2]), 1e-4
     hessian = jax.hessian(ise)(at)
     moved = [at + sign * width * unit for unit in np.eye(4) for sign in (1, -1)]
     slopes = np.asarray([jax.grad(ise)(x) for x in moved]).reshape(4, 2, 4)
-    np.testing.assert_allclose(hessian, (slopes[:, 0] - slopes[:, 1]) / (2 * width), rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(
+        hessian, (slopes[:, 0] - slopes[:, 1]) / (2 * width), rtol=1e-5, atol=1e-10
+    )
     np.testing.assert_allclose(jax.jacrev(jax.grad(ise))(at), hessian, rtol=1e-9, atol=1e-14)
 
 
 @needs_compiler
 @pytest.mark.slow
 def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
-    """And says the same: by the step, where records would be too large, without a compiler, and where a step does not lower."""
+    """And says the same: by the step, where records would be too large, without a compiler, and
+    where a step does not lower."""
 
     def last(K2, dt):
         scenario = canonical(ij.with_parameters(paper, {"controller.K2": K2}))
-        return jnp.sum(transformable.run_transformable(scenario, (), dt, step.Run(30, "euler", 1)).records[0]["q"][-1])
+        return jnp.sum(
+            transformable.run_transformable(scenario, (), dt, step.Run(30, "euler", 1)).records[0][
+                "q"
+            ][-1]
+        )
 
     K2, dt, calls = jnp.asarray([20.0, 15.0]), jnp.asarray(1e-3), []
     expected, original = jax.grad(last)(K2, dt), transformable._plain
@@ -233,7 +317,9 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
     np.testing.assert_array_equal(jax.grad(last)(K2, dt), expected)
     assert calls == []
     slope = jax.grad(last, 1)(K2, dt)
-    np.testing.assert_allclose(slope, (last(K2, dt * 1.001) - last(K2, dt * 0.999)) / (2e-3 * dt), rtol=1e-5)
+    np.testing.assert_allclose(
+        slope, (last(K2, dt * 1.001) - last(K2, dt * 0.999)) / (2e-3 * dt), rtol=1e-5
+    )
 
     def no_kernel(*args):
         raise UnsupportedError("made up")
@@ -251,11 +337,14 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
 
 
 def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
-    """Once a structure, a length and a method are compiled, every other value runs the same program."""
+    """Once a structure, a length and a method are compiled, every other value runs the same
+    program."""
     ij.simulate(paper, **PAPER)
     traces = []
     original = step.advance
-    monkeypatch.setattr(step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options))
+    monkeypatch.setattr(
+        step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options)
+    )
     parts = (execute._before_steps, execute._steps, execute._after_steps)
     before = [part._cache_size() for part in parts]
     for changes in (
@@ -277,7 +366,9 @@ def test_a_new_structure_does_recompile(paper, monkeypatch):
     """So that the test above can fail."""
     traces = []
     execute._before_steps.clear_cache()
-    monkeypatch.setattr(execute, "begin", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(
+        execute, "begin", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt)
+    )
     with pytest.raises(KeyboardInterrupt):
         ij.simulate(paper, **SHORT, metrics=(ij.metrics.Torque(),))
     assert traces == [1]
@@ -286,7 +377,10 @@ def test_a_new_structure_does_recompile(paper, monkeypatch):
 @pytest.mark.parametrize("backend", ["native", "xla"])
 def test_another_length_compiles_the_steps_alone(paper, backend):
     def compiled():
-        return [part._cache_size() for part in (execute._before_steps, execute._steps, execute._after_steps)]
+        return [
+            part._cache_size()
+            for part in (execute._before_steps, execute._steps, execute._after_steps)
+        ]
 
     ij.simulate(paper, **SHORT, backend=backend)
     before = compiled()
@@ -298,9 +392,13 @@ def test_another_length_compiles_the_steps_alone(paper, backend):
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path, monkeypatch):
-    """With one warning if it was asked for, without one if it was not; another length is not tried again."""
+    """With one warning if it was asked for, without one if it was not; another length is not tried
+    again."""
     broken = tmp_path / "g++"
-    broken.write_text('#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho "error: no" >&2\nexit 1\n')
+    broken.write_text(
+        '#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho "error: no"'
+        " >&2\nexit 1\n"
+    )
     broken.chmod(0o755)
     short = {"duration": 0.1, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
     expected = ij.simulate(paper, **short)
@@ -312,7 +410,9 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     native._turner.cache_clear()
     with monkeypatch.context() as patch:
         patch.setenv("CXX", str(broken))
-        with pytest.warns(execute.BackendWarning, match="native backend is not available .*g.. failed"):
+        with pytest.warns(
+            execute.BackendWarning, match="native backend is not available .*g.. failed"
+        ):
             found = ij.simulate(paper, **short, backend="native")
         np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
         with warnings.catch_warnings():

@@ -39,7 +39,10 @@ jax.config.update("jax_enable_x64", True)
 objectives = ij.objectives
 SHORT = {"duration": 0.3, "dt": 1e-3, "method": "euler"}
 GAINS = ["controller.k1", "controller.K2", "observer.kf"]
-DRAWS = {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)), "initial.q": ij.offset(ij.uniform(-0.03, 0.03))}
+DRAWS = {
+    "plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3)),
+    "initial.q": ij.offset(ij.uniform(-0.03, 0.03)),
+}
 
 
 def objective():
@@ -71,7 +74,11 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
     reverse = problem.gradient(nominal.shared, lanes, formulation=nominal.formulation)
 
     def loss(z):
-        return np.asarray(problem.value(nominal.shared, nominal.lanes(z[None]), formulation=nominal.formulation).loss[0])
+        return np.asarray(
+            problem.value(
+                nominal.shared, nominal.lanes(z[None]), formulation=nominal.formulation
+            ).loss[0]
+        )
 
     expected = central(loss, z)
     scale = np.max(np.abs(expected))
@@ -83,7 +90,8 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
 
 @pytest.mark.slow
 def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
-    """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v (trapezoidal rule), with e1_u by finite differences of recorded runs."""
+    """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v (trapezoidal rule), with e1_u by finite
+    differences of recorded runs."""
     lanes = nominal.lanes(nominal.box.z[None])
     found = problem.slope(nominal.shared, lanes, formulation=nominal.formulation)
 
@@ -99,21 +107,31 @@ def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     shared = nominal.shared._replace(objective=only)
     formulation = nominal.formulation._replace(pieces=(1, nominal.formulation.pieces[-1]))
     one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), formulation=formulation)
-    np.testing.assert_allclose(one.hessian[0] * only.terms[0].scale, expected, rtol=1e-5, atol=1e-9 * np.max(expected))
+    np.testing.assert_allclose(
+        one.hessian[0] * only.terms[0].scale, expected, rtol=1e-5, atol=1e-9 * np.max(expected)
+    )
     assert np.all(np.isfinite(found.hessian))
 
 
 @pytest.mark.slow
 def test_reverse_mode_remembers_few_states(paper):
-    """Temporary memory of the gradient grows like the cube root of the number of steps, and stays below 2 sqrt(T) states."""
+    """Temporary memory of the gradient grows like the cube root of the number of steps, and stays
+    below 2 sqrt(T) states."""
     sizes = {}
     for steps in (500, 4000):
-        built = _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3})
-        compiled = problem.gradient.lower(built.shared, built.lanes(built.box.z[None]), formulation=built.formulation).compile()
+        built = _tune.build(
+            paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3}
+        )
+        compiled = problem.gradient.lower(
+            built.shared, built.lanes(built.box.z[None]), formulation=built.formulation
+        ).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
     folds = problem.fold_of(built.shared.objective, jnp.float64)
     inputs = Inputs(canonical(paper), folds, built.shared.dt, built.shared.dt)
-    state = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(carry_shapes(Batch.of(inputs, None), "rk4")))
+    state = sum(
+        x.size * x.dtype.itemsize
+        for x in jax.tree.leaves(carry_shapes(Batch.of(inputs, None), "rk4"))
+    )
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
@@ -148,15 +166,28 @@ def test_quantities_are_what_numpy_makes_of_the_records(paper):
     T = 0.1 * 0.05
     edges = [0.0, *np.asarray(parts[5].windows), np.inf]
     both = np.concatenate([run.lower - run.q, run.q - run.upper], axis=1)
-    pieces = np.stack([np.max(both[(t >= a - 1e-9) & (t < b - 1e-9)], axis=0) for a, b in itertools.pairwise(edges)])
-    np.testing.assert_allclose(run.metrics["tuning_smooth"][5], T * np.logaddexp.reduce(np.ravel(pieces) / T), rtol=1e-9)
+    pieces = np.stack(
+        [
+            np.max(both[(t >= a - 1e-9) & (t < b - 1e-9)], axis=0)
+            for a, b in itertools.pairwise(edges)
+        ]
+    )
+    np.testing.assert_allclose(
+        run.metrics["tuning_smooth"][5], T * np.logaddexp.reduce(np.ravel(pieces) / T), rtol=1e-9
+    )
     first = 4 + 4  # the integrals, one each, and the torque of two joints with both signs
-    np.testing.assert_allclose(run.metrics["tuning_pieces"][first : first + 12], pieces.ravel(), rtol=1e-9)
-    assert np.all(np.asarray(run.metrics["tuning_smooth"])[4:] >= np.asarray(run.metrics["tuning_exact"])[4:])
+    np.testing.assert_allclose(
+        run.metrics["tuning_pieces"][first : first + 12], pieces.ravel(), rtol=1e-9
+    )
+    assert np.all(
+        np.asarray(run.metrics["tuning_smooth"])[4:] >= np.asarray(run.metrics["tuning_exact"])[4:]
+    )
 
 
 def test_objectives_compose_and_messages_name_the_mend():
-    both = 2 * (objectives.tracking(scale=1.0) + 3 * objectives.effort(scale=2.0)) + objectives.margin_above(0.05)
+    both = 2 * (
+        objectives.tracking(scale=1.0) + 3 * objectives.effort(scale=2.0)
+    ) + objectives.margin_above(0.05)
     assert [t.name for t in both.terms] == ["tracking", "effort"]
     assert [float(t.weight) for t in both.terms] == [2.0, 6.0]
     assert [r.name for r in (objectives.error_below(0.01, after=1.0) + both).requirements] == [
@@ -182,7 +213,9 @@ def test_risks():
 
 
 def test_bijections_keep_inside_and_invert():
-    box = Box(np.zeros(4), np.array([-1.0, 0.0, -np.inf, -np.inf]), np.array([2.0, np.inf, 3.0, np.inf]))
+    box = Box(
+        np.zeros(4), np.array([-1.0, 0.0, -np.inf, -np.inf]), np.array([2.0, np.inf, 3.0, np.inf])
+    )
     z = np.array([0.5, 0.7, 1.0, -5.0])
     np.testing.assert_allclose(squash(jnp.asarray(unsquash(z, box)), box), z, rtol=1e-12)
     for w in (-50.0, 50.0):
@@ -193,7 +226,9 @@ def test_bijections_keep_inside_and_invert():
 
 @pytest.mark.slow
 def test_default_limits_keep_the_conditions_and_the_step(paper):
-    blocks, box = layout(canonical(paper), [*GAINS, ij.tunable("controller.o", tied=True)], 1e-3, "rk4")
+    blocks, box = layout(
+        canonical(paper), [*GAINS, ij.tunable("controller.o", tied=True)], 1e-3, "rk4"
+    )
     low, high = np.exp(box.low), np.exp(box.high)
     assert [b.path for b in blocks] == [*GAINS, "controller.o"]
     assert blocks[-1].size == 1
@@ -203,8 +238,11 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
     run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
     assert run.ok
     assert 1e-3 * float(run.fastest_mode) > 1.2
-    # Together they keep to the same share of the step, which each alone would leave free to a larger range.
-    together = ij.with_parameters(paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]})
+    # Together they keep to the same share of the step, which each alone would leave free to a
+    # larger range.
+    together = ij.with_parameters(
+        paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]}
+    )
     mode = 1e-3 * fastest_along(canonical(together), TIMES)
     assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
     _, alone = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
@@ -220,7 +258,11 @@ def test_a_quadratic_programme_is_solved_with_its_multipliers():
     rng = np.random.default_rng(0)
     for _ in range(20):
         root, c, A = rng.normal(size=(3, 5)), rng.normal(size=5), rng.normal(size=(8, 5))
-        H, A, b = root.T @ root, np.concatenate([A, np.eye(5), -np.eye(5)]), np.concatenate([rng.uniform(0.1, 1, 8), np.full(10, 0.5)])
+        H, A, b = (
+            root.T @ root,
+            np.concatenate([A, np.eye(5), -np.eye(5)]),
+            np.concatenate([rng.uniform(0.1, 1, 8), np.full(10, 0.5)]),
+        )
         x, y = quadratic.solve(H, c, A, b)
         slack = b - A @ x
         np.testing.assert_allclose(H @ x + c + A.T @ y, 0.0, atol=1e-8)
@@ -228,8 +270,8 @@ def test_a_quadratic_programme_is_solved_with_its_multipliers():
 
 
 class TwoPieces:
-    """An evaluator of (z0 - 2)^2 + (z1 - 2)^2 with g = the larger of z0^2 + z1^2 - 1 and z0 - `most`, in each of two runs, the second
-    of which is further from its limit."""
+    """An evaluator of (z0 - 2)^2 + (z1 - 2)^2 with g = the larger of z0^2 + z1^2 - 1 and z0 -
+    `most`, in each of two runs, the second of which is further from its limit."""
 
     def __init__(self, most):
         self.most = most
@@ -243,28 +285,43 @@ class TwoPieces:
         return problem.Slope(value, slope, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), *two)
 
 
-@pytest.mark.parametrize(("share", "shift"), [(0.0, 0.0), (1.0, 0.25)], ids=["every run", "the mean of both"])
+@pytest.mark.parametrize(
+    ("share", "shift"), [(0.0, 0.0), (1.0, 0.25)], ids=["every run", "the mean of both"]
+)
 @pytest.mark.parametrize("most", [0.2, 5.0], ids=["corner", "circle"])
 def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
-    """The optimum on a circle, and at the corner of a circle and a line; moved outwards where the mean of two runs counts."""
+    """The optimum on a circle, and at the corner of a circle and a line; moved outwards where the
+    mean of two runs counts."""
     box = Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0))
     method = Newton(box, 1e-10, limits=Pieces.of((2,), (share,), 2), runs=2)
     state = method.init(np.array([[3.0, -1.0]]))
     for _ in range(12):
         method.step(TwoPieces(most), state)
     radius, x = np.sqrt(1 + shift), most + shift
-    point = np.array([x, np.sqrt(radius**2 - x**2)]) if x < radius / np.sqrt(2) else np.full(2, radius / np.sqrt(2))
+    point = (
+        np.array([x, np.sqrt(radius**2 - x**2)])
+        if x < radius / np.sqrt(2)
+        else np.full(2, radius / np.sqrt(2))
+    )
     np.testing.assert_allclose(state["z"][0], point, atol=2e-5)
     gradients = np.array([2 * point, [1.0, 0.0]]).T
-    y = np.linalg.lstsq(gradients if x < radius / np.sqrt(2) else gradients[:, :1], 2 * (2 - point), rcond=None)[0]
+    y = np.linalg.lstsq(
+        gradients if x < radius / np.sqrt(2) else gradients[:, :1], 2 * (2 - point), rcond=None
+    )[0]
     assert state["prices"][0, 0] == pytest.approx(y.sum(), rel=1e-3)
     assert state["done"][0] and np.all(state["residuals"][0] < 1e-3)
 
 
 def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
-    """With room for one piece a requirement the one that leaves is forgotten, and the optimum is found all the same."""
+    """With room for one piece a requirement the one that leaves is forgotten, and the optimum is
+    found all the same."""
     monkeypatch.setattr(newton, "MOST_BENT", 1)
-    method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-10, limits=Pieces.of((2,), (0.0,), 2), runs=2)
+    method = Newton(
+        Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)),
+        1e-10,
+        limits=Pieces.of((2,), (0.0,), 2),
+        runs=2,
+    )
     state = method.init(np.array([[3.0, -1.0]]))
     for _ in range(20):
         method.step(TwoPieces(5.0), state)
@@ -275,7 +332,8 @@ def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])
 def test_a_region_that_has_collapsed_is_no_optimum(sign):
-    """|z|^2 with its gradient, and with the opposite one: nothing is foretold there, however short the step."""
+    """|z|^2 with its gradient, and with the opposite one: nothing is foretold there, however short
+    the step."""
 
     def evaluate(z):
         value = problem.Value(np.sum(z**2, axis=1))
@@ -291,7 +349,8 @@ def test_a_region_that_has_collapsed_is_no_optimum(sign):
 
 
 def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
-    """The circle and z0 > 1.5, another requirement: between them the sum of both is least at the end of the circle."""
+    """The circle and z0 > 1.5, another requirement: between them the sum of both is least at the
+    end of the circle."""
 
     class Both(TwoPieces):
         def __call__(self, z):
@@ -299,7 +358,12 @@ def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
             found.excess[:, :, 1], found.slopes[:, :, :, 1] = 1.5 - z[:, :1], np.array([-1.0, 0.0])
             return found
 
-    method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-8, limits=Pieces.of((1, 1), (0.0, 0.0), 2), runs=2)
+    method = Newton(
+        Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)),
+        1e-8,
+        limits=Pieces.of((1, 1), (0.0, 0.0), 2),
+        runs=2,
+    )
     state = method.init(np.array([[0.3, -0.7]]))
     for _ in range(40):
         method.step(Both(5.0), state)
@@ -309,7 +373,8 @@ def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
 
 
 class Valleys:
-    """Seven coordinates and a requirement that does not bind; a broad valley at -1, a deeper one at 1."""
+    """Seven coordinates and a requirement that does not bind; a broad valley at -1, a deeper one at
+    1."""
 
     LOW, DEEP = 1.3, 1.0
 
@@ -317,9 +382,19 @@ class Valleys:
         a, b = self.LOW + np.sum((z + 1) ** 2, axis=1), self.DEEP + 3 * np.sum((z - 1) ** 2, axis=1)
         f, eye = np.minimum(a, b), np.eye(z.shape[1])
         gradient = np.where((a < b)[:, None], 2 * (z + 1), 6 * (z - 1))
-        value = problem.Value(f, f, f[:, None], -np.ones((len(z), 1)), -np.ones((len(z), 1)), np.ones(len(z)), np.ones(len(z), bool))
+        value = problem.Value(
+            f,
+            f,
+            f[:, None],
+            -np.ones((len(z), 1)),
+            -np.ones((len(z), 1)),
+            np.ones(len(z)),
+            np.ones(len(z), bool),
+        )
         hessian = np.where((a < b)[:, None, None], 2 * eye, 6 * eye)
-        return problem.Slope(value, gradient, hessian, -np.ones((len(z), 1, 1)), np.zeros((len(z), 1, z.shape[1], 1)))
+        return problem.Slope(
+            value, gradient, hessian, -np.ones((len(z), 1, 1)), np.zeros((len(z), 1, z.shape[1], 1))
+        )
 
 
 class Turns(Valleys):
@@ -329,7 +404,9 @@ class Turns(Valleys):
         self.evaluations, self.needed = 0, np.ones(2, bool)
         self.lanes = SimpleNamespace(index=np.zeros((2, 1)), _replace=lambda **changes: self.lanes)
         self.formulation = SimpleNamespace(shares=(0.0,))
-        self.shared = SimpleNamespace(objective=objectives.tracking(), _replace=lambda **changes: self.shared)
+        self.shared = SimpleNamespace(
+            objective=objectives.tracking(), _replace=lambda **changes: self.shared
+        )
 
     def __call__(self, z):
         self.evaluations += int(self.needed.sum())
@@ -340,7 +417,9 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 4.0))
     valleys = Valleys()
     probes = Probes(lambda z: valleys(z).value, box, 0, lambda z: False)
-    assert probes.count == len(probes.points) == 14 * 7 and np.all(np.abs(probes.points - box.z) <= REACH)
+    assert probes.count == len(probes.points) == 14 * 7 and np.all(
+        np.abs(probes.points - box.z) <= REACH
+    )
     first = probes.points[0]
     assert np.sum((first + 1) ** 2) < np.sum((probes.points[-1] + 1) ** 2)
     assert np.max(np.abs(probes.best(first[None]) - first)) > APART
@@ -361,26 +440,40 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
 
 @pytest.mark.slow
 def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
-    parameters = [ij.tunable("controller.k1", 0.1, 100), ij.tunable("controller.K2", 0.6, 40), ij.tunable("observer.kf", 1.01, 100)]
+    parameters = [
+        ij.tunable("controller.k1", 0.1, 100),
+        ij.tunable("controller.K2", 0.6, 40),
+        ij.tunable("observer.kf", 1.01, 100),
+    ]
     best = ij.tune(paper, parameters, objective(), iterations=25, **SHORT)
     first = best.history["objective"][0, 0]
     assert best.objective < 0.75 * first
     x = best.history["x"]
     assert np.all(x[..., 2:4] >= 0.6 - 1e-12)
     assert np.all(x[..., 0:2] <= 100 + 1e-9)
-    np.testing.assert_allclose(best.values["controller.K2"], np.asarray(best.scenario.controller.K2))
+    np.testing.assert_allclose(
+        best.values["controller.K2"], np.asarray(best.scenario.controller.K2)
+    )
     assert "one nominal run" in str(best.report)
     assert best.report.improved
     again = ij.simulate(best.scenario, **SHORT).metrics
     before = ij.simulate(paper, **SHORT).metrics
-    assert best.report.changes[1].after == pytest.approx(float(again.ise.sum() / before.ise.sum()), rel=1e-9)
+    assert best.report.changes[1].after == pytest.approx(
+        float(again.ise.sum() / before.ise.sum()), rel=1e-9
+    )
 
 
 @pytest.mark.slow
 def test_an_infeasible_start_finds_its_way_in(paper):
-    weak = ij.with_parameters(paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]})
+    weak = ij.with_parameters(
+        paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]}
+    )
     assert int(plain_status(weak)) & ij.Status.BOUND_VIOLATED
-    wanted = objectives.effort() + objectives.margin_above(0.06) + objectives.violation_probability_below(0.01)
+    wanted = (
+        objectives.effort()
+        + objectives.margin_above(0.06)
+        + objectives.violation_probability_below(0.01)
+    )
     best = ij.tune(weak, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
     assert int(plain_status(best.scenario)) & ij.Status.BOUND_VIOLATED == 0
     assert best.report.passed, best.report
@@ -389,7 +482,8 @@ def test_an_infeasible_start_finds_its_way_in(paper):
 
 @pytest.mark.slow
 def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
-    """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just so."""
+    """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just
+    so."""
     wanted = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
     best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
@@ -398,11 +492,14 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
 
 @pytest.mark.slow
 def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
-    """Against the optima themselves, with the limit moved by 1 % to both sides; few values are needed for each."""
+    """Against the optima themselves, with the limit moved by 1 % to both sides; few values are
+    needed for each."""
     gains = ["controller.k1", "controller.K2"]
 
     def tuned(limit):
-        wanted = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(limit)
+        wanted = (
+            objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(limit)
+        )
         return ij.tune(paper, gains, wanted, tolerance=1e-7, **SHORT)
 
     tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
@@ -410,7 +507,9 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
     assert best.prices == pytest.approx({"peak torque < 9 N m": price}, rel=0.02)
     assert price > 1e-3 and best.stopped == "converged" and best.evaluations <= 30
     assert 8.99 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 9.0
-    assert f"would fall by {best.prices['peak torque < 9 N m']:.3g} for each N m" in str(best.report)
+    assert f"would fall by {best.prices['peak torque < 9 N m']:.3g} for each N m" in str(
+        best.report
+    )
     gradient, excess, complementarity = best.residuals
     assert gradient < 1e-2 * best.objective and excess == 0 and complementarity < 1e-4
     assert "dt / 2: objective" in str(best.report)
@@ -427,18 +526,32 @@ def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
     for factor in (0.9, 1.1):  # no gains near these break them less
         for path, value in best.values.items():
             near = np.maximum(value * factor, 0.505)
-            assert np.max(ij.simulate(ij.with_parameters(best.scenario, {path: near}), **SHORT).metrics.peak_torque) > peak - 1e-3
+            assert (
+                np.max(
+                    ij.simulate(
+                        ij.with_parameters(best.scenario, {path: near}), **SHORT
+                    ).metrics.peak_torque
+                )
+                > peak - 1e-3
+            )
     assert best.prices == {}
     priceless = ij.tune(paper, ["controller.k1"], objectives.tracking(), iterations=1, **SHORT)
     assert any("no price on torque" in line for line in priceless.notes)
-    assert any("WARNING: not converged: give more iterations than 1" in line for line in priceless.notes)
-    assert any("WARNING: no optimum: give several starts" in line for line in dataclasses.replace(priceless, stopped=STUCK).notes)
+    assert any(
+        "WARNING: not converged: give more iterations than 1" in line for line in priceless.notes
+    )
+    assert any(
+        "WARNING: no optimum: give several starts" in line
+        for line in dataclasses.replace(priceless, stopped=STUCK).notes
+    )
     far = dataclasses.replace(priceless, values={"controller.k1": np.array([2.0, 210.0])})
     assert [line for line in far.notes if "controller.k1[1] ended at 105 times its start" in line]
 
 
 def plain_status(scenario):
-    return jax.jit(lambda s: run_transformable(s, standard(), jnp.asarray(1e-3), Run(300, "euler")).status)(scenario)
+    return jax.jit(
+        lambda s: run_transformable(s, standard(), jnp.asarray(1e-3), Run(300, "euler")).status
+    )(scenario)
 
 
 class Cliff:
@@ -447,8 +560,19 @@ class Cliff:
     def __call__(self, z):
         loss = np.where(z[:, 0] > 1, np.nan, -z[:, 0])
         valid = np.isfinite(loss)
-        value = problem.Value(np.where(valid, loss, np.inf), loss, loss[:, None], z[:, :0], z[:, :0], loss, valid, loss)
-        return problem.Slope(value, np.where(valid[:, None], -np.ones_like(z), np.nan), np.zeros((len(z), 1, 1)))
+        value = problem.Value(
+            np.where(valid, loss, np.inf),
+            loss,
+            loss[:, None],
+            z[:, :0],
+            z[:, :0],
+            loss,
+            valid,
+            loss,
+        )
+        return problem.Slope(
+            value, np.where(valid[:, None], -np.ones_like(z), np.nan), np.zeros((len(z), 1, 1))
+        )
 
 
 @pytest.mark.parametrize("name", ["newton", "adam"])
@@ -478,14 +602,20 @@ class Bowl:
         value, gradient = jax.vmap(jax.value_and_grad(loss))(lanes.z)
         valid = jnp.isfinite(value)
         empty = lanes.z[:, :0]
-        found = problem.Value(jnp.where(valid, value, jnp.inf), value, empty, empty, empty, value, valid, empty)
+        found = problem.Value(
+            jnp.where(valid, value, jnp.inf), value, empty, empty, empty, value, valid, empty
+        )
         return problem.Slope(found, gradient, jnp.zeros((len(value), 2, 2)))
 
     def row(self, s):
-        return None, problem.Lane(jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.zeros((1, 0)), jnp.ones(1))
+        return None, problem.Lane(
+            jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.zeros((1, 0)), jnp.ones(1)
+        )
 
     def __call__(self, z):
-        return jax.tree.map(np.asarray, self.derive(None, self.row(0)[1]._replace(z=jnp.asarray(z))))
+        return jax.tree.map(
+            np.asarray, self.derive(None, self.row(0)[1]._replace(z=jnp.asarray(z)))
+        )
 
 
 @pytest.mark.slow
@@ -501,13 +631,20 @@ def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
 
 
 class Corner:
-    """An evaluator of max(x, -2 x), x = z - 0.3, smoothed as its objective says: the smooth maximum has its bottom elsewhere."""
+    """An evaluator of max(x, -2 x), x = z - 0.3, smoothed as its objective says: the smooth maximum
+    has its bottom elsewhere."""
 
     def __init__(self, starts):
         goal = jax.tree.map(jnp.asarray, objectives.peak_torque(1.0, smoothing=0.2))
         self.shared = problem.ProblemInputs(None, goal, jnp.asarray(1e-3))
         self.formulation = problem.Formulation((), (), 1, "euler", Risk("mean"), ())
-        self.lanes = problem.Lane(np.zeros((starts, 1)), np.zeros((starts, 1), np.uint32), np.ones((starts, 1)), np.zeros((starts, 0)), 1.0)
+        self.lanes = problem.Lane(
+            np.zeros((starts, 1)),
+            np.zeros((starts, 1), np.uint32),
+            np.ones((starts, 1)),
+            np.zeros((starts, 0)),
+            1.0,
+        )
         self.needed, self.evaluations = np.ones(starts, bool), 0
 
     def __call__(self, z):
@@ -520,13 +657,27 @@ class Corner:
         curved = (weight @ slope**2 - mean**2) / T
         self.evaluations += int(self.needed.sum())
         none = np.zeros((len(z), 0))
-        value = problem.Value(loss, exact, exact[:, None], none, none, np.ones(len(z)), self.needed.copy(), exact[:, None])
+        value = problem.Value(
+            loss,
+            exact,
+            exact[:, None],
+            none,
+            none,
+            np.ones(len(z)),
+            self.needed.copy(),
+            exact[:, None],
+        )
         return problem.Slope(value, mean[:, None], curved[:, None, None])
 
 
 def followed(starts, sharpenings, steps=60, resumed=None, stop=None):
     box = Box(np.zeros(1), np.full(1, -3.0), np.full(1, 3.0))
-    loop = Loop(Corner(len(starts)), _tune.make_method("newton", box, 60, 1e-6, 0.1), np.asarray(starts)[:, None], sharpenings=sharpenings)
+    loop = Loop(
+        Corner(len(starts)),
+        _tune.make_method("newton", box, 60, 1e-6, 0.1),
+        np.asarray(starts)[:, None],
+        sharpenings=sharpenings,
+    )
     if resumed:
         load_checkpoint(resumed, loop, "mark")
     loop.run(stop or steps, tolerance=1e-6, patience=60, on_step=lambda _: None)
@@ -562,7 +713,9 @@ def test_only_needed_starts_are_evaluated_in_groups_of_one_shape(nominal):
     evaluator.needed[[3, 7]] = False
     found = evaluator(lanes.z)
     assert shapes == {(16, 6)} and evaluator.evaluations == 18
-    np.testing.assert_array_equal(found.value.loss, np.where(evaluator.needed, np.arange(20.0), np.inf))
+    np.testing.assert_array_equal(
+        found.value.loss, np.where(evaluator.needed, np.arange(20.0), np.inf)
+    )
     np.testing.assert_array_equal(found.value.valid, evaluator.needed)
 
 
@@ -585,7 +738,8 @@ def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypa
 
 
 def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeypatch):
-    """The nominal run may be fine where some perturbed ones are not: dry friction of a narrow width is what no gain makes slower."""
+    """The nominal run may be fine where some perturbed ones are not: dry friction of a narrow width
+    is what no gain makes slower."""
     lane = jax.tree.map(lambda x: x[0], nominal.lanes(nominal.box.z[None]))
     status = np.array([0, int(ij.Status.STEP_TOO_LARGE), 0, int(ij.Status.BOUND_VIOLATED)])
     smooth = np.ones((4, len(nominal.shared.objective.quantities) + 1))
@@ -596,7 +750,9 @@ def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeyp
     monkeypatch.setattr(nominal, "step", lambda: 2e-4)
     seen = jax.tree.map(lambda x: np.asarray(x)[None], found)
     monkeypatch.setattr(nominal, "values", lambda z: seen)
-    with pytest.raises(ValueError, match=r"only 2 of 4 runs can be integrated.*Take dt=0.0002, not 0.001 s"):
+    with pytest.raises(
+        ValueError, match=r"only 2 of 4 runs can be integrated.*Take dt=0.0002, not 0.001 s"
+    ):
         _tune.look_around(nominal, 0, nominal.box.z[None])
 
 
@@ -606,7 +762,15 @@ def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeyp
 @pytest.fixture(scope="module")
 def robust(paper):
     return ij.tune(
-        paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=8, risk=ij.cvar(0.75), iterations=8, report_runs=256, **SHORT
+        paper,
+        GAINS,
+        objectives.tracking(),
+        perturbations=DRAWS,
+        runs=8,
+        risk=ij.cvar(0.75),
+        iterations=8,
+        report_runs=256,
+        **SHORT,
     )
 
 
@@ -629,7 +793,9 @@ def test_a_change_that_is_not_significant_is_called_so(robust, paper):
     from iblf_jax.tuning.report import make_report
 
     known = robust.values, robust.setup.objective, DRAWS
-    report = make_report(paper, paper, *known, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=SHORT)
+    report = make_report(
+        paper, paper, *known, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=SHORT
+    )
     assert report.changes[0].significant is False
     assert "NOT significant" in str(report)
     assert "do not show that tuning helped" in str(report)
@@ -638,19 +804,44 @@ def test_a_change_that_is_not_significant_is_called_so(robust, paper):
 
 @pytest.mark.slow
 def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
-    best = ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, starts=2, resample=True, iterations=3, **SHORT)
+    best = ij.tune(
+        paper,
+        GAINS,
+        objectives.tracking(),
+        perturbations=DRAWS,
+        runs=4,
+        starts=2,
+        resample=True,
+        iterations=3,
+        **SHORT,
+    )
     assert best.optimiser == "adam"
     assert best.history["loss"].shape == (3, 2)
     with pytest.raises(ValueError, match="adam"):
-        ij.tune(paper, GAINS, objectives.tracking(), perturbations=DRAWS, runs=4, resample=True, optimiser="newton", **SHORT)
+        ij.tune(
+            paper,
+            GAINS,
+            objectives.tracking(),
+            perturbations=DRAWS,
+            runs=4,
+            resample=True,
+            optimiser="newton",
+            **SHORT,
+        )
 
 
 @pytest.mark.slow
 def test_common_random_numbers(paper):
     """The same draws for every start and every step; other seeds give others."""
-    built = [_tune.build(paper, GAINS, objectives.tracking(scale=1.0), DRAWS, 4, seed, "mean", SHORT) for seed in (0, 0, 1)]
+    built = [
+        _tune.build(paper, GAINS, objectives.tracking(scale=1.0), DRAWS, 4, seed, "mean", SHORT)
+        for seed in (0, 0, 1)
+    ]
     z = np.stack([built[0].box.z] * 2)
-    losses = [np.asarray(CountedProblem(p.formulation, p.shared, p.lanes(z), "forward")(z).value.loss) for p in built]
+    losses = [
+        np.asarray(CountedProblem(p.formulation, p.shared, p.lanes(z), "forward")(z).value.loss)
+        for p in built
+    ]
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
 
 
@@ -674,7 +865,10 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
     env = os.environ | {"PYTHONPATH": str(Path(ij.__file__).parents[1])}
 
     def start(checkpoint, pace, out):
-        return subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / checkpoint), pace, str(tmp_path / out)], env=env)
+        return subprocess.Popen(
+            [sys.executable, "-c", KILLED, str(tmp_path / checkpoint), pace, str(tmp_path / out)],
+            env=env,
+        )
 
     killed = start("a.npz", "slow", "never.npz")
     deadline = time.monotonic() + 300
@@ -688,7 +882,9 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
     with np.load(tmp_path / "a.npz") as half:
         assert 1 <= len(half["history_loss"]) < 12
     assert start("a.npz", "fast", "resumed.npz").wait() == 0
-    monkeypatch.setattr(sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "whole.npz")])
+    monkeypatch.setattr(
+        sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "whole.npz")]
+    )
     exec(KILLED, {})
     with np.load(tmp_path / "resumed.npz") as resumed, np.load(tmp_path / "whole.npz") as whole:
         assert set(resumed.files) == set(whole.files)
@@ -715,9 +911,14 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
 
 @pytest.mark.parametrize(("runs", "share"), [(300, 0.3), (60, 0.1)])
 def test_a_share_of_many_runs_is_in_the_programme(runs, share):
-    """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down, whatever the number of the worst."""
+    """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down,
+    whatever the number of the worst."""
     pieces = Pieces.of((1,), (share,), runs)
     excess, slopes = np.full((runs, 1), 0.2), np.ones((runs, 1, 1))
-    found = planned(np.array([-1.0]), np.eye(1), np.array([-1.0]), np.array([1.0]), pieces, excess, slopes, 10.0)
+    found = planned(
+        np.array([-1.0]), np.eye(1), np.array([-1.0]), np.array([1.0]), pieces, excess, slopes, 10.0
+    )
     np.testing.assert_allclose(found.step, -0.2, atol=1e-4)
-    np.testing.assert_allclose(found.prices, 1.2, rtol=1e-3)  # 1 - z, what the objective's slope is there
+    np.testing.assert_allclose(
+        found.prices, 1.2, rtol=1e-3
+    )  # 1 - z, what the objective's slope is there

@@ -58,8 +58,14 @@ def run_again(attack):
 @pytest.mark.parametrize(
     "sets",
     [
-        {"initial.q": ij.value(ij.uniform(0.2, 1.2)), "initial.dq": ij.value(ij.uniform(-3.0, 3.0))},
-        {"reference.amplitude": ij.value(ij.uniform(0.0, 0.8)), "reference.frequency": ij.value(ij.uniform(0.0, 3.0))},
+        {
+            "initial.q": ij.value(ij.uniform(0.2, 1.2)),
+            "initial.dq": ij.value(ij.uniform(-3.0, 3.0)),
+        },
+        {
+            "reference.amplitude": ij.value(ij.uniform(0.0, 0.8)),
+            "reference.frequency": ij.value(ij.uniform(0.0, 3.0)),
+        },
     ],
     ids=["start over its bound", "reference over its bound"],
 )
@@ -73,14 +79,18 @@ def test_falsify_returns_what_can_be_run(paper, sets):
 
 
 def test_falsify_refuses_sets_without_an_admissible_run(paper):
-    with pytest.raises(ValueError, match=r"perturbations: got \{'initial.q': .*start inside the bounds .*Narrow"):
+    with pytest.raises(
+        ValueError, match=r"perturbations: got \{'initial.q': .*start inside the bounds .*Narrow"
+    ):
         ij.falsify(paper, {"initial.q": ij.value(ij.uniform(1.1, 1.2))}, starts=2, **SHORT)
 
 
 @pytest.fixture(scope="module")
 def front(paper):
     pair = (ij.objectives.tracking(), ij.objectives.effort())
-    return ij.pareto(paper, ["controller.k1", "controller.K2"], pair, points=4, iterations=10, **SHORT)
+    return ij.pareto(
+        paper, ["controller.k1", "controller.K2"], pair, points=4, iterations=10, **SHORT
+    )
 
 
 @pytest.mark.slow
@@ -92,10 +102,18 @@ def test_pareto_is_a_front(paper, front):
     assert not np.any(np.all(front.tried[:, None] < front.objectives[None] - 1e-12, axis=-1))
     assert a[0] < front.first[0]
     assert b[-1] < front.first[1]
-    again = ij.simulate(front.scenario(0), **SHORT).metrics.ise.sum() / ij.simulate(paper, **SHORT).metrics.ise.sum()
+    again = (
+        ij.simulate(front.scenario(0), **SHORT).metrics.ise.sum()
+        / ij.simulate(paper, **SHORT).metrics.ise.sum()
+    )
     assert float(again) == pytest.approx(a[0], rel=1e-9)
     with pytest.raises(ValueError, match="one plain term"):
-        ij.pareto(paper, ["controller.k1"], (ij.objectives.tracking(), ij.objectives.peak_torque()), **SHORT)
+        ij.pareto(
+            paper,
+            ["controller.k1"],
+            (ij.objectives.tracking(), ij.objectives.peak_torque()),
+            **SHORT,
+        )
 
 
 def area(points, corner):
@@ -107,13 +125,21 @@ def area(points, corner):
 
 @pytest.mark.slow
 def test_a_front_has_its_ends_and_no_gaps(paper):
-    """Beside a dense grid over both gains; a limit on the margin cuts the grid's front and this one alike."""
-    gains = [ij.tunable("controller.k1", 0.3, 60.0, tied=True), ij.tunable("controller.K2", 0.6, 60.0, tied=True)]
-    limit = ij.objectives.margin_above(0.9 * float(np.min(ij.simulate(paper, **SHORT).metrics.margin)))
+    """Beside a dense grid over both gains; a limit on the margin cuts the grid's front and this one
+    alike."""
+    gains = [
+        ij.tunable("controller.k1", 0.3, 60.0, tied=True),
+        ij.tunable("controller.K2", 0.6, 60.0, tied=True),
+    ]
+    limit = ij.objectives.margin_above(
+        0.9 * float(np.min(ij.simulate(paper, **SHORT).metrics.margin))
+    )
     pair = (ij.objectives.tracking(), ij.objectives.effort() + limit)
     front = ij.pareto(paper, gains, pair, iterations=12, progress=False, **SHORT)
     built = _tune.build(paper, gains, pair[0] + pair[1], None, 1, 0, "mean", SHORT)
-    axes = (np.linspace(low, high, 40) for low, high in zip(built.box.low, built.box.high, strict=True))
+    axes = (
+        np.linspace(low, high, 40) for low, high in zip(built.box.low, built.box.high, strict=True)
+    )
     z = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     seen = problem.value(built.shared, built.lanes(z), formulation=built.formulation)
     kept = np.asarray(seen.valid & (seen.margin > 0) & (seen.exact_excess[:, 0] <= 0))
@@ -132,7 +158,11 @@ def test_a_front_has_its_ends_and_no_gaps(paper):
 def test_a_front_asks_for_the_middle_of_its_largest_gap_once():
     """What no level fills is a gap of the front, and is not asked for again."""
     search = _pareto.Search(SimpleNamespace(box=SimpleNamespace(z=np.zeros(1))), 8, 1, 0.0)
-    search.z, search.terms, search.nodes = np.array([[0.0], [1.0], [3.0]]), np.exp([[0.0, 9.0], [1.0, 5.0], [1.5, 0.0]]), [0, 1, 2]
+    search.z, search.terms, search.nodes = (
+        np.array([[0.0], [1.0], [3.0]]),
+        np.exp([[0.0, 9.0], [1.0, 5.0], [1.5, 0.0]]),
+        [0, 1, 2],
+    )
     z, aims, levels = search.largest_gaps(8)
     np.testing.assert_array_equal((z[:, 0], aims, levels), ([2.0, 0.5], [0, 0], [2.5, 7.0]))
     search.asked = [(1, 2.5), (1, 7.0)]
@@ -182,7 +212,12 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     text = capsys.readouterr().out
     assert "requirement margin > 0.02 rad" in text
     assert "fresh runs" in text
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"scenario.toml", "tuning.json", "report.txt", "tuning.png"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "scenario.toml",
+        "tuning.json",
+        "report.txt",
+        "tuning.png",
+    }
     loaded = ij.load_tuning(tmp_path / "out" / "tuning.json")
     assert str(loaded.report) in text
     tuned = ij.load_scenario(tmp_path / "out" / "scenario.toml")
@@ -197,34 +232,55 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
 
 
 def _check_torque_and_ends(paper, best, figure):
-    """Report, repr and figure show both, although the objective asked for neither; the legend covers no curve."""
-    peaks = [np.asarray(ij.simulate(scenario, **SHORT).metrics.peak_torque) for scenario in (paper, best.scenario)]
+    """Report, repr and figure show both, although the objective asked for neither; the legend
+    covers no curve."""
+    peaks = [
+        np.asarray(ij.simulate(scenario, **SHORT).metrics.peak_torque)
+        for scenario in (paper, best.scenario)
+    ]
     assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5, "as given")
     for text in (repr(best), str(best.report)):
         assert "controller.k1[0] = 2.5 is at the upper end of its range, 2.5" in text
-    assert f"peak torque of the nominal run: {peaks[0].max():.5g} -> {peaks[1].max():.5g} N m" in repr(best)
+    assert (
+        f"peak torque of the nominal run: {peaks[0].max():.5g} -> {peaks[1].max():.5g} N m"
+        in repr(best)
+    )
     before, after = (", ".join(f"{x:.5g}" for x in peak) for peak in peaks)
     assert f"peak torque, joint by joint: {before} -> {after} N m" in str(best.report)
     figure._repr_png_()
     assert "at the end of their range: controller.k1[0]" in figure.get_suptitle().replace("\n", " ")
     panels = {axes.get_ylabel(): axes for axes in figure.axes}
-    assert [text.get_text() for text in panels["peak torque [N m]"].texts] == [f"{x:.5g}" for x in np.concatenate(peaks)]
+    assert [text.get_text() for text in panels["peak torque [N m]"].texts] == [
+        f"{x:.5g}" for x in np.concatenate(peaks)
+    ]
     gains = panels["gain, relative to start"]
     assert not gains.get_legend().get_window_extent().overlaps(gains.get_window_extent())
-    assert "controller.k1[0] (at its upper limit 2.5)" in [text.get_text() for text in gains.get_legend().get_texts()]
+    assert "controller.k1[0] (at its upper limit 2.5)" in [
+        text.get_text() for text in gains.get_legend().get_texts()
+    ]
 
 
 def test_ends_of_ranges_are_found_at_zero_and_where_there_is_none():
-    """1 % of the limit, or of the range where the limit is 0; an infinite limit is never reached."""
+    """1 % of the limit, or of the range where the limit is 0; an infinite limit is never
+    reached."""
     limits = ((0.0, 100.0), (1.01, np.inf), (-np.inf, 50.0), (1.0, 9.0))
     values = {"a": np.array(0.5), "b": np.array(1.011), "c": np.array(49.8), "d": np.array(5.0)}
     setup = SimpleNamespace(limits=limits, reasons=())
-    result = TuneResult(None, None, values, ("a", "b", "c", "d"), {}, 0, "", "newton", "forward", 0.0, setup)
-    assert {name: end.side for name, end in result.at_limits.items()} == {"a": "lower", "b": "lower", "c": "upper"}
+    result = TuneResult(
+        None, None, values, ("a", "b", "c", "d"), {}, 0, "", "newton", "forward", 0.0, setup
+    )
+    assert {name: end.side for name, end in result.at_limits.items()} == {
+        "a": "lower",
+        "b": "lower",
+        "c": "upper",
+    }
     assert dataclasses.replace(result, setup=SimpleNamespace(limits=(), reasons=())).at_limits == {}
 
 
-@pytest.mark.parametrize(("b", "scale"), [([1.0, 30.0, 2000.0], "log"), ([1.0, 1.5, 2.0], "linear"), ([-1.0, 0.0, 2000.0], "linear")])
+@pytest.mark.parametrize(
+    ("b", "scale"),
+    [([1.0, 30.0, 2000.0], "log"), ([1.0, 1.5, 2.0], "linear"), ([-1.0, 0.0, 2000.0], "linear")],
+)
 def test_a_front_over_decades_has_logarithmic_axes(b, scale):
     points = np.stack([np.linspace(0.5, 1.0, 3), b], axis=1)
     front = Front(("a", "b"), points, points, (), points, points[0], None, (), points, 0.0)
@@ -237,7 +293,9 @@ def test_a_front_over_decades_has_logarithmic_axes(b, scale):
 @pytest.mark.slow
 def test_figures(paper, front):
     narrow = ij.tunable("controller.k1", low=1.0, high=2.5)
-    best = ij.tune(paper, [narrow, "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT)
+    best = ij.tune(
+        paper, [narrow, "controller.K2"], ij.objectives.tracking(), iterations=3, **SHORT
+    )
     figure = best.plot(points=3)
     assert len(figure.axes) == 8
     _check_torque_and_ends(paper, best, figure)
@@ -252,20 +310,33 @@ def test_figures(paper, front):
 
 @pytest.mark.slow
 def test_the_way_of_a_tuning_across_what_is_allowed(paper):
-    """Two gains that are one number for all joints; what the limit forbids is where runs break it."""
+    """Two gains that are one number for all joints; what the limit forbids is where runs break
+    it."""
     gains = [ij.tunable("controller.k1", tied=True), ij.tunable("controller.K2", tied=True)]
     wanted = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
     best = ij.tune(paper, gains, wanted, iterations=3, progress=False, **SHORT)
     k1, K2 = np.array([1.0, 4.0]), np.array([3.0, 10.0, 40.0])
     loss, excess = best.on_slice(*best.names, k1, K2)
     for i, j in ((0, 0), (1, 2)):
-        run = ij.simulate(ij.with_parameters(paper, {"controller.k1": np.full(2, k1[i]), "controller.K2": np.full(2, K2[j])}), **SHORT)
-        assert excess[i, j] == pytest.approx(float(np.max(run.metrics.peak_torque)) / 12 - 1, rel=1e-9)
+        run = ij.simulate(
+            ij.with_parameters(
+                paper, {"controller.k1": np.full(2, k1[i]), "controller.K2": np.full(2, K2[j])}
+            ),
+            **SHORT,
+        )
+        assert excess[i, j] == pytest.approx(
+            float(np.max(run.metrics.peak_torque)) / 12 - 1, rel=1e-9
+        )
         ise = float(np.sum(run.metrics.ise) / np.sum(ij.simulate(paper, **SHORT).metrics.ise))
         assert loss[i, j] == pytest.approx(ise, rel=1e-9)
     (axes,) = ij.plotting.paths(best, {"grid": [[1.0, 3.0], [4.0, 40.0]]}, points=5).axes
     names = [text.get_text() for text in axes.figure.legends[0].get_texts()]
-    assert sorted(names) == ["grid, 2 values", "start", f"tune, {len(best.history['loss'])} values", "tuned"]
+    assert sorted(names) == [
+        "grid, 2 values",
+        "start",
+        f"tune, {len(best.history['loss'])} values",
+        "tuned",
+    ]
     assert axes.get_xlim()[1] > 4.0 and axes.get_ylim()[1] > 40.0 and axes.get_xscale() == "log"
     with pytest.raises(ValueError, match="names of two tuned numbers"):
         ij.plotting.paths(best, gains=("controller.k1", "controller.o"))
@@ -275,7 +346,13 @@ def test_the_way_of_a_tuning_across_what_is_allowed(paper):
 def tuned(paper, tmp_path_factory):
     """A tuning, its checkpoint and its file."""
     folder = tmp_path_factory.mktemp("tuned")
-    best = ij.tune(paper, ["controller.k1"], ij.objectives.tracking(scale=1.0), checkpoint=folder / "state.npz", **BRIEF)
+    best = ij.tune(
+        paper,
+        ["controller.k1"],
+        ij.objectives.tracking(scale=1.0),
+        checkpoint=folder / "state.npz",
+        **BRIEF,
+    )
     best.save(folder / "best.json")
     return folder
 
@@ -285,18 +362,41 @@ BRIEF = {"duration": 0.01, "iterations": 1, "report_runs": 2, "progress": False}
 
 @pytest.mark.slow
 def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
-    """Checkpoints and saved results: cut anywhere, of another kind, with keys that are missing or of another type."""
+    """Checkpoints and saved results: cut anywhere, of another kind, with keys that are missing or
+    of another type."""
     np.save(tmp_path / "array.npy", np.ones(3))
     state, saved = (tuned / "state.npz").read_bytes(), (tuned / "best.json").read_text()
-    for data in (b"", state[:10], state[: len(state) // 2], state[:-30], (tmp_path / "array.npy").read_bytes(), b"PK" + state[40:]):
+    for data in (
+        b"",
+        state[:10],
+        state[: len(state) // 2],
+        state[:-30],
+        (tmp_path / "array.npy").read_bytes(),
+        b"PK" + state[40:],
+    ):
         (tmp_path / "bad.npz").write_bytes(data)
         with pytest.raises(ValueError, match=r"checkpoint: got .*delete it or name another"):
-            ij.tune(paper, ["controller.k1"], ij.objectives.tracking(scale=1.0), checkpoint=tmp_path / "bad.npz", **BRIEF)
+            ij.tune(
+                paper,
+                ["controller.k1"],
+                ij.objectives.tracking(scale=1.0),
+                checkpoint=tmp_path / "bad.npz",
+                **BRIEF,
+            )
         with pytest.raises(ValueError, match="save_rollouts"):
             ij.load_rollouts(tmp_path / "bad.npz")
     whole = json.loads(saved)
-    bad = [{key: x for key, x in whole.items() if key != left_out} for left_out in whole if left_out != "report"]
-    bad += [whole | {key: value} for key in whole for value in (None, 3, [[1]]) if key not in ("report", "best_start", "seconds", "probes")]
+    bad = [
+        {key: x for key, x in whole.items() if key != left_out}
+        for left_out in whole
+        if left_out != "report"
+    ]
+    bad += [
+        whole | {key: value}
+        for key in whole
+        for value in (None, 3, [[1]])
+        if key not in ("report", "best_start", "seconds", "probes")
+    ]
     for data in (*map(json.dumps, bad), saved[:200], "[]", "[" * 100_000):
         (tmp_path / "bad.json").write_text(data)
         with pytest.raises(ValueError, match=r"path: got .*TuneResult\.save"):

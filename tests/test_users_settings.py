@@ -1,7 +1,9 @@
-"""What other tests find holds as users compile too: the tests' own settings (conftest.py) leave out what compilers optimise.
+"""What other tests find holds as users compile too: the tests' own settings (conftest.py) leave out
+what compilers optimise.
 
-An optimiser may add up in another order in another batch, and fails on functions of its own; so these are the tests of the reference data,
-of bit-identity, of the functions of kernels, and of the ways in which XLA is given a loop.
+An optimiser may add up in another order in another batch, and fails on functions of its own; so
+these are the tests of the reference data, of bit-identity, of the functions of kernels, and of the
+ways in which XLA is given a loop.
 """
 
 from __future__ import annotations
@@ -16,7 +18,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 AGAIN = {
-    "the paper": ["test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]", "test_paper.py::test_what_the_paper_shows"],
+    "the paper": [
+        "test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]",
+        "test_paper.py::test_what_the_paper_shows",
+    ],
     "shapes": ["test_engine.py::test_every_shape_is_the_same_run[euler-None]"],
     "runs": [
         "test_transforms.py::test_a_failing_run_leaves_the_others_bit_identical",
@@ -35,7 +40,9 @@ def test_the_testers_own_flags_come_last():
     flags, own = os.environ["XLA_FLAGS"], os.environ["TESTER_XLA_FLAGS"]
     as_users = bool(os.environ.get("TEST_AS_USERS"))
     assert flags == f"{'' if as_users else conftest.XLA_FLAGS} {own}".strip()
-    assert (os.environ.get("CXX") == str(ROOT / "tests" / "quick_compiler")) == bool(os.environ["TESTER_CXX"] and not as_users)
+    assert (os.environ.get("CXX") == str(ROOT / "tests" / "quick_compiler")) == bool(
+        os.environ["TESTER_CXX"] and not as_users
+    )
 
 
 @pytest.mark.slow
@@ -43,7 +50,25 @@ def test_the_testers_own_flags_come_last():
 def test_the_same_as_users_compile(what):
     plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-m", "not release", *names]
-    done = subprocess.run(command, cwd=ROOT, env=plain | {"TEST_AS_USERS": "1"}, capture_output=True, text=True, timeout=300)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not release",
+        *names,
+    ]
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=plain | {"TEST_AS_USERS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stdout[-3000:]
     assert f"{len(names)} passed" in done.stdout

@@ -1,4 +1,5 @@
-"""`vector_field`: the closed loop in other libraries' solvers, as docs/how_to/other_solvers.md shows it."""
+"""`vector_field`: the closed loop in other libraries' solvers, as docs/how_to/other_solvers.md
+shows it."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def test_diffrax_and_scipy_agree_with_simulate(page, converged):
 @pytest.mark.release
 def test_an_implicit_solver_agrees_too(page, converged):
     solution = page["solve"](page["field"], page["diffrax"].Kvaerno5(), page["ts"][:6])
-    np.testing.assert_allclose(page["field"].unpack(solution.ys).q, converged.q[:6], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        page["field"].unpack(solution.ys).q, converged.q[:6], rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -48,13 +51,17 @@ def test_the_gradient_through_the_solver(page):
     gains, step = jnp.array([20.0, 20.0]), 1e-3
     for i in range(2):
         ahead, behind = (page["final_error"](gains.at[i].add(h)) for h in (step, -step))
-        np.testing.assert_allclose(page["slope"][:, i], (ahead - behind) / (2 * step), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(
+            page["slope"][:, i], (ahead - behind) / (2 * step), rtol=0, atol=1e-8
+        )
     assert np.all(np.abs(np.diag(page["slope"])) > 1e-5)
 
 
 @pytest.mark.release
 def test_the_gradient_in_reverse(page):
-    back = jax.grad(lambda K2: page["final_error"](K2, page["diffrax"].RecursiveCheckpointAdjoint())[0])(jnp.array([20.0, 20.0]))
+    back = jax.grad(
+        lambda K2: page["final_error"](K2, page["diffrax"].RecursiveCheckpointAdjoint())[0]
+    )(jnp.array([20.0, 20.0]))
     np.testing.assert_allclose(back, page["slope"][0], rtol=0, atol=1e-8)
 
 
@@ -75,7 +82,9 @@ def test_scipy_agrees_with_an_independent_program(paper, reference_data):
     from scipy.integrate import solve_ivp
 
     field, times = ij.vector_field(paper), reference_data["t"][:6]
-    found = solve_ivp(field, (0.0, times[-1]), field.start, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-11)
+    found = solve_ivp(
+        field, (0.0, times[-1]), field.start, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-11
+    )
     state = field.unpack(found.y.T)
     np.testing.assert_allclose(state.q, reference_data["iblf_printed.q"][:6], rtol=0, atol=1e-9)
     tau = [field.sample(t, x).tau for t, x in zip(found.t, found.y.T, strict=True)]
@@ -88,12 +97,21 @@ def test_the_rate_is_the_loops_own_with_memory_in_law_and_observer(paper):
     m = len(field.names)
     assert m == 2 + 2 + 8 * 2 + 2 + 2
     assert field.names[4:6] == ("controller[0, 0]", "controller[0, 1]")
-    assert field.names[-4:] == ("observer.p_hat[0]", "observer.p_hat[1]", "observer.f_hat[0]", "observer.f_hat[1]")
+    assert field.names[-4:] == (
+        "observer.p_hat[0]",
+        "observer.p_hat[1]",
+        "observer.f_hat[0]",
+        "observer.f_hat[1]",
+    )
     x = field.start + 0.01 * jnp.arange(m, dtype=field.start.dtype)
     state = field.unpack(x)
     assert jax.tree.structure(state) == jax.tree.structure(initial_state(field.scenario))
     expected = rate(field.scenario, jnp.array(0.3), state)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), field.unpack(field(0.3, x)), expected)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12),
+        field.unpack(field(0.3, x)),
+        expected,
+    )
     np.testing.assert_array_equal(field.pack(state), x)
     many = field.unpack(np.stack([x, 2 * x, 3 * x]))
     assert many.controller.shape == (3, 8, 2)
@@ -112,12 +130,17 @@ def test_a_batch_of_fields(paper):
         return field(0.0, field.start)
 
     gains = jnp.array([10.0, 20.0])
-    np.testing.assert_allclose(jax.vmap(first)(gains), jnp.stack([first(gains[0]), first(gains[1])]), rtol=1e-12)
+    np.testing.assert_allclose(
+        jax.vmap(first)(gains), jnp.stack([first(gains[0]), first(gains[1])]), rtol=1e-12
+    )
 
 
 def test_bad_arguments(paper):
     field = ij.vector_field(paper)
-    with pytest.raises(ValueError, match=r"x: .* expected shape \(\.\.\., 6\)\. Its shape is \(5,\)\. .*solution\.y\.T"):
+    with pytest.raises(
+        ValueError,
+        match=r"x: .* expected shape \(\.\.\., 6\)\. Its shape is \(5,\)\. .*solution\.y\.T",
+    ):
         field(0.0, np.zeros(5))
     for x in (3.0, "q", None, 1j * np.zeros(6), [[1.0], [2.0, 3.0]], {"q": 1.0}):
         with pytest.raises(ValueError, match="x: "):
@@ -128,7 +151,14 @@ def test_bad_arguments(paper):
         with pytest.raises(ValueError, match="t: "):
             field.sample(t, field.start)
     state = field.unpack(field.start)
-    for wrong in (3.0, None, state._replace(q=np.zeros(3)), state._replace(controller=np.zeros(2)), state._replace(q="ab"), (1, 2, 3, 4)):
+    for wrong in (
+        3.0,
+        None,
+        state._replace(q=np.zeros(3)),
+        state._replace(controller=np.zeros(2)),
+        state._replace(q="ab"),
+        (1, 2, 3, 4),
+    ):
         with pytest.raises(ValueError, match="state: "):
             field.pack(wrong)
     with pytest.raises(ValueError, match=r"VectorField.scenario: .* ij.vector_field"):

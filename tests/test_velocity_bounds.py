@@ -1,4 +1,5 @@
-"""Bounds on the velocities: watched by metrics, status, requirements and figures, whatever the law knows of them."""
+"""Bounds on the velocities: watched by metrics, status, requirements and figures, whatever the law
+knows of them."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,9 @@ def speeds(low=(-1.6, -1.4), high=(0.6, 0.5), amplitude=(0.1, 0.0)):
 
 
 def paper(**parts):
-    return ij.with_parts(ij.presets.zhang_yan_2024(reading="corrected"), **({"velocity_bounds": speeds()} | parts))
+    return ij.with_parts(
+        ij.presets.zhang_yan_2024(reading="corrected"), **({"velocity_bounds": speeds()} | parts)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +34,9 @@ def watched():
 
 @pytest.fixture(scope="module")
 def violated():
-    with pytest.warns(ij.SimulationWarning, match=r"Joint 1 left its velocity bounds first, at t = 0\.00\d s"):
+    with pytest.warns(
+        ij.SimulationWarning, match=r"Joint 1 left its velocity bounds first, at t = 0\.00\d s"
+    ):
         return ij.simulate(paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5))), **SHORT)
 
 
@@ -43,7 +48,9 @@ def test_what_is_watched_is_what_the_samples_say(watched):
     np.testing.assert_allclose(run.dq_upper, high, atol=1e-15)
     assert run.ok
     for name, signal in (("velocity_margin", run.dq), ("alpha_margin", run.alpha)):
-        np.testing.assert_allclose(run.metrics[name], np.minimum(signal - low, high - signal).min(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(
+            run.metrics[name], np.minimum(signal - low, high - signal).min(axis=0), rtol=1e-12
+        )
     assert np.isinf(run.metrics.first_velocity_violation_time)
     assert int(run.metrics.first_velocity_violation_joint) == -1
 
@@ -72,7 +79,12 @@ def test_a_violation_is_flagged_with_time_and_joint(violated):
 def test_backends_agree():
     scenario = paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5)))
     options = {"runs": 4, "duration": 0.3, "dt": 1e-3, "progress": False}
-    studies = [ij.monte_carlo(scenario, {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}, backend=b, **options) for b in ("xla", "vmap")]
+    studies = [
+        ij.monte_carlo(
+            scenario, {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}, backend=b, **options
+        )
+        for b in ("xla", "vmap")
+    ]
     for name in ("velocity_margin", "alpha_margin", "first_velocity_violation_time"):
         np.testing.assert_allclose(*(np.asarray(s.metrics[name]) for s in studies), rtol=1e-9)
     assert np.all(studies[0].status & int(ij.Status.VELOCITY_VIOLATED) != 0)
@@ -81,7 +93,11 @@ def test_backends_agree():
 
 def test_a_funnel_of_velocities_follows_the_reference():
     funnel = bounds.Bounds(lower=bounds.Funnel(-1.0, -0.2, 2.0), upper=bounds.Funnel(1.5, 0.2, 2.0))
-    run = ij.simulate(paper(velocity_bounds=funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0])), duration=0.2, dt=1e-3)
+    run = ij.simulate(
+        paper(velocity_bounds=funnel, initial=ij.Initial([0.5, 0.64], [0.14, 0.0])),
+        duration=0.2,
+        dt=1e-3,
+    )
     r = np.exp(-2.0 * np.asarray(run.t))[:, None]
     np.testing.assert_allclose(run.dq_upper, run.dq_d + 1.3 * r + 0.2, rtol=1e-12)
     np.testing.assert_allclose(run.dq_lower, run.dq_d - 0.8 * r - 0.2, rtol=1e-12)
@@ -89,11 +105,17 @@ def test_a_funnel_of_velocities_follows_the_reference():
 
 def test_the_margin_has_a_derivative():
     def margin(low):
-        scenario = ij.with_parameters(paper(), {"velocity_bounds.lower.offset": low, "controller.k1": 2.0 + low})
-        return jnp.min(ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=200).metrics.velocity_margin)
+        scenario = ij.with_parameters(
+            paper(), {"velocity_bounds.lower.offset": low, "controller.k1": 2.0 + low}
+        )
+        return jnp.min(
+            ij.simulate(scenario, duration=0.2, dt=1e-3, record_every=200).metrics.velocity_margin
+        )
 
     found, h = jax.grad(margin)(-1.5), 1e-6
-    assert float(found) == pytest.approx((float(margin(-1.5 + h)) - float(margin(-1.5 - h))) / (2 * h), rel=1e-6)
+    assert float(found) == pytest.approx(
+        (float(margin(-1.5 + h)) - float(margin(-1.5 - h))) / (2 * h), rel=1e-6
+    )
 
 
 def test_files_hold_them_and_say_their_unit(tmp_path):
@@ -119,26 +141,43 @@ def test_a_dataset_has_them(watched):
 def test_requirements_on_velocities():
     scenario = paper(velocity_bounds=speeds((-0.6, -0.6)))
     objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
-    result = ij.tune(scenario, ["controller.k1"], objective, duration=0.3, dt=1e-3, iterations=12, progress=False)
+    result = ij.tune(
+        scenario, ["controller.k1"], objective, duration=0.3, dt=1e-3, iterations=12, progress=False
+    )
     line = result.report.verdicts[0]
     assert (line.name, line.unit, line.verdict) == ("velocity margin > 0.02 rad/s", "rad/s", "pass")
     run = result.nominal[1]
     assert float(np.min(run.metrics.velocity_margin)) == pytest.approx(line.value)
     assert float(np.min(result.nominal[0].metrics.velocity_margin)) < 0.02
     with pytest.raises(ValueError, match="velocity_bounds"):
-        ij.tune(paper(velocity_bounds=None), ["controller.k1"], objective, duration=0.3, dt=1e-3, progress=False)
+        ij.tune(
+            paper(velocity_bounds=None),
+            ["controller.k1"],
+            objective,
+            duration=0.3,
+            dt=1e-3,
+            progress=False,
+        )
 
 
 def test_figures(watched, violated):
     figure = plotting.velocities({"wide": watched, "narrow": violated})
     assert len(figure.axes) == 4
-    drawn = [line.get_ydata() for line in figure.axes[0].get_lines() if line.get_label() == "bounds"]
+    drawn = [
+        line.get_ydata() for line in figure.axes[0].get_lines() if line.get_label() == "bounds"
+    ]
     np.testing.assert_allclose(drawn[0][0], watched.dq_lower[0, 0])
-    box = next(line for line in plotting.velocity_portrait(watched, 1).axes[0].get_lines() if line.get_label() == "bounds")
+    box = next(
+        line
+        for line in plotting.velocity_portrait(watched, 1).axes[0].get_lines()
+        if line.get_label() == "bounds"
+    )
     np.testing.assert_allclose(box.get_ydata(), [-1.4, -1.4, 0.5, 0.5, -1.4])
     np.testing.assert_allclose(box.get_xdata()[:2], [watched.lower[0, 1], watched.upper[0, 1]])
     free = ij.simulate(paper(velocity_bounds=None), **SHORT)
-    assert "bounds" not in [line.get_label() for line in plotting.velocities(free).axes[0].get_lines()]
+    assert "bounds" not in [
+        line.get_label() for line in plotting.velocities(free).axes[0].get_lines()
+    ]
     assert (
         len(plotting.velocity_portrait(free).axes[0].get_lines()) == 7
     )  # position bounds at the start and all they reach, reference, run, start
@@ -149,9 +188,15 @@ def test_figures(watched, violated):
     ("parts", "words"),
     [
         ({"velocity_bounds": 3.0}, "a Bounds, or None"),
-        ({"velocity_bounds": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))}, "velocity_bounds of joint 0"),
+        (
+            {"velocity_bounds": speeds((-1.6, -1.4), (-1.7, 0.5), (0.0, 0.0))},
+            "velocity_bounds of joint 0",
+        ),
         ({"initial": ij.Initial([0.8, 0.8], [0.0, 0.6])}, r"initial\.dq\[1\]"),
-        ({"velocity_bounds": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))}, "2 .one a joint."),
+        (
+            {"velocity_bounds": speeds((-1.6, -1.4, 0.0), (0.6, 0.5, 0.0), (0.1, 0.0, 0.0))},
+            "2 .one a joint.",
+        ),
     ],
 )
 def test_bad_ones_are_refused(parts, words):
@@ -172,4 +217,8 @@ def test_limits_of_a_robot():
     with pytest.raises(ValueError, match="speed limits"):
         bounds.from_speed_limits(ij.presets.customary_two_link())
     with pytest.raises(ValueError, match="unlimited"):
-        bounds.from_speed_limits(ij.robots.Arm(mass=[1.0], centre=[[0, 0, 0]], inertia=[[1, 1, 1, 0, 0, 0]], position=[[0, 0, 0]]))
+        bounds.from_speed_limits(
+            ij.robots.Arm(
+                mass=[1.0], centre=[[0, 0, 0]], inertia=[[1, 1, 1, 0, 0, 0]], position=[[0, 0, 0]]
+            )
+        )

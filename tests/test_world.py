@@ -46,10 +46,15 @@ def test_quintic_is_at_rest_at_both_ends():
         np.testing.assert_allclose([v, a], 0, atol=1e-12)
     q, v, _ = at(1.25)
     np.testing.assert_allclose(q, (start + end) / 2, atol=1e-14)
-    np.testing.assert_allclose(v, 15 / 8 * (end - start) / 2.5, rtol=1e-12)  # peak speed of a minimum-jerk motion
+    np.testing.assert_allclose(
+        v, 15 / 8 * (end - start) / 2.5, rtol=1e-12
+    )  # peak speed of a minimum-jerk motion
 
 
-TIMES, POINTS = (0.5, 1.0, 2.2, 3.0, 4.5), np.asarray([[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.6, 0.4], [0.5, 0.5]])
+TIMES, POINTS = (
+    (0.5, 1.0, 2.2, 3.0, 4.5),
+    np.asarray([[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.6, 0.4], [0.5, 0.5]]),
+)
 
 
 def test_spline_passes_its_waypoints_and_rests_at_the_ends():
@@ -70,11 +75,15 @@ def test_spline_passes_its_waypoints_and_rests_at_the_ends():
     for t in np.linspace(0.5, 4.5, 23)[1:-1]:
         got = at(t)
         for order in range(3):
-            np.testing.assert_allclose(got[order], expected.derivative(order)(t) if order else expected(t), atol=1e-9)
+            np.testing.assert_allclose(
+                got[order], expected.derivative(order)(t) if order else expected(t), atol=1e-9
+            )
 
 
 def test_spline_is_differentiable_by_its_waypoints():
-    gradient = jax.jacobian(lambda w: references.WaypointSpline(TIMES, w).position(1.7)[0])(jnp.asarray(POINTS))
+    gradient = jax.jacobian(lambda w: references.WaypointSpline(TIMES, w).position(1.7)[0])(
+        jnp.asarray(POINTS)
+    )
     assert gradient.shape == POINTS.shape
     np.testing.assert_allclose(gradient[:, 1], 0)
     assert float(jnp.sum(gradient)) == pytest.approx(1.0)  # lifting all waypoints lifts the spline
@@ -95,8 +104,17 @@ def test_tube_rates_against_finite_differences(sides):
     h = 1e-6
     for t in (0.0, 0.8, 7.1):
         tube, ahead, behind = at(t), at(t + h), at(t - h)
-        for value, rate in (("q_d", "dq_d"), ("dq_d", "ddq_d"), ("lower", "dlower"), ("upper", "dupper"), ("k_l", "dk_l"), ("k_u", "dk_u")):
-            difference = (np.asarray(getattr(ahead, value)) - np.asarray(getattr(behind, value))) / (2 * h)
+        for value, rate in (
+            ("q_d", "dq_d"),
+            ("dq_d", "ddq_d"),
+            ("lower", "dlower"),
+            ("upper", "dupper"),
+            ("k_l", "dk_l"),
+            ("k_u", "dk_u"),
+        ):
+            difference = (
+                np.asarray(getattr(ahead, value)) - np.asarray(getattr(behind, value))
+            ) / (2 * h)
             np.testing.assert_allclose(getattr(tube, rate), difference, atol=1e-8)
         np.testing.assert_allclose(tube.xi(tube.upper), 1.0, rtol=1e-12)
         np.testing.assert_allclose(tube.xi(tube.lower), -1.0, rtol=1e-12)
@@ -105,7 +123,10 @@ def test_tube_rates_against_finite_differences(sides):
 
 @pytest.mark.parametrize(
     "reference",
-    [references.Quintic([0.1, 0.5], [0.9, -0.2], 2.5), references.WaypointSpline((0.0, 1.0, 2.2), [[0.0, 0.1], [0.4, 0.3], [0.2, 0.8]])],
+    [
+        references.Quintic([0.1, 0.5], [0.9, -0.2], 2.5),
+        references.WaypointSpline((0.0, 1.0, 2.2), [[0.0, 0.1], [0.4, 0.3], [0.2, 0.8]]),
+    ],
     ids=["quintic", "spline"],
 )
 def test_the_tube_has_the_acceleration_of_its_reference(reference):
@@ -117,23 +138,31 @@ def test_the_tube_has_the_acceleration_of_its_reference(reference):
 
 @pytest.mark.slow
 def test_an_acceleration_that_is_not_used_costs_nothing(paper, monkeypatch):
-    """The same operations as without it.  Two guards, so that the second program is not the first one from a cache."""
+    """The same operations as without it.  Two guards, so that the second program is not the first
+    one from a cache."""
 
     def counted(guard):
-        law = ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=ij.barriers.Integral(guard=guard))
+        law = ij.controllers.Backstepping(
+            k1=2.0, K2=20.0, barrier=ij.barriers.Integral(guard=guard)
+        )
         return ij.explain(ij.with_parts(paper, controller=law)).counts
 
     with_it = counted(1.1e-3)
-    monkeypatch.setattr(controllers._base, "tube_at", lambda *args, acceleration: tube_at(*args, acceleration=False))
+    monkeypatch.setattr(
+        controllers._base, "tube_at", lambda *args, acceleration: tube_at(*args, acceleration=False)
+    )
     assert counted(1.2e-3) == with_it
 
 
 def test_a_reference_needs_two_derivatives_and_no_third():
-    """One from outside of JAX, say: it gives position, velocity and acceleration, and there it ends."""
+    """One from outside of JAX, say: it gives position, velocity and acceleration, and there it
+    ends."""
 
     def outside(function):
         shape = jax.ShapeDtypeStruct((2,), float)
-        return lambda t: jax.pure_callback(lambda t: np.asarray(function(float(t))), shape, t, vmap_method="sequential")
+        return lambda t: jax.pure_callback(
+            lambda t: np.asarray(function(float(t))), shape, t, vmap_method="sequential"
+        )
 
     acceleration = outside(lambda t: [-0.1 * np.sin(t), -0.1 * np.cos(t)])
     velocity = jax.custom_jvp(outside(lambda t: [0.1 * np.cos(t), -0.1 * np.sin(t)]))
@@ -148,7 +177,9 @@ def test_a_reference_needs_two_derivatives_and_no_third():
 
     for law in ("integral", "computed_torque", "pd"):
         scenario = ij.with_parts(ij.presets.zhang_yan_2024(law=law), reference=Outside())
-        rate = jax.eval_shape(lambda s: closed_loop.rate(s, jnp.asarray(0.3), closed_loop.initial_state(s)), scenario)
+        rate = jax.eval_shape(
+            lambda s: closed_loop.rate(s, jnp.asarray(0.3), closed_loop.initial_state(s)), scenario
+        )
         assert rate.dq.shape == (2,)
 
 
@@ -161,14 +192,18 @@ def test_funnel_shrinks_onto_the_reference():
 
 
 def torque(disturbance, t, q, dq, plant=TWO_LINK):
-    return np.asarray(disturbance.torque(jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), plant, TWO_LINK))
+    return np.asarray(
+        disturbance.torque(jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), plant, TWO_LINK)
+    )
 
 
 def test_disturbances_by_hand(rng):
     q, dq = rng.uniform(-1, 1, (2, 2))
     np.testing.assert_array_equal(torque(disturbances.Nothing(), 1.0, q, dq), 0)
     wave = disturbances.Sinusoids(amplitude=[1.0, 2.0], frequency=3.0, phase=0.4, offset=0.2)
-    np.testing.assert_allclose(torque(wave, 0.9, q, dq), 0.2 + np.asarray([1, 2]) * np.sin(2.7 + 0.4))
+    np.testing.assert_allclose(
+        torque(wave, 0.9, q, dq), 0.2 + np.asarray([1, 2]) * np.sin(2.7 + 0.4)
+    )
     step = disturbances.Step(size=[1.0, -2.0], time=3.0)
     np.testing.assert_array_equal(torque(step, 2.999, q, dq), 0)
     np.testing.assert_array_equal(torque(step, 3.0, q, dq), [1.0, -2.0])
@@ -176,7 +211,9 @@ def test_disturbances_by_hand(rng):
     friction = disturbances.Friction(viscous=0.5, coulomb=0.2, width=0.01)
     np.testing.assert_allclose(torque(friction, 0.0, q, np.asarray([2.0, -1.0])), [-1.2, 0.7])
     both = disturbances.Sum((friction, step, disturbances.Step(1.0, 5.0)))
-    np.testing.assert_allclose(torque(both, 4.0, q, dq), torque(friction, 4.0, q, dq) + np.asarray([1.0, -2.0]))
+    np.testing.assert_allclose(
+        torque(both, 4.0, q, dq), torque(friction, 4.0, q, dq) + np.asarray([1.0, -2.0])
+    )
     np.testing.assert_array_equal(both.jump_times(), [3.0, 5.0])
 
 
@@ -188,27 +225,38 @@ def test_friction_takes_power(rng):
 
 def test_tip_force_does_the_work_that_it_should(rng):
     """Virtual work: F . d tip = tau . dq."""
-    push = disturbances.TipForce(amplitude=[3.0, -2.0], frequency=[1.0, 2.0], phase=0.3, offset=[0.0, -1.0])
+    push = disturbances.TipForce(
+        amplitude=[3.0, -2.0], frequency=[1.0, 2.0], phase=0.3, offset=[0.0, -1.0]
+    )
     q, dq, t = rng.uniform(-1, 1, 2), rng.normal(size=2), 0.8
-    force = np.asarray([0.0, -1.0]) + np.asarray([3.0, -2.0]) * np.sin(np.asarray([1.0, 2.0]) * t + 0.3)
-    moved = (np.asarray(TWO_LINK.tip(q + 1e-6 * dq)) - np.asarray(TWO_LINK.tip(q - 1e-6 * dq))) / 2e-6
+    force = np.asarray([0.0, -1.0]) + np.asarray([3.0, -2.0]) * np.sin(
+        np.asarray([1.0, 2.0]) * t + 0.3
+    )
+    moved = (
+        np.asarray(TWO_LINK.tip(q + 1e-6 * dq)) - np.asarray(TWO_LINK.tip(q - 1e-6 * dq))
+    ) / 2e-6
     assert torque(push, t, q, dq) @ dq == pytest.approx(force @ moved, rel=1e-8)
 
 
 def test_the_papers_disturbance(rng):
-    """(4.3): f = M0 (0.3 sin t, 0.3 cos t) + C0 (0.3 cos 0.5t, 0.3 sin 0.5t), and with the model's matrices, not the plant's."""
+    """(4.3): f = M0 (0.3 sin t, 0.3 cos t) + C0 (0.3 cos 0.5t, 0.3 sin 0.5t), and with the model's
+    matrices, not the plant's."""
     import independent
 
     f = ij.presets.zhang_yan_2024().disturbance
     q, dq, t = rng.uniform(-1, 1, 2), rng.normal(size=2), 1.7
     M, C, _, _ = independent.Loop().arm(q)
-    a, b = 0.3 * np.asarray([np.sin(t), np.cos(t)]), 0.3 * np.asarray([np.cos(t / 2), np.sin(t / 2)])
+    a, b = (
+        0.3 * np.asarray([np.sin(t), np.cos(t)]),
+        0.3 * np.asarray([np.cos(t / 2), np.sin(t / 2)]),
+    )
     np.testing.assert_allclose(torque(f, t, q, dq), M @ a + C(dq) @ b, rtol=1e-12)
     heavy = dataclasses.replace(TWO_LINK, mass=[5.0, 5.0])
     np.testing.assert_array_equal(torque(f, t, q, dq, heavy), torque(f, t, q, dq))
     shifted = dataclasses.replace(f, phase=1.0)
     np.testing.assert_allclose(
         torque(shifted, t, q, dq),
-        M @ (0.3 * np.asarray([np.sin(t + 1), np.cos(t + 1)])) + C(dq) @ (0.3 * np.asarray([np.cos(t / 2 + 1), np.sin(t / 2 + 1)])),
+        M @ (0.3 * np.asarray([np.sin(t + 1), np.cos(t + 1)]))
+        + C(dq) @ (0.3 * np.asarray([np.cos(t / 2 + 1), np.sin(t / 2 + 1)])),
         rtol=1e-12,
     )

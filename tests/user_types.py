@@ -1,4 +1,5 @@
-"""What a type checker knows of what users get: `mypy` reads this file beside the package, and nothing runs it."""
+"""What a type checker knows of what users get: `mypy` reads this file beside the package, and
+nothing runs it."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ class Drive:
         """The state that delivers a torque."""
         return tau
 
-    def deliver(self, asked: jax.Array, dq: jax.Array, state: ij.actuators.State) -> ij.actuators.Delivered:
+    def deliver(
+        self, asked: jax.Array, dq: jax.Array, state: ij.actuators.State
+    ) -> ij.actuators.Delivered:
         """Torque, whether a limit acted, and the rate of the state."""
         return ij.actuators.Delivered(state, asked > 1.0, self.gain * (asked - state))
 
@@ -39,12 +42,20 @@ class Wrapping:
 
     law: ij.controllers.Controller
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: ij.controllers.Setting) -> ij.controllers.State:
+    def init(
+        self, q: jax.Array, dq: jax.Array, setting: ij.controllers.Setting
+    ) -> ij.controllers.State:
         """The wrapped law's state."""
         return self.law.init(q, dq, setting)
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: ij.controllers.Setting, state: ij.controllers.State
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: ij.controllers.Setting,
+        state: ij.controllers.State,
     ) -> tuple[ij.controllers.Command, ij.controllers.State]:
         """The wrapped law's command."""
         return self.law.command(t, q, dq, f_hat, setting, state)

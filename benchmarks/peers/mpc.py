@@ -1,7 +1,9 @@
-"""The peer of `constraints.py`: a nonlinear model-predictive law by CasADi and IPOPT for the two-link arm, offline.
+"""The peer of `constraints.py`: a nonlinear model-predictive law by CasADi and IPOPT for the
+two-link arm, offline.
 
-Multiple shooting over HORIZON periods, one Runge-Kutta step a period, the estimated uncertain term held.  Positions, velocities and the
-tip's wall are kept by constraints with a dear slack, so that there always is an answer; torques are free.
+Multiple shooting over HORIZON periods, one Runge-Kutta step a period, the estimated uncertain term
+held.  Positions, velocities and the tip's wall are kept by constraints with a dear slack, so that
+there always is an answer; torques are free.
 """
 
 from __future__ import annotations
@@ -16,27 +18,46 @@ PERIOD, HORIZON = 0.02, 15
 SLACK = 1e4
 """Price of a slack in the units of the cost."""
 ROOM = (0.005, 0.03, 0.002)
-"""What is kept from bounds of positions [rad] and velocities [rad/s] and from the wall [m], as between the periods nothing is looked at."""
+"""What is kept from bounds of positions [rad] and velocities [rad/s] and from the wall [m], as
+between the periods nothing is looked at."""
 
 
 class Mpc:
-    """The law: torque(q, q', f_hat, reference, lower, upper, speeds) of one period, warm-started by the last answer."""
+    """The law: torque(q, q', f_hat, reference, lower, upper, speeds) of one period, warm-started by
+    the last answer.
+    """
 
     def __init__(self, robot, wall: float) -> None:
-        """`robot`: a TwoLink of the package, whose numbers it takes; `wall`: largest x of the tip [m]."""
-        numbers = {name: np.asarray(getattr(robot, name), float) for name in ("mass", "length", "centre", "inertia", "g")}
+        """`robot`: a TwoLink of the package, whose numbers it takes; `wall`: largest x of the tip
+        [m].
+        """
+        numbers = {
+            name: np.asarray(getattr(robot, name), float)
+            for name in ("mass", "length", "centre", "inertia", "g")
+        }
         rate, tip = _arm(**numbers)
         n = HORIZON
         x, u, s = ca.SX.sym("x", 4, n + 1), ca.SX.sym("u", 2, n), ca.SX.sym("s", n)
         start, f = ca.SX.sym("start", 4), ca.SX.sym("f", 2)
-        q_d, dq_d, lower, upper, slow, fast = (ca.SX.sym(name, 2, n + 1) for name in ("q_d", "dq_d", "lower", "upper", "slow", "fast"))
+        q_d, dq_d, lower, upper, slow, fast = (
+            ca.SX.sym(name, 2, n + 1) for name in ("q_d", "dq_d", "lower", "upper", "slow", "fast")
+        )
         cost, equal, kept = 0.0, [x[:, 0] - start], []
         for k in range(n):
             equal.append(x[:, k + 1] - _step(lambda y, k=k: rate(y, u[:, k] + f), x[:, k], PERIOD))
             e, de = x[:2, k + 1] - q_d[:, k + 1], x[2:, k + 1] - dq_d[:, k + 1]
-            cost += 100 * ca.dot(e, e) + 0.1 * ca.dot(de, de) + 1e-4 * ca.dot(u[:, k], u[:, k]) + SLACK * s[k]
+            cost += (
+                100 * ca.dot(e, e)
+                + 0.1 * ca.dot(de, de)
+                + 1e-4 * ca.dot(u[:, k], u[:, k])
+                + SLACK * s[k]
+            )
             q, dq = x[:2, k + 1], x[2:, k + 1]
-            over = [lower[:, k + 1] - q + ROOM[0], q - upper[:, k + 1] + ROOM[0], tip(q)[0] - wall + ROOM[2]]
+            over = [
+                lower[:, k + 1] - q + ROOM[0],
+                q - upper[:, k + 1] + ROOM[0],
+                tip(q)[0] - wall + ROOM[2],
+            ]
             over += [slow[:, k + 1] - dq + ROOM[1], dq - fast[:, k + 1] + ROOM[1]]
             kept += [row - s[k] for row in over]
         unknown = ca.vertcat(ca.vec(x), ca.vec(u), s)
@@ -44,16 +65,29 @@ class Mpc:
         g = ca.vertcat(*equal, *kept)
         quiet = {
             "print_time": False,
-            "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 60, "warm_start_init_point": "yes", "mu_init": 1e-3},
+            "ipopt": {
+                "print_level": 0,
+                "sb": "yes",
+                "max_iter": 60,
+                "warm_start_init_point": "yes",
+                "mu_init": 1e-3,
+            },
         }
-        self.solve: Callable = ca.nlpsol("mpc", "ipopt", {"x": unknown, "p": parameters, "f": cost, "g": g}, quiet)
+        self.solve: Callable = ca.nlpsol(
+            "mpc", "ipopt", {"x": unknown, "p": parameters, "f": cost, "g": g}, quiet
+        )
         rows = int(sum(x.numel() for x in equal))
-        self.limits = {"lbg": [0.0] * rows + [-np.inf] * (g.numel() - rows), "ubg": [0.0] * g.numel()}
+        self.limits = {
+            "lbg": [0.0] * rows + [-np.inf] * (g.numel() - rows),
+            "ubg": [0.0] * g.numel(),
+        }
         self.limits |= {"lbx": [-np.inf] * (unknown.numel() - n) + [0.0] * n}
         self.guess: np.ndarray | None = None
 
     def torque(self, q, dq, f_hat, *ahead: np.ndarray) -> np.ndarray:
-        """The torque [N m] of the next period; `ahead`: q_d, q_d', lower, upper and speeds, (HORIZON + 1, 2) each, from now on."""
+        """The torque [N m] of the next period; `ahead`: q_d, q_d', lower, upper and speeds,
+        (HORIZON + 1, 2) each, from now on.
+        """
         start = np.concatenate([q, dq])
         if self.guess is None:
             self.guess = np.concatenate([np.tile(start, HORIZON + 1), np.zeros(3 * HORIZON)])
@@ -78,7 +112,9 @@ def _arm(mass, length, centre, inertia, g):
         return ca.vertcat(v, (p2 * first - b * second) / det, (a * second - b * first) / det)
 
     def tip(q):
-        return ca.vertcat(*(length[0] * f(q[0]) + length[1] * f(q[0] + q[1]) for f in (ca.cos, ca.sin)))
+        return ca.vertcat(
+            *(length[0] * f(q[0]) + length[1] * f(q[0] + q[1]) for f in (ca.cos, ca.sin))
+        )
 
     return rate, tip
 

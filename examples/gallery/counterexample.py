@@ -2,7 +2,9 @@
 
 import iblf_jax as ij
 
-printed, corrected = (ij.presets.printed_gap(reading=reading) for reading in ("printed", "corrected"))
+printed, corrected = (
+    ij.presets.printed_gap(reading=reading) for reading in ("printed", "corrected")
+)
 certificate = ij.certify(printed, duration=0.1, dt=1e-5)
 figure = certificate.plot()
 

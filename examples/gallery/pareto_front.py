@@ -5,5 +5,7 @@ from iblf_jax import plotting
 
 scenario = ij.presets.zhang_yan_2024()
 both = (ij.objectives.tracking(), ij.objectives.effort())
-front = ij.pareto(scenario, ["controller.K2"], both, duration=1.0, dt=2e-3, points=6, progress=False)
+front = ij.pareto(
+    scenario, ["controller.K2"], both, duration=1.0, dt=2e-3, points=6, progress=False
+)
 figure = plotting.pareto(front)

@@ -1,4 +1,6 @@
-"""A payload is picked up: at two seconds the UR5 has 4 kg in its hand that its law does not know."""
+"""A payload is picked up: at two seconds the UR5 has 4 kg in its hand that its law does not
+know.
+"""
 
 import iblf_jax as ij
 from iblf_jax import plotting

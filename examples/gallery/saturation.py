@@ -7,7 +7,11 @@ scenario = ij.presets.zhang_yan_2024()
 limits = {"no limit": None, "9 and 4 N m": [9.0, 4.0], "4 and 1 N m": [4.0, 1.0]}
 runs = {}
 for name, limit in limits.items():
-    law = scenario.controller if limit is None else ij.controllers.Saturated(scenario.controller, limit=limit)
+    law = (
+        scenario.controller
+        if limit is None
+        else ij.controllers.Saturated(scenario.controller, limit=limit)
+    )
     runs[name] = ij.simulate(ij.with_parts(scenario, controller=law), duration=3.0, dt=1e-3)
 figure = plotting.torques(runs)
 

@@ -1,4 +1,6 @@
-"""A map of violations: where in the plane of two gains a PD law with gravity compensation leaves its bounds."""
+"""A map of violations: where in the plane of two gains a PD law with gravity compensation leaves
+its bounds.
+"""
 
 import numpy as np
 
@@ -8,5 +10,7 @@ from iblf_jax import plotting
 scenario = ij.presets.zhang_yan_2024(law="pd")
 grid = {"controller.Kp": np.geomspace(2.0, 128.0, 7), "controller.Kd": np.geomspace(0.25, 16.0, 7)}
 unknown = {"plant.payload": ij.value(ij.uniform(0.0, 1.0))}
-table = ij.sweep(scenario, grid, perturbations=unknown, runs=32, duration=3.0, dt=1e-3, progress=False)
+table = ij.sweep(
+    scenario, grid, perturbations=unknown, runs=32, duration=3.0, dt=1e-3, progress=False
+)
 figure = plotting.heat_map(table, ["violated", "margin"])

@@ -1,8 +1,10 @@
-"""Prescribed performance (Dimanidis 2018): a two-joint arm that no law knows anything of, and the points of the published curve.
+"""Prescribed performance (Dimanidis 2018): a two-joint arm that no law knows anything of, and the
+points of the published curve.
 
-I. Dimanidis, diploma thesis (in Greek), Aristotle University of Thessaloniki, May 2018, section 5.2. Its sources, its program and its
-figures as numbers are public (github.com/iodim/diploma-thesis). The arm and the reference are those of C. P. Bechlioulis,
-G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099, whom the thesis names for them.
+I. Dimanidis, diploma thesis (in Greek), Aristotle University of Thessaloniki, May 2018, section
+5.2. Its sources, its program and its figures as numbers are public
+(github.com/iodim/diploma-thesis). The arm and the reference are those of C. P. Bechlioulis, G. A.
+Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099, whom the thesis names for them.
 
 | printed | value | where |
 | --- | --- | --- |
@@ -18,17 +20,20 @@ G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099, whom the th
 | gain, limit of the torque | k = 1, 30 N m | table of the control |
 | high-gain observer | mu = 1e-4, eta = 10, 25 | the same |
 
-**What it shows:** errors that rise to 3.71 and 0.89 rad, shrink, and stay inside of what is prescribed; sigma inside its funnel. The
-figures' numbers are in the sources of the text, and 34 points of them beside the scenario.
+**What it shows:** errors that rise to 3.71 and 0.89 rad, shrink, and stay inside of what is
+prescribed; sigma inside its funnel. The figures' numbers are in the sources of the text, and 34
+points of them beside the scenario.
 
-**Not printed:** the start. The first points of its figures have it: e1 = (0.8 pi, -pi/6) rad, q' = (2.793, 1.047) rad/s. The speed of
-joint 0 is outside of the set of starts that the text prints.
+**Not printed:** the start. The first points of its figures have it: e1 = (0.8 pi, -pi/6) rad, q' =
+(2.793, 1.047) rad/s. The speed of joint 0 is outside of the set of starts that the text prints.
 
-**Printed twice, and not alike:** the figures are of the reference pi/2 + pi/6 sin t, pi/2 - pi/6 cos t (only so is sigma(0) = 7.295 rad/s,
-as the figure of the surfaces begins), and of k = 6 (only so is the torque at 0.066 s -0.287 N m, as the figure of the torques has it; the
-program has k = 12 for the same law without its 2). The scenario takes the figures' word.
+**Printed twice, and not alike:** the figures are of the reference pi/2 + pi/6 sin t, pi/2 - pi/6
+cos t (only so is sigma(0) = 7.295 rad/s, as the figure of the surfaces begins), and of k = 6 (only
+so is the torque at 0.066 s -0.287 N m, as the figure of the torques has it; the program has k = 12
+for the same law without its 2). The scenario takes the figures' word.
 
-The law is the package's `SurfaceBarrier`: -2 k T(xi)/((1 - xi^2) rho) is -4 k times the slope of its barrier.
+The law is the package's `SurfaceBarrier`: -2 k T(xi)/((1 - xi^2) rho) is -4 k times the slope of
+its barrier.
 """
 
 from pathlib import Path
@@ -76,19 +81,27 @@ def told(name, run):
 
 
 told("the scenario", run)
-print(f"after 6 s |e1| < {np.abs(run.e1[run.t > 6.0]).max():.1e} rad, where pi/180 = {np.pi / 180:.1e} rad is prescribed")
+print(
+    f"after 6 s |e1| < {np.abs(run.e1[run.t > 6.0]).max():.1e} rad, where pi/180 ="
+    f" {np.pi / 180:.1e} rad is prescribed"
+)
 print(f"largest |sigma|/rho: {float(np.max(np.abs(sigma) / rho[:, None])):.3f}")
 print(f"largest torque: {np.max(np.abs(run.tau), axis=0).round(2)} N m")
 
-# %% What is left is their high-gain observer: in the first 0.2 ms its estimate peaks, and the speed of joint 1 falls from 1.0472 to 1.0395
-# rad/s in their figure, by 0.0068 rad/s more than here. A start slower by that much is off by a tenth of it.
-slower = ij.simulate(ij.with_parameters(scenario, {"initial.dq[1]": scenario.initial.dq[1] - 0.0068}), **options)
+# %% What is left is their high-gain observer: in the first 0.2 ms its estimate peaks, and the speed
+# of joint 1 falls from 1.0472 to 1.0395 rad/s in their figure, by 0.0068 rad/s more than here. A
+# start slower by that much is off by a tenth of it.
+slower = ij.simulate(
+    ij.with_parameters(scenario, {"initial.dq[1]": scenario.initial.dq[1] - 0.0068}), **options
+)
 told("slower by the peak", slower)
 
-# %% The gain that the text prints gives another motion: within what is prescribed too, but not the one of the figures.
+# %% The gain that the text prints gives another motion: within what is prescribed too, but not the
+# one of the figures.
 printed = ij.simulate(ij.with_parameters(scenario, {"controller.K": 4.0}), **options)
 told("k = 1", printed)
 print(f"status: {ij.Status(int(printed.status))!r}")
 
-# %% **Not reproduced:** the high-gain observer and the limit of 30 N m, which is reached in its peak alone. The dotted lines in the
-# published figure of the errors are at 0.00875 rad, half of what the text prescribes; in the end the errors keep those too.
+# %% **Not reproduced:** the high-gain observer and the limit of 30 N m, which is reached in its
+# peak alone. The dotted lines in the published figure of the errors are at 0.00875 rad, half of
+# what the text prescribes; in the end the errors keep those too.

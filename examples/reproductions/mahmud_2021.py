@@ -1,8 +1,9 @@
-"""A box of positions and velocities (Mahmud et al. 2021): the benchmark arm with friction, from a corner of its box, under another law.
+"""A box of positions and velocities (Mahmud et al. 2021): the benchmark arm with friction, from a
+corner of its box, under another law.
 
-S. M. N. Mahmud, S. A. Nivison, Z. I. Bell, R. Kamalapurkar, Safe model-based reinforcement learning for systems with parametric
-uncertainties, Frontiers in Robotics and AI 8 (2021) 733104, section 7.2. The authors' program is public
-(github.com/scc-lab/publications-code, 2021-Frontiers-BT-MBRL).
+S. M. N. Mahmud, S. A. Nivison, Z. I. Bell, R. Kamalapurkar, Safe model-based reinforcement learning
+for systems with parametric uncertainties, Frontiers in Robotics and AI 8 (2021) 733104, section
+7.2. The authors' program is public (github.com/scc-lab/publications-code, 2021-Frontiers-BT-MBRL).
 
 | printed | value | where |
 | --- | --- | --- |
@@ -12,14 +13,18 @@ uncertainties, Frontiers in Robotics and AI 8 (2021) 733104, section 7.2. The au
 | start | q = (-5, -5) rad, q' = (5, 5) rad/s | x0 in main.m |
 | task | to the origin | the same |
 
-**What it shows**, by its plotting script: the states and their walls over time, the stretched states beside those of an optimal control
-(GPOPS II), the law's weights, and its estimates of the friction. Read for this page: the program, not the article.
+**What it shows**, by its plotting script: the states and their walls over time, the stretched
+  states beside those of an optimal control
+(GPOPS II), the law's weights, and its estimates of the friction. Read for this page: the program,
+not the article.
 
-**Not printed:** masses and lengths, which p1 ... p3 do without; those of the scenario are chosen to give them. There is no gravity.
+**Not printed:** masses and lengths, which p1 ... p3 do without; those of the scenario are chosen to
+give them. There is no gravity.
 
-**Their law is not in the package:** they stretch each state by b(x) = ln[A (a - x)/(a (A - x))], which is infinite at the walls, and learn
-an optimal law in the stretched coordinates. This is their arm, box and start under the package's law for such boxes, `FullState`, with a
-momentum observer in the place of their estimate of the friction. Its gains are ours.
+**Their law is not in the package:** they stretch each state by b(x) = ln[A (a - x)/(a (A - x))],
+which is infinite at the walls, and learn an optimal law in the stretched coordinates. This is their
+arm, box and start under the package's law for such boxes, `FullState`, with a momentum observer in
+the place of their estimate of the friction. Its gains are ours.
 """
 
 from pathlib import Path
@@ -39,20 +44,31 @@ overview = run.plot()
 
 # %% What their law is made for: states that stay in the box and go to the origin. Under this one:
 M = np.asarray(scenario.plant.mass_matrix(np.zeros(2)))
-print(f"M(0) = {M.round(3).tolist()} kg m^2, p1 + 2 p3 = {3.473 + 2 * 0.242:.3f}, p2 + p3 = {0.196 + 0.242:.3f}")
+print(
+    f"M(0) = {M.round(3).tolist()} kg m^2, p1 + 2 p3 = {3.473 + 2 * 0.242:.3f}, p2 + p3 ="
+    f" {0.196 + 0.242:.3f}"
+)
 print(f"status: {ij.Status(int(run.status))!r}")
 print(
-    f"least distance to the walls: {np.asarray(run.metrics.margin).round(3)} rad, {np.asarray(run.metrics.velocity_margin).round(3)} rad/s"
+    f"least distance to the walls: {np.asarray(run.metrics.margin).round(3)} rad,"
+    f" {np.asarray(run.metrics.velocity_margin).round(3)} rad/s"
 )
 last = np.abs(run.q) > 0.05
 print(f"|q| < 0.05 rad from {float(run.t[np.max(np.flatnonzero(last.any(axis=1)))]):.1f} s on")
-print(f"friction at the start {np.asarray(run.disturbance[0]).round(2)} N m, largest torque {np.abs(run.tau).max(axis=0).round(1)} N m")
+print(
+    f"friction at the start {np.asarray(run.disturbance[0]).round(2)} N m, largest torque"
+    f" {np.abs(run.tau).max(axis=0).round(1)} N m"
+)
 
 # %% In their coordinates: the stretched states, from the start's values on.
 low, high = np.array([-7.0, -5.0]), np.array([5.0, 7.0])
 states = np.stack([np.asarray(run.q), np.asarray(run.dq)], axis=-1)
 stretched = np.log(high * (low - states) / (low * (high - states)))
-print(f"at the start b(q) = {stretched[0, 0, 0]:.3f}, b(q') = {stretched[0, 0, 1]:.3f}; largest |b| {np.abs(stretched).max():.3f}")
+print(
+    f"at the start b(q) = {stretched[0, 0, 0]:.3f}, b(q') = {stretched[0, 0, 1]:.3f}; largest |b|"
+    f" {np.abs(stretched).max():.3f}"
+)
 
-# %% **Not reproduced:** the law, its weights, its estimates of the friction, and the optimal control (GPOPS II) that is plotted
-# beside it; their curves are not kept as numbers, so none is beside these.
+# %% **Not reproduced:** the law, its weights, its estimates of the friction, and the optimal
+# control (GPOPS II) that is plotted beside it; their curves are not kept as numbers, so none is
+# beside these.

@@ -1,7 +1,9 @@
-"""A push, and observers that tell it (Zhang 2022): three joints under computed torque, pushed for a second.
+"""A push, and observers that tell it (Zhang 2022): three joints under computed torque, pushed for a
+second.
 
-Z. Zhang, Disturbance estimation for robotic systems using continuous integral sliding mode observer, Int. J. Robust and Nonlinear Control
-(2022), 10.1002/rnc.6252. The author's program is public (github.com/zhang-zengjie/smc-for-robot).
+Z. Zhang, Disturbance estimation for robotic systems using continuous integral sliding mode
+observer, Int. J. Robust and Nonlinear Control (2022), 10.1002/rnc.6252. The author's program is
+public (github.com/zhang-zengjie/smc-for-robot).
 
 | printed | value | where |
 | --- | --- | --- |
@@ -13,15 +15,18 @@ Z. Zhang, Disturbance estimation for robotic systems using continuous integral s
 | push | (0.15, 0.18, 0.12) N m: a square from 6 to 7 s; half a sine, a triangle to 8 s | disturbance_sqrt.m and others |
 | steps | Euler, 1e-4 s, 10 s | main.m |
 
-**What it shows:** estimates of the push that lie on it in figures whose axes are named below. Read for this page: the program, not the
-article.
+**What it shows:** estimates of the push that lie on it in figures whose axes are named below. Read
+for this page: the program, not the article.
 
-**Not printed:** links. Masses and lengths enter by six sums, and any chain with these sums moves alike; the scenario's are chosen.
+**Not printed:** links. Masses and lengths enter by six sums, and any chain with these sums moves
+alike; the scenario's are chosen.
 
-**Printed, and not an arm's:** 0.0519 cos q3 in M_22, where 2 x 0.02809 = 0.05618 must stand (M_11 and M_12 have 0.0561, C has 0.0561 and
-0.05619). The scenario has the arm. The law knows the arm and its friction exactly, so both cancel, and the scenario leaves friction out.
+**Printed, and not an arm's:** 0.0519 cos q3 in M_22, where 2 x 0.02809 = 0.05618 must stand (M_11
+and M_12 have 0.0561, C has 0.0561 and 0.05619). The scenario has the arm. The law knows the arm and
+its friction exactly, so both cancel, and the scenario leaves friction out.
 
-The law is the package's `ComputedTorque`, without an observer: in the publication what is estimated is not fed back.
+The law is the package's `ComputedTorque`, without an observer: in the publication what is estimated
+is not fed back.
 """
 
 from pathlib import Path
@@ -45,27 +50,52 @@ for joint in range(3):
     left.plot(run.t, 1e3 * runs["momentum"].e1[:, joint], color=f"C{joint}", linestyle=":")
     right.plot(run.t, run.disturbance[:, joint], color="0.8", linewidth=4)
     for found, style in zip(runs.values(), (":", "--"), strict=True):
-        right.plot(found.t, found.disturbance_estimate[:, joint], color=f"C{joint}", linestyle=style)
-left.set(xlim=(5.8, 7.6), xlabel="time $t$ [s]", ylabel="error $e_1$ [mrad]", title="their law; dotted: with a momentum observer")
-right.set(xlim=(5.9, 6.3), xlabel="time $t$ [s]", ylabel="push and estimates [N m]", title="dotted: momentum, dashed: extended state")
+        right.plot(
+            found.t, found.disturbance_estimate[:, joint], color=f"C{joint}", linestyle=style
+        )
+left.set(
+    xlim=(5.8, 7.6),
+    xlabel="time $t$ [s]",
+    ylabel="error $e_1$ [mrad]",
+    title="their law; dotted: with a momentum observer",
+)
+right.set(
+    xlim=(5.9, 6.3),
+    xlabel="time $t$ [s]",
+    ylabel="push and estimates [N m]",
+    title="dotted: momentum, dashed: extended state",
+)
 left.legend()
 
-# %% Their law, pushed: the joints give way by M^-1 d/1500, and come back. With an observer of the package whose estimate is fed back they
-# give way for an instant only. The axes of the published figures leave 5e-3 N m for the error of their estimate of half a sine wave,
-# and 0.2 N m for that of a square, which is the push itself: no observer knows a jump at once.
+# %% Their law, pushed: the joints give way by M^-1 d/1500, and come back. With an observer of the
+# package whose estimate is fed back they give way for an instant only. The axes of the published
+# figures leave 5e-3 N m for the error of their estimate of half a sine wave, and 0.2 N m for that
+# of a square, which is the push itself: no observer knows a jump at once.
 print(f"status: {ij.Status(int(run.status))!r}")
 pushed = (run.t > 6.5) & (run.t < 6.99)
 for name, found in {"no observer": run, **runs}.items():
     sizes = ", ".join(f"{x:.1e}" for x in np.abs(found.e1[pushed]).max(axis=0))
     print(f"{name}: |e1| up to {sizes} rad, from half a second into the push to its end")
 M = np.asarray(scenario.plant.mass_matrix(run.q[(run.t > 6.9)][0]))
-print("M^-1 d/1500:", ", ".join(f"{x:.1e}" for x in np.abs(np.linalg.solve(M, [0.15, 0.18, 0.12]) / 1500)), "rad")
+print(
+    "M^-1 d/1500:",
+    ", ".join(f"{x:.1e}" for x in np.abs(np.linalg.solve(M, [0.15, 0.18, 0.12]) / 1500)),
+    "rad",
+)
 for name, found in runs.items():
     off = np.abs(found.disturbance - found.disturbance_estimate)
     settled = off[(found.t > 6.1) & (found.t < 6.99)].max()
-    print(f"{name}: the estimate is off by {off[found.t < 5.99].max():.1e} N m before, {settled:.1e} N m from 0.1 s after the push began")
-print(f"largest torque {np.abs(run.tau).max(axis=0).round(2)} N m, in a published figure from -2 to 3 N m")
+    print(
+        f"{name}: the estimate is off by {off[found.t < 5.99].max():.1e} N m before, {settled:.1e}"
+        " N m from 0.1 s after the push began"
+    )
+print(
+    f"largest torque {np.abs(run.tau).max(axis=0).round(2)} N m, in a published figure from -2 to"
+    " 3 N m"
+)
 
-# %% **Not reproduced:** the paper's own observers, a continuous integral sliding mode and a conventional one: the package has neither. The
-# square push is the one of its three that a scenario file can hold; half a sine and a triangle end after two seconds, which no disturbance
-# of the package does. Its discrete steps: Euler's method at 1e-4 s is off by about 1e-5 rad from what is computed here.
+# %% **Not reproduced:** the paper's own observers, a continuous integral sliding mode and a
+# conventional one: the package has neither. The square push is the one of its three that a scenario
+# file can hold; half a sine and a triangle end after two seconds, which no disturbance of the
+# package does. Its discrete steps: Euler's method at 1e-4 s is off by about 1e-5 rad from what is
+# computed here.

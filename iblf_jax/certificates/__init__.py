@@ -1,4 +1,6 @@
-"""Certificates: Theorem 2's claims about a loop, checked line by line (`certify`), and broken if it can be (`counterexample`)."""
+"""Certificates: Theorem 2's claims about a loop, checked line by line (`certify`), and broken if it
+can be (`counterexample`).
+"""
 
 from iblf_jax.certificates._certify import certify as certify
 from iblf_jax.certificates._counterexample import Counterexample as Counterexample

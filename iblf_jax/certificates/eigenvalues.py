@@ -1,9 +1,10 @@
 """The eigenvalues of the mass matrix over the admissible box of joint positions.
 
-rho (3.19), (3.27) holds lambda_max(M0), and (3.23), (3.31) hold lambda_min(M0).  Along one run they are known; before it, they must be
-taken over every position that the bounds admit, the box  min_t k_lc < q < max_t k_uc.  The maximum of an eigenvalue over a box
-has no closed form for a general arm: a grid (up to 3 joints) or a Sobol set (more) is searched, and the best points are
-improved by projected quasi-Newton steps.  What was searched is said in words beside the number.
+rho (3.19), (3.27) holds lambda_max(M0), and (3.23), (3.31) hold lambda_min(M0).  Along one run they
+are known; before it, they must be taken over every position that the bounds admit, the box  min_t
+k_lc < q < max_t k_uc.  The maximum of an eigenvalue over a box has no closed form for a general
+arm: a grid (up to 3 joints) or a Sobol set (more) is searched, and the best points are improved by
+  projected quasi-Newton steps.  What was searched is said in words beside the number.
 """
 
 from __future__ import annotations
@@ -46,10 +47,14 @@ def _with_gradient(robot: Robot, q: jax.Array, sign: int) -> jax.Array:
 
 @jax.jit
 def _both_ends(robot: Robot, points: jax.Array) -> jax.Array:
-    return jax.lax.map(lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=CERTIFY_TOGETHER)
+    return jax.lax.map(
+        lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=CERTIFY_TOGETHER
+    )
 
 
-def maximise(value_and_gradient, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, np.ndarray]:
+def maximise(
+    value_and_gradient, start: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[float, np.ndarray]:
     """A local maximum of a function over a box, by projected quasi-Newton ascent (L-BFGS-B)."""
     from scipy.optimize import minimize
 
@@ -57,7 +62,13 @@ def maximise(value_and_gradient, start: np.ndarray, low: np.ndarray, high: np.nd
         value, gradient = value_and_gradient(x)
         return -float(value), -np.asarray(gradient, float)
 
-    found = minimize(negative, np.asarray(start, float), jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)))
+    found = minimize(
+        negative,
+        np.asarray(start, float),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+    )
     return -float(found.fun), np.clip(found.x, low, high)
 
 
@@ -90,7 +101,14 @@ def eigenvalues_over(robot: Robot, low: np.ndarray, high: np.ndarray) -> Extreme
     found = {}
     for sign, values in ((1, ends[:, -1]), (-1, -ends[:, 0])):
         starts = points[np.argsort(values)[::-1][:REFINED]]
-        tries = [maximise(lambda x, s=sign: _with_gradient(robot, np.asarray(x, dtype), s), start, low, high) for start in starts]
-        found[sign] = max([*tries, (float(values.max()), points[np.argmax(values)])], key=lambda pair: pair[0])
+        tries = [
+            maximise(
+                lambda x, s=sign: _with_gradient(robot, np.asarray(x, dtype), s), start, low, high
+            )
+            for start in starts
+        ]
+        found[sign] = max(
+            [*tries, (float(values.max()), points[np.argmax(values)])], key=lambda pair: pair[0]
+        )
     searched = f"{words}, the best {REFINED} improved by L-BFGS-B"
     return Extremes(-found[-1][0], found[1][0], found[-1][1], found[1][1], searched)

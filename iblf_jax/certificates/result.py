@@ -1,7 +1,10 @@
-"""What `certify` gives back: a `Certificate`, which is a list of `Line`s, and the traces that the figure shows.
+"""What `certify` gives back: a `Certificate`, which is a list of `Line`s, and the traces that the
+figure shows.
 
-A line is one inequality of the theorem: what was checked, by what margin it holds (positive: holds), where and when the margin is
-smallest, and the verdict.  "Not applicable" is a verdict of its own: no claim was made, so none was broken.
+A line is one inequality of the theorem: what was checked, by what margin it holds (positive:
+  holds), where and when the margin is
+smallest, and the verdict.  "Not applicable" is a verdict of its own: no claim was made, so none was
+broken.
 """
 
 from __future__ import annotations
@@ -37,7 +40,8 @@ class Line:
     verdict: str
     """"holds", "fails" or "not applicable"."""
     margin: float | None = None
-    """Smallest distance to breaking it, positive if it holds, in `unit`; None where there is nothing to measure."""
+    """Smallest distance to breaking it, positive if it holds, in `unit`; None where there is
+    nothing to measure."""
     tolerance: float = 0.0
     """How far below zero the margin may be by rounding and by the integrator's error."""
     value: float | None = None
@@ -58,11 +62,15 @@ class Line:
 
     @property
     def applies(self) -> bool:
-        """Whether the line says something of this run: a verdict, or a number that was measured beside the claims."""
+        """Whether the line says something of this run: a verdict, or a number that was measured
+        beside the claims.
+        """
         return self.verdict != NOT_APPLICABLE or (self.value is not None and not self.counts)
 
     def where(self) -> str:
-        """Run, joint and time of the smallest margin, and when the line was first broken, in words."""
+        """Run, joint and time of the smallest margin, and when the line was first broken, in
+        words.
+        """
         if self.margin is None and self.value is None:
             return ""
         parts = [] if self.run is None else [f"run {self.run}"]
@@ -73,7 +81,9 @@ class Line:
 
 
 class Traces(NamedTuple):
-    """What `Certificate.plot` shows: arrays over the T recorded samples of one run; NaN where nothing is claimed."""
+    """What `Certificate.plot` shows: arrays over the T recorded samples of one run; NaN where
+    nothing is claimed.
+    """
 
     t: np.ndarray
     V: np.ndarray
@@ -97,7 +107,9 @@ class Traces(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Certificate:
-    """Theorem 2, inequality by inequality, for one run or for many.  `holds`, `lines`, `cert["inequality, case 2"]`, `plot()`."""
+    """Theorem 2, inequality by inequality, for one run or for many.  `holds`, `lines`,
+    `cert["inequality, case 2"]`, `plot()`.
+    """
 
     heading: str
     """Law, barrier, reading and observer that were judged."""
@@ -111,11 +123,14 @@ class Certificate:
     joints: tuple[str, ...] = ()
     """What the joints are called."""
     worst_run: int | None = None
-    """The run whose inequality has the smallest margin (or fails), if there were many; the traces are its."""
+    """The run whose inequality has the smallest margin (or fails), if there were many; the traces
+    are its."""
 
     @property
     def verdict(self) -> str:
-        """All in one word: "fails" if a line does, "holds" if none does and the inequality was checked, else "not applicable"."""
+        """All in one word: "fails" if a line does, "holds" if none does and the inequality was
+        checked, else "not applicable".
+        """
         counted = [line for line in self.lines if line.counts]
         if any(line.verdict == FAILS for line in counted):
             return FAILS
@@ -129,7 +144,9 @@ class Certificate:
 
     @property
     def is_of_own_claim(self) -> bool:
-        """Whether what was checked is a claim that the law states of itself, and not the paper's theorem."""
+        """Whether what was checked is a claim that the law states of itself, and not the paper's
+        theorem.
+        """
         inequalities = [line.name for line in self.applicable if line.name.startswith("inequality")]
         return inequalities == [OWN_INEQUALITY]
 
@@ -137,12 +154,22 @@ class Certificate:
         for line in self.lines:
             if isinstance(name, str) and line.name == name:
                 return line
-        raise KeyError(f"no line {checks.shown(name)}; there are {', '.join(repr(line.name) for line in self.lines)}")
+        raise KeyError(
+            f"no line {checks.shown(name)}; there are"
+            f" {', '.join(repr(line.name) for line in self.lines)}"
+        )
 
     def __repr__(self) -> str:
-        rows = [("", "equation", "verdict", "margin", "value", "where the margin is smallest"), *self._rows()]
+        rows = [
+            ("", "equation", "verdict", "margin", "value", "where the margin is smallest"),
+            *self._rows(),
+        ]
         notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
-        shown = [f"Certificate: {self.verdict}  ({self.subject})", *tables.as_text(rows), *(["notes", *notes] if notes else [])]
+        shown = [
+            f"Certificate: {self.verdict}  ({self.subject})",
+            *tables.as_text(rows),
+            *(["notes", *notes] if notes else []),
+        ]
         return "\n".join([*shown, *([self.omitted] if self.omitted else [])])
 
     def _repr_html_(self) -> str:
@@ -151,9 +178,14 @@ class Certificate:
         return reports.card(self)
 
     def table_html(self) -> str:
-        """The lines that apply as an HTML table, those that fail in bold, and below it why the others do not apply."""
+        """The lines that apply as an HTML table, those that fail in bold, and below it why the
+        others do not apply.
+        """
         heading = ("", "equation", "verdict", "margin", "value", "where", "checked", "note")
-        rows = [(*row, line.statement, line.note) for line, row in zip(self.applicable, self._rows(), strict=True)]
+        rows = [
+            (*row, line.statement, line.note)
+            for line, row in zip(self.applicable, self._rows(), strict=True)
+        ]
         failing = [i for i, line in enumerate(self.applicable) if line.verdict == FAILS]
         table = tables.as_html(heading, rows, failing)
         return f"{table}<p>{html.escape(self.omitted)}</p>" if self.omitted else table
@@ -173,10 +205,17 @@ class Certificate:
         count = sum(map(len, reasons.values()))
         if count == 0:
             return ""
-        subject = "1 line of the paper's theorem does not apply" if count == 1 else f"{count} lines of the paper's theorem do not apply"
+        subject = (
+            "1 line of the paper's theorem does not apply"
+            if count == 1
+            else f"{count} lines of the paper's theorem do not apply"
+        )
         if len(reasons) == 1:
             return f"{subject}, because {next(iter(reasons))}."
-        return f"{subject}: {'; '.join(f'{_named(names)}, because {reason}' for reason, names in reasons.items())}."
+        return (
+            f"{subject}:"
+            f" {'; '.join(f'{_named(names)}, because {reason}' for reason, names in reasons.items())}."
+        )
 
     def _notes(self) -> dict[str, list[str]]:
         """Each note and the lines that it belongs to."""
@@ -189,16 +228,27 @@ class Certificate:
     @property
     def subject(self) -> str:
         """What was judged, in words."""
-        return self.heading + (f"; {len(self.runs)} runs, worst {self.worst_run}" if self.runs else "")
+        return self.heading + (
+            f"; {len(self.runs)} runs, worst {self.worst_run}" if self.runs else ""
+        )
 
     def _rows(self) -> list[tuple[str, str, str, str, str, str]]:
         return [
-            (line.name, line.equation, line.verdict, _number(line.margin, line.unit), _number(line.value, line.unit), line.where())
+            (
+                line.name,
+                line.equation,
+                line.verdict,
+                _number(line.margin, line.unit),
+                _number(line.value, line.unit),
+                line.where(),
+            )
             for line in self.applicable
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Heading, verdict, constants and lines as plain numbers, strings and lists, for strict JSON (no NaN, no infinity)."""
+        """Heading, verdict, constants and lines as plain numbers, strings and lists, for strict
+        JSON (no NaN, no infinity).
+        """
         return _for_json({
             "heading": self.heading,
             "verdict": self.verdict,
@@ -209,7 +259,9 @@ class Certificate:
         })  # fmt: skip
 
     def plot(self, **options):
-        """V2 under its envelope, the inequality's left side, and the errors under their bounds.  Options as `plotting.certificate`."""
+        """V2 under its envelope, the inequality's left side, and the errors under their bounds.
+        Options as `plotting.certificate`.
+        """
         from iblf_jax.plotting import certificates
 
         return certificates.certificate(self, **options)

@@ -1,8 +1,10 @@
 """Every step of a run again, from the samples that it recorded, in stretches of bounded size.
 
-A recorded sample holds the whole state of the loop.  So the steps between two of them are made again from the first, and must arrive at
-the second; and what the run recorded must be what its scenario gives there.  If not, the run is refused: a certificate would speak of
-another loop.  Differences of rounding (another backend, another machine) are let pass; starting anew at every sample keeps them small.
+A recorded sample holds the whole state of the loop.  So the steps between two of them are made
+again from the first, and must arrive at the second; and what the run recorded must be what its
+scenario gives there.  If not, the run is refused: a certificate would speak of another loop.
+  Differences of rounding (another backend, another machine) are let pass; starting anew at every
+  sample keeps them small.
 
 A run that is not to be believed is not made again: its recorded samples are looked at as they are.
 """
@@ -74,47 +76,87 @@ def grid(run: Any) -> tuple[int, int]:
     every = int(np.rint((t[1] - t[0]) / dt)) if t.size > 1 else (run.steps or 0) + 1
     slack = 16 * np.finfo(np.asarray(run.t).dtype).eps * max(abs(t[-1]), dt)
     if every < 1 or not np.all(np.abs(t - np.arange(t.size) * every * dt) <= slack):
-        raise checks.fail("run.t", run.t, f"0 and whole multiples of run.dt, {dt:g} s, at equal distances", "Simulate it again.")
+        raise checks.fail(
+            "run.t",
+            run.t,
+            f"0 and whole multiples of run.dt, {dt:g} s, at equal distances",
+            "Simulate it again.",
+        )
     last = (t.size - 1) * every if run.steps is None else run.steps
     if not last > 0 or not 0 <= last - (t.size - 1) * every < every:
         remedy = "Simulate it again with record_every so small that there are two."
-        raise checks.fail("run", f"{t.size} recorded samples of {run.steps} steps", "samples that cover the run", remedy)
+        raise checks.fail(
+            "run",
+            f"{t.size} recorded samples of {run.steps} steps",
+            "samples that cover the run",
+            remedy,
+        )
     return every, last
 
 
 def tolerances(run: Any) -> dict[str, float]:
-    """By how much a recorded quantity may differ from what the scenario gives, by kind [rad, rad/s, N m]."""
+    """By how much a recorded quantity may differ from what the scenario gives, by kind [rad, rad/s,
+    N m].
+    """
 
     def largest(names):
         return max(float(np.max(np.abs(getattr(run, name)), initial=0.0)) for name in names)
 
-    rough, position, torque = np.sqrt(np.finfo(run.q.dtype).eps), largest(POSITIONS), largest(TORQUES)
+    rough, position, torque = (
+        np.sqrt(np.finfo(run.q.dtype).eps),
+        largest(POSITIONS),
+        largest(TORQUES),
+    )
     # A loop at rest has speeds of rounding alone, which is why they are not held to their own size.
-    return {"position": rough * position, "speed": rough * max(largest(SPEEDS), position), "torque": rough * torque}
+    return {
+        "position": rough * position,
+        "speed": rough * max(largest(SPEEDS), position),
+        "torque": rough * torque,
+    }
 
 
 def _as_recorded(run: Any, every: int) -> Iterator[tuple[np.ndarray, LoopState]]:
     """Step numbers and states of the recorded samples alone."""
     for at in range(0, run.t.size, CERTIFY_STRETCH):
         rows = slice(at, min(at + CERTIFY_STRETCH, run.t.size))
-        yield np.arange(rows.start, rows.stop) * every, jax.tree.map(lambda x, rows=rows: x[rows], states_of(run))
+        yield (
+            np.arange(rows.start, rows.stop) * every,
+            jax.tree.map(lambda x, rows=rows: x[rows], states_of(run)),
+        )
 
 
 def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopState]]:
-    """Step numbers and states of all steps, made again; several of the pieces between samples at once where they are short."""
+    """Step numbers and states of all steps, made again; several of the pieces between samples at
+    once where they are short.
+    """
     recorded, count = states_of(run), run.t.size
     together, length = max(1, CERTIFY_STRETCH // every), min(every, CERTIFY_STRETCH)
     start = jax.tree.map(np.asarray, initial_state(run.scenario))
-    _check_arrival(run, jax.tree.map(lambda x: x[:1], recorded), jax.tree.map(lambda x: x[None], start), np.zeros(1, int))
+    _check_arrival(
+        run,
+        jax.tree.map(lambda x: x[:1], recorded),
+        jax.tree.map(lambda x: x[None], start),
+        np.zeros(1, int),
+    )
     for at in range(0, count, together):
         rows = np.minimum(np.arange(at, at + together), count - 1)
         states = jax.tree.map(lambda x, rows=rows: x[rows], recorded)
         for offset in range(0, every, length):
             first = rows * every + offset
-            place = Place(jax.device_put(first.astype(run.dt.dtype)), jax.device_put(np.full(first.shape, run.dt, run.dt.dtype)), states)
-            (_, _, states), (path, _) = run_from(run.scenario, run.dt, place, step=Onward(run.method), steps=length)
+            place = Place(
+                jax.device_put(first.astype(run.dt.dtype)),
+                jax.device_put(np.full(first.shape, run.dt, run.dt.dtype)),
+                states,
+            )
+            (_, _, states), (path, _) = run_from(
+                run.scenario, run.dt, place, step=Onward(run.method), steps=length
+            )
             index = first[:, None] + np.arange(length)
-            keep = (np.arange(at, at + together) < count)[:, None] & (np.arange(offset, offset + length) < every) & (index <= last)
+            keep = (
+                (np.arange(at, at + together) < count)[:, None]
+                & (np.arange(offset, offset + length) < every)
+                & (index <= last)
+            )
             if not keep.any():
                 return
             host = jax.tree.map(np.asarray, path)
@@ -124,7 +166,12 @@ def _again(run: Any, every: int, last: int) -> Iterator[tuple[np.ndarray, LoopSt
             arrived = jax.tree.map(lambda x, rest=rest: x[:, rest], host)
         come = np.arange(at, at + together) < count - 1
         arrived = jax.tree.map(lambda x, come=come: x[come], arrived)
-        _check_arrival(run, jax.tree.map(lambda x, rows=rows, come=come: x[rows[come] + 1], recorded), arrived, rows[come] + 1)
+        _check_arrival(
+            run,
+            jax.tree.map(lambda x, rows=rows, come=come: x[rows[come] + 1], recorded),
+            arrived,
+            rows[come] + 1,
+        )
 
 
 def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> Stretch:
@@ -138,39 +185,77 @@ def _looked_at(run: Any, index: np.ndarray, states: LoopState, every: int) -> St
 
 
 def _check_arrival(run: Any, recorded: LoopState, made: LoopState, rows: np.ndarray) -> None:
-    """Raises ValueError if the states that were made again are not those that the run recorded there."""
+    """Raises ValueError if the states that were made again are not those that the run recorded
+    there.
+    """
     sizes = tolerances(run)
-    for name, kind in (("q", "position"), ("dq", "speed"), ("controller", "torque"), ("observer", "torque")):
+    for name, kind in (
+        ("q", "position"),
+        ("dq", "speed"),
+        ("controller", "torque"),
+        ("observer", "torque"),
+    ):
         label = {"controller": "controller_state", "observer": "observer_state"}.get(name, name)
-        for kept, again in zip(jax.tree.leaves(getattr(recorded, name)), jax.tree.leaves(getattr(made, name)), strict=True):
-            # A state of law or observer has a unit of its own: it is held to its own size, where that is larger.
-            own = np.sqrt(np.finfo(kept.dtype).eps) * np.max(np.abs(kept), initial=0.0) if "state" in label else 0.0
+        for kept, again in zip(
+            jax.tree.leaves(getattr(recorded, name)),
+            jax.tree.leaves(getattr(made, name)),
+            strict=True,
+        ):
+            # A state of law or observer has a unit of its own: it is held to its own size, where
+            # that is larger.
+            own = (
+                np.sqrt(np.finfo(kept.dtype).eps) * np.max(np.abs(kept), initial=0.0)
+                if "state" in label
+                else 0.0
+            )
             _compare(run, label, kept, again, rows, max(sizes[kind], own))
 
 
 def _check_signals(run: Any, stretch: Stretch, rows: np.ndarray, sizes: dict[str, float]) -> None:
-    """Raises ValueError if what the scenario gives at recorded states is not what the run recorded there."""
+    """Raises ValueError if what the scenario gives at recorded states is not what the run recorded
+    there.
+    """
     for names, kind in ((POSITIONS, "position"), (SPEEDS, "speed"), (TORQUES, "torque")):
         for name in names:
-            _compare(run, name, getattr(run, name)[rows], getattr(stretch.sample, name)[stretch.recorded], rows, sizes[kind])
+            _compare(
+                run,
+                name,
+                getattr(run, name)[rows],
+                getattr(stretch.sample, name)[stretch.recorded],
+                rows,
+                sizes[kind],
+            )
 
 
-def _compare(run: Any, name: str, kept: np.ndarray, made: np.ndarray, rows: np.ndarray, tolerance: float) -> None:
+def _compare(
+    run: Any, name: str, kept: np.ndarray, made: np.ndarray, rows: np.ndarray, tolerance: float
+) -> None:
     far = np.any(~(np.abs(made - kept) <= tolerance), axis=tuple(range(1, np.ndim(kept))))
     if far.any():
         k = int(np.argmax(far))
         where = f"{name} of sample {int(rows[k])} (t = {float(run.t[rows[k]]):.6g} s)"
-        remedy = f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, made again {made[k]}. "
-        remedy += "Simulate it again; a loop that amplifies rounding that much needs record_every=1."
-        raise checks.fail("run", "samples that its scenario does not give", "the run of run.scenario", remedy)
+        remedy = (
+            f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, made"
+            f" again {made[k]}. "
+        )
+        remedy += (
+            "Simulate it again; a loop that amplifies rounding that much needs record_every=1."
+        )
+        raise checks.fail(
+            "run", "samples that its scenario does not give", "the run of run.scenario", remedy
+        )
 
 
 def check_status(run: Any, margin: float) -> None:
-    """Raises ValueError if the run's status and the smallest margin of all steps [rad] contradict each other beyond rounding."""
+    """Raises ValueError if the run's status and the smallest margin of all steps [rad] contradict
+    each other beyond rounding.
+    """
     flagged = bool(int(run.status) & int(Status.BOUND_VIOLATED))
     # Without the number of steps, the run may have left its bounds after its last sample.
     unseen = flagged and margin > 0 and run.steps is None
     if flagged == (not margin > 0) or unseen or abs(margin) <= tolerances(run)["position"]:
         return
-    remedy = f"All its steps, made again, have a smallest margin of {margin:.3g} rad. Simulate it again."
+    remedy = (
+        f"All its steps, made again, have a smallest margin of {margin:.3g} rad. Simulate it again."
+    )
     raise checks.fail("run.status", describe(int(run.status)), "the status of run.scenario", remedy)

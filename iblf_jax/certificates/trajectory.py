@@ -1,16 +1,21 @@
-"""One run as the certificate sees it: the terms of the proof at every step, the constants of the claim, and the envelope of V2.
+"""One run as the certificate sees it: the terms of the proof at every step, the constants of the
+claim, and the envelope of V2.
 
-    case 1:  V2(t) <= V2(s) exp(-rho (t - s)) for t >= s                                                                 (3.20)
-    case 2:  V2(t) <= V2(s) exp(-rho (t - s)) + rho2/rho,   rho2 = F_d^2/2, F_d = sup |f'| over the run                  (3.28)
+    case 1:  V2(t) <= V2(s) exp(-rho (t - s)) for t >= s
+      (3.20)
+    case 2:  V2(t) <= V2(s) exp(-rho (t - s)) + rho2/rho,   rho2 = F_d^2/2, F_d = sup |f'| over the
+      run                  (3.28)
 
-The claim holds from any instant s on.  So where f jumps (Assumption 1 is broken there), and where the guard or a torque limit was at
-work, the envelope starts anew at the next step.
+The claim holds from any instant s on.  So where f jumps (Assumption 1 is broken there), and where
+the guard or a torque limit was at work, the envelope starts anew at the next step.
 
-A run is not the exact solution: the envelope is widened by the integrator's own error in V2 (`proof_terms.along_run`), carried along at the
+A run is not the exact solution: the envelope is widened by the integrator's own error in V2
+  (`proof_terms.along_run`), carried along at the
 rate of the claim, and by rounding, so that V2 may be followed down to where it is only noise.
 
-All steps are looked at, whatever the run recorded (`retrace`), twice: rho and F_d are known after the first time only.  A run of few
-steps is kept in between; a long one is made again, so that memory stays bounded.
+All steps are looked at, whatever the run recorded (`retrace`), twice: rho and F_d are known after
+the first time only.  A run of few steps is kept in between; a long one is made again, so that
+memory stays bounded.
 """
 
 from __future__ import annotations
@@ -104,7 +109,9 @@ class Trajectory(NamedTuple):
 
 def look(run: Any) -> tuple[Whole, Iterator[Trajectory]]:
     """What is known of one run, its arrays on the host, and its stretches one after the other."""
-    seen: Iterable[Stretch] = list(stretches(run)) if grid(run)[1] <= CERTIFY_KEPT else stretches(run)
+    seen: Iterable[Stretch] = (
+        list(stretches(run)) if grid(run)[1] <= CERTIFY_KEPT else stretches(run)
+    )
     whole = _whole(run, seen)
     return whole, _with_envelopes(whole, seen if isinstance(seen, list) else stretches(run))
 
@@ -124,8 +131,13 @@ class _Tally:
     def add(self, stretch: Stretch) -> None:
         """Takes a stretch into account; what is no number stays none."""
         sample, proof = stretch.sample, stretch.proof
-        self.low, self.high = np.minimum(self.low, sample.lower.min(axis=0)), np.maximum(self.high, sample.upper.max(axis=0))
-        self.margin = np.minimum(self.margin, np.minimum(sample.q - sample.lower, sample.upper - sample.q).min())
+        self.low, self.high = (
+            np.minimum(self.low, sample.lower.min(axis=0)),
+            np.maximum(self.high, sample.upper.max(axis=0)),
+        )
+        self.margin = np.minimum(
+            self.margin, np.minimum(sample.q - sample.lower, sample.upper - sample.q).min()
+        )
         self.F_m = np.maximum(self.F_m, np.linalg.norm(proof.f, axis=1).max())
         self.F_d = np.maximum(self.F_d, np.linalg.norm(proof.df, axis=1).max())
         self.lambda_min = np.minimum(self.lambda_min, proof.lambda_min.min())
@@ -135,7 +147,10 @@ class _Tally:
         if self.samples == 0:
             self.half_square = 0.5 * np.sum(proof.f_tilde[0] ** 2)
         self.V_ends = (proof.V[0] if self.samples == 0 else self.V_ends[0], proof.V[-1])
-        self.samples, self.left_out = self.samples + stretch.t.size, self.left_out + int(proof.held.sum())
+        self.samples, self.left_out = (
+            self.samples + stretch.t.size,
+            self.left_out + int(proof.held.sum()),
+        )
 
 
 def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
@@ -156,7 +171,9 @@ def _whole(run: Any, seen: Iterable[Stretch]) -> Whole:
     if constants is not None:
         for each in claims.CASES:
             for where, seen_there in (("run", tally), ("box", over_box)):
-                rates[each, where] = float(claims.rho(constants, seen_there.lambda_max, each, seen_there.lambda_min))
+                rates[each, where] = float(
+                    claims.rho(constants, seen_there.lambda_max, each, seen_there.lambda_min)
+                )
     F_d = 0.0 if case == 1 else float(tally.F_d)
     return Whole(
         run=run,
@@ -188,7 +205,9 @@ def _weights(run: Any, constants: Any, tally: _Tally, F_d: float) -> dict[int, w
     V_rest = float(tally.V_ends[0]) - half_square
     found = {}
     for case in claims.CASES:
-        best = weighted.best(constants, float(tally.slowest), V_rest, half_square, F_d, duration, case)
+        best = weighted.best(
+            constants, float(tally.slowest), V_rest, half_square, F_d, duration, case
+        )
         if best is not None:
             found[case] = best
     return found
@@ -199,14 +218,24 @@ def _with_envelopes(whole: Whole, seen: Iterable[Stretch]) -> Iterator[Trajector
     anchors: dict[tuple[str, int], Anchor] = {}
     t, held = np.zeros(0), np.zeros(0, bool)
     for stretch in seen:
-        starts = starts_of(np.append(t, stretch.t), np.append(held, stretch.proof.held), whole.jumps)[t.size :]
+        starts = starts_of(
+            np.append(t, stretch.t), np.append(held, stretch.proof.held), whole.jumps
+        )[t.size :]
         t, held = stretch.t[-1:], stretch.proof.held[-1:]
         envelopes: dict[str, dict[int, Envelope]] = {"paper": {}, "weighted": {}}
         for (kind, case), (rate, rho2, w_f) in _claimed(whole).items():
             level = level_of(stretch, w_f)
             found = _envelope(whole, rate, rho2, stretch, level, starts, anchors.get((kind, case)))
             envelopes[kind][case], anchors[kind, case] = found
-        yield Trajectory(whole, stretch.t, stretch.sample, stretch.proof, stretch.recorded, envelopes["paper"], envelopes["weighted"])
+        yield Trajectory(
+            whole,
+            stretch.t,
+            stretch.sample,
+            stretch.proof,
+            stretch.recorded,
+            envelopes["paper"],
+            envelopes["weighted"],
+        )
 
 
 def _claimed(whole: Whole) -> dict[tuple[str, int], tuple[float, float, float]]:
@@ -228,7 +257,8 @@ def same_structure(one: Any, other: Any) -> bool:
 def same_tree(one: Any, other: Any) -> bool:
     """Whether two pytrees have one structure and the same numbers."""
     return same_structure(one, other) and all(
-        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     )
 
 
@@ -238,8 +268,12 @@ def _jumps(scenario: Scenario, end: float) -> np.ndarray:
 
 
 def starts_of(t: np.ndarray, held: np.ndarray, jumps: np.ndarray) -> np.ndarray:
-    """At which samples the envelope starts anew, (T,) bool: the first, those after a jump, those after a held one."""
-    fresh = np.searchsorted(jumps, t[1:], side="right") > np.searchsorted(jumps, t[:-1], side="right")
+    """At which samples the envelope starts anew, (T,) bool: the first, those after a jump, those
+    after a held one.
+    """
+    fresh = np.searchsorted(jumps, t[1:], side="right") > np.searchsorted(
+        jumps, t[:-1], side="right"
+    )
     return np.concatenate([[True], fresh | held[:-1]])
 
 
@@ -254,7 +288,9 @@ class Level(NamedTuple):
 
 
 def level_of(stretch: Any, w_f: float) -> Level:
-    """V_w with the weight w_f of f_tilde, V2 for w_f = 1, along a `Stretch` or a `Trajectory` (whose integrator's errors are not known)."""
+    """V_w with the weight w_f of f_tilde, V2 for w_f = 1, along a `Stretch` or a `Trajectory`
+    (whose integrator's errors are not known).
+    """
     proof = stretch.proof
     V = proof.V if w_f == 1.0 else proof.V + (w_f - 1.0) * 0.5 * np.sum(proof.f_tilde**2, axis=1)
     noise = NOISE * float(np.finfo(proof.V.dtype).eps) * proof.V_terms * max(1.0, w_f) ** 0.5
@@ -265,15 +301,25 @@ def level_of(stretch: Any, w_f: float) -> Level:
 
 
 def _envelope(
-    whole: Whole, rate: float, rho2: float, stretch: Stretch, level: Level, starts: np.ndarray, before: Anchor | None
+    whole: Whole,
+    rate: float,
+    rho2: float,
+    stretch: Stretch,
+    level: Level,
+    starts: np.ndarray,
+    before: Anchor | None,
 ) -> tuple[Envelope, Anchor]:
-    """The envelope of a level and its tolerance along a stretch; NaN at held steps, and everywhere if the rate is not positive."""
+    """The envelope of a level and its tolerance along a stretch; NaN at held steps, and everywhere
+    if the rate is not positive.
+    """
     t, V, noise = stretch.t, level.V, level.noise
     if before is None:
         before = Anchor(t[0], V[0], noise[0], 0.0)
     # Index of the step at which the envelope started, 0 for one before this stretch.
     first = np.maximum.accumulate(np.where(starts, np.arange(1, t.size + 1), 0))
-    start_t, start_V, start_noise = (np.append(a, b)[first] for a, b in zip(before[:3], (t, V, noise), strict=True))
+    start_t, start_V, start_noise = (
+        np.append(a, b)[first] for a, b in zip(before[:3], (t, V, noise), strict=True)
+    )
     decay, sums, total = np.exp(-max(rate, 0.0) * float(whole.run.dt)), [], before.carried
     for fresh, error in zip(starts.tolist(), level.defect.tolist(), strict=True):
         sums.append(0.0 if fresh else total)
@@ -282,6 +328,8 @@ def _envelope(
     if not rate > 0:
         nothing = np.full(t.size, np.nan)
         return Envelope(nothing, nothing), after
-    bound = np.where(stretch.proof.held, np.nan, start_V * np.exp(-rate * (t - start_t)) + rho2 / rate)
+    bound = np.where(
+        stretch.proof.held, np.nan, start_V * np.exp(-rate * (t - start_t)) + rho2 / rate
+    )
     widened = np.sqrt(2 * (bound + np.asarray(sums))) + start_noise + noise
     return Envelope(bound, 0.5 * widened**2 - bound), after

@@ -1,4 +1,6 @@
-"""The lines of a certificate about the claim with weights (`weighted`), stretch by stretch as those of Theorem 2 (`lines`)."""
+"""The lines of a certificate about the claim with weights (`weighted`), stretch by stretch as those
+of Theorem 2 (`lines`).
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,12 @@ def rates(whole: Whole) -> list[Line]:
         return []
     lines = []
     for case in claims.CASES:
-        description: Description = {"name": f"weighted rho, case {case}", "equation": "(W.2)", "statement": RATE[case], "unit": "1/s"}
+        description: Description = {
+            "name": f"weighted rho, case {case}",
+            "equation": "(W.2)",
+            "statement": RATE[case],
+            "unit": "1/s",
+        }
         reason = why_not_weighted(whole, case)
         if reason or not isinstance(whole.claim, claims.Claim):
             lines.append(Line(verdict=NOT_APPLICABLE, note=reason, **description))
@@ -40,9 +47,16 @@ def rates(whole: Whole) -> list[Line]:
         found = whole.weights[case]
         limits = (np.min(whole.claim.decay), 2.0 * whole.slowest, 2.0 * np.min(whole.claim.kf))
         least = ("the decay rate of V1", "K2 over M0", "kf")[int(np.argmin(limits))]
-        chosen = f"a = {found.a:.4g}, w_f = {found.w_f:.4g} rad/(N m)" + (f", b = {found.b:.4g} 1/s" if case == 2 else "")
-        note = f"chosen for the smallest mean of the envelope: {chosen}; lambda_min(M0^-1 K2) = {whole.slowest:.4g} 1/s; limited by {least}"
-        margin = float(np.min(weighted.rate_terms(whole.claim, whole.slowest, found.a, found.b, found.w_f)))
+        chosen = f"a = {found.a:.4g}, w_f = {found.w_f:.4g} rad/(N m)" + (
+            f", b = {found.b:.4g} 1/s" if case == 2 else ""
+        )
+        note = (
+            f"chosen for the smallest mean of the envelope: {chosen}; lambda_min(M0^-1 K2) ="
+            f" {whole.slowest:.4g} 1/s; limited by {least}"
+        )
+        margin = float(
+            np.min(weighted.rate_terms(whole.claim, whole.slowest, found.a, found.b, found.w_f))
+        )
         counts = not (case == 2 and whole.case == 1)
         lines.append(positive(description, margin, value=found.rho, note=note, counts=counts))
     return lines
@@ -96,7 +110,9 @@ def _envelope(trajectory: Trajectory, case: int) -> Line:
     if reason:
         return Line(verdict=NOT_APPLICABLE, note=reason, **description)
     upper, V = trajectory.weighted[case], level_of(trajectory, whole.weights[case].w_f).V
-    return judged(trajectory, upper.bound - V, upper.tolerance, {**description, "note": excluded(whole)})
+    return judged(
+        trajectory, upper.bound - V, upper.tolerance, {**description, "note": excluded(whole)}
+    )
 
 
 def _bounds(trajectory: Trajectory) -> list[Line]:
@@ -105,29 +121,55 @@ def _bounds(trajectory: Trajectory) -> list[Line]:
     descriptions: list[Description] = [
         {
             "name": "weighted xi",
-            "statement": "w_i V1_i <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar/w_i)), or as the barrier says",
+            "statement": (
+                "w_i V1_i <= Vbar: |xi_i| <= sqrt(1 - exp(-Vbar/w_i)), or as the barrier says"
+            ),
         },
-        {"name": "weighted e2", "statement": "|e2| <= sqrt(2 Vbar/lambda_min(M0))", "unit": "rad/s"},
+        {
+            "name": "weighted e2",
+            "statement": "|e2| <= sqrt(2 Vbar/lambda_min(M0))",
+            "unit": "rad/s",
+        },
         {"name": "weighted f_tilde", "statement": "|f_tilde| <= sqrt(2 Vbar/w_f)", "unit": "N m"},
     ]
     case = weighted_case(whole)
     if case is None:
         reason = why_not_weighted(whole, whole.case)
-        return [Line(equation="(W.3)", verdict=NOT_APPLICABLE, note=reason, **description) for description in descriptions]
+        return [
+            Line(equation="(W.3)", verdict=NOT_APPLICABLE, note=reason, **description)
+            for description in descriptions
+        ]
     upper, w_f = trajectory.weighted[case], whole.weights[case].w_f
-    sizes = (np.abs(proof.xi), np.linalg.norm(proof.e2, axis=1), np.linalg.norm(proof.f_tilde, axis=1))
-    tight, wide = (_limits(trajectory, V, w_f) for V in (upper.bound, upper.bound + upper.tolerance))
+    sizes = (
+        np.abs(proof.xi),
+        np.linalg.norm(proof.e2, axis=1),
+        np.linalg.norm(proof.f_tilde, axis=1),
+    )
+    tight, wide = (
+        _limits(trajectory, V, w_f) for V in (upper.bound, upper.bound + upper.tolerance)
+    )
     note = "; ".join(x for x in (f"Vbar is the envelope of V_w, case {case}", excluded(whole)) if x)
     lines = []
     for description, size, low, high in zip(descriptions, sizes, tight, wide, strict=True):
         if np.all(np.isnan(low)) and not np.all(proof.held):
-            lines.append(Line(equation="(W.3)", verdict=NOT_APPLICABLE, note=NO_BOUND, **description))
+            lines.append(
+                Line(equation="(W.3)", verdict=NOT_APPLICABLE, note=NO_BOUND, **description)
+            )
             continue
-        lines.append(judged(trajectory, low - size, high - low, {**description, "equation": "(W.3)", "note": note}))
+        lines.append(
+            judged(
+                trajectory,
+                low - size,
+                high - low,
+                {**description, "equation": "(W.3)", "note": note},
+            )
+        )
     return lines
 
 
-def _limits(trajectory: Trajectory, V: np.ndarray, w_f: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _limits(
+    trajectory: Trajectory, V: np.ndarray, w_f: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The bounds on |xi| (T, n), |e2| and |f_tilde| (T,) where V_w <= V."""
     by_e2 = np.sqrt(2.0 * V / trajectory.whole.lambda_min)
     return xi_bound_along(trajectory, V), by_e2, np.sqrt(2.0 * V / w_f)

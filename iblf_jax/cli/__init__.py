@@ -1,9 +1,11 @@
 """The command line: `python -m iblf_jax COMMAND`, or `iblf-jax COMMAND`.
 
-One module a command, each with `add_parser(subparsers)` and `run(args) -> int`; a new command is a new module and a word in `COMMANDS`.
-Exit codes: 0 done; 1 a run failed (a bound was violated, the state ran away, the step was too large); 2 bad arguments or files, with
-one line on stderr; 3 a study did not finish (disk full, another process lost) and what it wrote stays valid; 130 interrupted.
-What is slow to import is imported by `run`, so that `--help` is quick.  The CLI computes in float64.
+One module a command, each with `add_parser(subparsers)` and `run(args) -> int`; a new command is a
+new module and a word in `COMMANDS`. Exit codes: 0 done; 1 a run failed (a bound was violated, the
+  state ran away, the step was too large); 2 bad arguments or files, with
+one line on stderr; 3 a study did not finish (disk full, another process lost) and what it wrote
+stays valid; 130 interrupted. What is slow to import is imported by `run`, so that `--help` is
+quick.  The CLI computes in float64.
 """
 
 from __future__ import annotations
@@ -23,7 +25,18 @@ from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
 
-COMMANDS = ("reproduce", "simulate", "compare", "montecarlo", "sweep", "tune", "identify", "export", "presets", "parameters")
+COMMANDS = (
+    "reproduce",
+    "simulate",
+    "compare",
+    "montecarlo",
+    "sweep",
+    "tune",
+    "identify",
+    "export",
+    "presets",
+    "parameters",
+)
 
 
 LONGEST_WORD = 400
@@ -73,9 +86,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         except ValueError as error:
             complain(str(error))
         except OSError as error:
-            complain(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error))
+            complain(
+                f"{error.filename}: {error.strerror}"
+                if error.filename and error.strerror
+                else str(error)
+            )
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
-            complain(f"the machine gave up: {error}. A shorter --duration or a larger --record-every takes less memory.")
+            complain(
+                f"the machine gave up: {error}. A shorter --duration or a larger --record-every"
+                " takes less memory."
+            )
         except KeyboardInterrupt:
             complain("interrupted")
             return INTERRUPTED
@@ -104,7 +124,10 @@ def _warn_once(message: str, said: set[str]) -> None:
 
 def complain(message: str, kind: str = "error") -> None:
     """One line on stderr that can be read."""
-    words = [x if len(x) <= LONGEST_WORD else f"{x[: LONGEST_WORD - 23]}...{x[-20:]}" for x in message.split()]
+    words = [
+        x if len(x) <= LONGEST_WORD else f"{x[: LONGEST_WORD - 23]}...{x[-20:]}"
+        for x in message.split()
+    ]
     print(f"iblf-jax: {kind}: {checks.line(' '.join(words), 'message')}", file=sys.stderr)
 
 
@@ -114,11 +137,23 @@ def build_parser() -> argparse.ArgumentParser:
 
     parser = Parser(
         prog="iblf-jax",
-        description="Simulate, compare, certify and tune barrier-Lyapunov tracking controllers of constrained robots.",
-        epilog="Exit codes: 0 done; 1 a run failed; 2 bad arguments or files; 3 a study did not finish; 130 interrupted.",
+        description=(
+            "Simulate, compare, certify and tune barrier-Lyapunov tracking controllers of"
+            " constrained robots."
+        ),
+        epilog=(
+            "Exit codes: 0 done; 1 a run failed; 2 bad arguments or files; 3 a study did not"
+            " finish; 130 interrupted."
+        ),
     )
-    parser.add_argument("--version", action="version", version=f"iblf_jax {iblf_jax.__version__} (jax {jax.__version__})")
-    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, dest="command")
+    parser.add_argument(
+        "--version",
+        action="version",
+        version=f"iblf_jax {iblf_jax.__version__} (jax {jax.__version__})",
+    )
+    subparsers = parser.add_subparsers(
+        title="commands", metavar="COMMAND", required=True, dest="command"
+    )
     for name in COMMANDS:
         importlib.import_module(f"iblf_jax.cli.{name}").add_parser(subparsers)
     return parser

@@ -1,7 +1,7 @@
 """What the paper says that its figures show (section 4), each claim computed from the two runs.
 
-A claim says in its own words by which numbers it is judged, so that a reader can disagree.  "Late" is the second half of the
-run; the initial stage is its first second.
+A claim says in its own words by which numbers it is judged, so that a reader can disagree.  "Late"
+is the second half of the run; the initial stage is its first second.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ INITIAL_STAGE = 1.0
 NEIGHBOURHOOD = 0.01
 """Late errors count as a very small neighbourhood of zero below this share of their own peak."""
 ESTIMATE_SHARE = 0.1
-"""The estimate counts as following the uncertain term if its late error stays below this share of the term's peak."""
+"""The estimate counts as following the uncertain term if its late error stays below this share of
+the term's peak."""
 SETTLED = 0.01
 """rad; the tolerance of the metric settling_time."""
 
@@ -44,13 +45,24 @@ def paper_claims(runs: Pair) -> list[PaperClaim]:
     Args:
       runs: two runs by name, of the integral and the logarithmic law, in this order.
     """
-    judges = (bounds_kept, both_track, faster, more_accurate, overshoot_of_e2, estimate_follows, small_neighbourhood, theorem_1)
+    judges = (
+        bounds_kept,
+        both_track,
+        faster,
+        more_accurate,
+        overshoot_of_e2,
+        estimate_follows,
+        small_neighbourhood,
+        theorem_1,
+    )
     return [judge(runs) for judge in judges]
 
 
 def each_joint(values: Any, unit: str) -> str:
     """Numbers of the joints as text, such as 0.99 / 0.71 s."""
-    shown = " / ".join(f"{x:.3g}" if np.isfinite(x) else "never" for x in np.ravel(np.asarray(values, float)))
+    shown = " / ".join(
+        f"{x:.3g}" if np.isfinite(x) else "never" for x in np.ravel(np.asarray(values, float))
+    )
     return f"{shown} {unit}".rstrip()
 
 
@@ -77,7 +89,12 @@ def bounds_kept(runs: Pair) -> PaperClaim:
     flagged = [name for name, run in runs.items() if int(run.status) & int(Status.BOUND_VIOLATED)]
     held = not flagged and all(np.all(m > 0) for m in margins.values())
     detail = f"smallest distance to a bound, joint by joint: {_versus(margins, 'rad')}."
-    return PaperClaim("Neither law violates its time-varying asymmetric bounds.", held, detail, {"margin [rad]": margins})
+    return PaperClaim(
+        "Neither law violates its time-varying asymmetric bounds.",
+        held,
+        detail,
+        {"margin [rad]": margins},
+    )
 
 
 def both_track(runs: Pair) -> PaperClaim:
@@ -96,7 +113,9 @@ def faster(runs: Pair) -> PaperClaim:
     detail = f"settling times {_versus(times, 's')}"
     if held and np.all(np.isfinite(compared)):
         detail += f": sooner by {each_joint(100.0 * (1.0 - proposed / compared), '%')}"
-    return PaperClaim("The integral form converges faster.", held, f"{detail}.", {"settling_time [s]": times})
+    return PaperClaim(
+        "The integral form converges faster.", held, f"{detail}.", {"settling_time [s]": times}
+    )
 
 
 def more_accurate(runs: Pair) -> PaperClaim:
@@ -105,7 +124,12 @@ def more_accurate(runs: Pair) -> PaperClaim:
     late = {name: _late_peak(run, run.e1) for name, run in runs.items()}
     held = all(bool(np.all(a < b)) for a, b in (tuple(rmse.values()), tuple(late.values())))
     detail = f"rms of e1 {_versus(rmse, 'rad')}; largest late |e1| {_versus(late, 'rad')}."
-    return PaperClaim("The integral form is slightly more accurate.", held, detail, {"rmse [rad]": rmse, "late |e1| [rad]": late})
+    return PaperClaim(
+        "The integral form is slightly more accurate.",
+        held,
+        detail,
+        {"rmse [rad]": rmse, "late |e1| [rad]": late},
+    )
 
 
 def overshoot_of_e2(runs: Pair) -> PaperClaim:
@@ -115,15 +139,27 @@ def overshoot_of_e2(runs: Pair) -> PaperClaim:
         e2 = np.asarray(run.e2)[np.asarray(run.t) <= INITIAL_STAGE]
         swings[name] = np.maximum(0.0, (-np.sign(e2[0]) * e2).max(axis=0))
     proposed, compared = swings.values()
-    detail = f"how far e2 swings past zero in the first {INITIAL_STAGE:g} s: {_versus(swings, 'rad/s')}."
+    detail = (
+        f"how far e2 swings past zero in the first {INITIAL_STAGE:g} s: {_versus(swings, 'rad/s')}."
+    )
     held = bool(np.all(proposed > compared))
-    return PaperClaim("The integral form overshoots more in e2 at the start.", held, detail, {"overshoot of e2 [rad/s]": swings})
+    return PaperClaim(
+        "The integral form overshoots more in e2 at the start.",
+        held,
+        detail,
+        {"overshoot of e2 [rad/s]": swings},
+    )
 
 
 def _estimate_errors(runs: Pair) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Largest late |f - f_hat| and peak |f|, by name, each (n,) [N m]."""
-    late = {name: _late_peak(run, run.disturbance - run.disturbance_estimate) for name, run in runs.items()}
-    return late, {name: np.abs(np.asarray(run.disturbance)).max(axis=0) for name, run in runs.items()}
+    late = {
+        name: _late_peak(run, run.disturbance - run.disturbance_estimate)
+        for name, run in runs.items()
+    }
+    return late, {
+        name: np.abs(np.asarray(run.disturbance)).max(axis=0) for name, run in runs.items()
+    }
 
 
 def estimate_follows(runs: Pair) -> PaperClaim:
@@ -132,11 +168,15 @@ def estimate_follows(runs: Pair) -> PaperClaim:
     held = all(bool(np.all(late[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
     share = {name: 100.0 * late[name] / peak[name] for name in runs}
     detail = (
-        f"largest late |f - f_hat|: {_versus(late, 'N m')}; as a share of the peak of |f|: {_versus(share, '%')} "
-        f"(held if under {100 * ESTIMATE_SHARE:g} %; the observer lags by 1/kf, so about |f'|/kf remains)."
+        f"largest late |f - f_hat|: {_versus(late, 'N m')}; as a share of the peak of |f|:"
+        f" {_versus(share, '%')} (held if under {100 * ESTIMATE_SHARE:g} %; the observer lags by"
+        " 1/kf, so about |f'|/kf remains)."
     )
     return PaperClaim(
-        "The observer's estimate tends to the uncertain term.", held, detail, {"late |f - f_hat| [N m]": late, "peak |f| [N m]": peak}
+        "The observer's estimate tends to the uncertain term.",
+        held,
+        detail,
+        {"late |f - f_hat| [N m]": late, "peak |f| [N m]": peak},
     )
 
 
@@ -146,22 +186,28 @@ def small_neighbourhood(runs: Pair) -> PaperClaim:
     e2 = {name: _late_peak(run, run.e2) for name, run in runs.items()}
     f_tilde, peak = _estimate_errors(runs)
     small = all(
-        bool(np.all(late[name] < NEIGHBOURHOOD * np.abs(np.asarray(getattr(run, field))).max(axis=0)))
+        bool(
+            np.all(late[name] < NEIGHBOURHOOD * np.abs(np.asarray(getattr(run, field))).max(axis=0))
+        )
         for name, run in runs.items()
         for field, late in (("e1", e1), ("e2", e2))
     )
     held = small and all(bool(np.all(f_tilde[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
     detail = (
-        f"largest late values: |e1| {_versus(e1, 'rad')}; |e2| {_versus(e2, 'rad/s')}; |f_tilde| {_versus(f_tilde, 'N m')} "
-        f"(held if e1 and e2 are under {100 * NEIGHBOURHOOD:g} % of their peaks, "
-        f"f_tilde under {100 * ESTIMATE_SHARE:g} % of the peak of |f|)."
+        f"largest late values: |e1| {_versus(e1, 'rad')}; |e2| {_versus(e2, 'rad/s')}; |f_tilde|"
+        f" {_versus(f_tilde, 'N m')} (held if e1 and e2 are under {100 * NEIGHBOURHOOD:g} % of"
+        f" their peaks, f_tilde under {100 * ESTIMATE_SHARE:g} % of the peak of |f|)."
     )
     numbers = {"late |e1| [rad]": e1, "late |e2| [rad/s]": e2, "late |f_tilde| [N m]": f_tilde}
-    return PaperClaim("The error signals tend to a very small neighbourhood of zero.", held, detail, numbers)
+    return PaperClaim(
+        "The error signals tend to a very small neighbourhood of zero.", held, detail, numbers
+    )
 
 
 def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
-    """V1 of a barrier and xi at every sample of a run, (T, n), of the same bounds to the last digit."""
+    """V1 of a barrier and xi at every sample of a run, (T, n), of the same bounds to the last
+    digit.
+    """
     import jax
 
     def at(t, q):
@@ -184,11 +230,23 @@ def theorem_1(runs: Pair) -> PaperClaim:
     broken = int(np.sum(~kept))
     at = np.unravel_index(np.argmax(np.abs(xi)), xi.shape)
     detail = (
-        f"checked at {V1.size} samples of xi, broken at {broken}; at the largest |xi| = {abs(xi[at]):.4g}: "
-        f"{low[at]:.4g} <= {V1[at]:.4g} <= {high[at]:.4g}."
+        f"checked at {V1.size} samples of xi, broken at {broken}; at the largest |xi| ="
+        f" {abs(xi[at]):.4g}: {low[at]:.4g} <= {V1[at]:.4g} <= {high[at]:.4g}."
     )
-    numbers = {"samples": V1.size, "broken": broken, "largest |xi|": abs(xi[at]), "lower": low[at], "V1": V1[at], "upper": high[at]}
-    return PaperClaim("Theorem 1 holds along the run: xi^2/2 <= V1 <= xi^2/(1 - xi^2).", broken == 0, detail, numbers)
+    numbers = {
+        "samples": V1.size,
+        "broken": broken,
+        "largest |xi|": abs(xi[at]),
+        "lower": low[at],
+        "V1": V1[at],
+        "upper": high[at],
+    }
+    return PaperClaim(
+        "Theorem 1 holds along the run: xi^2/2 <= V1 <= xi^2/(1 - xi^2).",
+        broken == 0,
+        detail,
+        numbers,
+    )
 
 
 def assumed(runs: Pair) -> str:
@@ -215,14 +273,18 @@ def _all_digits(values: Any) -> str:
 
 
 def remark(runs: Pair) -> str:
-    """What the comparison rests on: the two barriers differ by a factor of two, here confirmed along the run."""
+    """What the comparison rests on: the two barriers differ by a factor of two, here confirmed
+    along the run.
+    """
     from iblf_jax.control.barriers import Integral, Log
 
     run = next(iter(runs.values()))
     (integral, _), (log, _) = _along(run, Integral()), _along(run, Log(p=1))
     worst = float(np.max(np.abs(integral - 2.0 * log)))
     return (
-        f"V_integral = 2 V_log (p = 1) identically (largest difference along this run: {worst:.1g}). So with equal gains the integral "
-        "form has twice the barrier term in its torque, and that factor is the whole difference between these two runs: a log law "
-        "whose barrier term is doubled is the same law. The comparison shows the gain of the barrier term, not the form of the barrier."
+        "V_integral = 2 V_log (p = 1) identically (largest difference along this run:"
+        f" {worst:.1g}). So with equal gains the integral form has twice the barrier term in its"
+        " torque, and that factor is the whole difference between these two runs: a log law whose"
+        " barrier term is doubled is the same law. The comparison shows the gain of the barrier"
+        " term, not the form of the barrier."
     )

@@ -1,4 +1,6 @@
-"""What the commands share: how a scenario is named, changed and run, how results are printed and written."""
+"""What the commands share: how a scenario is named, changed and run, how results are printed and
+written.
+"""
 
 from __future__ import annotations
 
@@ -24,27 +26,48 @@ RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "
 
 def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
     """SCENARIO (which may be left out if there is a default), --arg and --set."""
-    words = "a scenario file, or the name of a preset" + (f" (default: {default})" if default else "")
+    words = "a scenario file, or the name of a preset" + (
+        f" (default: {default})" if default else ""
+    )
     optional: dict[str, Any] = {"nargs": "?", "default": default} if default else {}
     parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=words, **optional)
     parser.add_argument(
-        "--arg", action="append", default=[], metavar="NAME=VALUE", help="an argument of the preset, such as law=log; may be repeated"
+        "--arg",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="an argument of the preset, such as law=log; may be repeated",
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="PATH=VALUE",
-        help="another value for a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be repeated",
+        help=(
+            "another value for a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be"
+            " repeated"
+        ),
     )
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """--duration, --dt, --method, --record-every."""
-    parser.add_argument("--duration", type=float, metavar="S", help="length of the run [s] (default: the file's, else 20)")
-    parser.add_argument("--dt", type=float, metavar="S", help="time step [s] (default: the file's, else 0.001)")
+    parser.add_argument(
+        "--duration",
+        type=float,
+        metavar="S",
+        help="length of the run [s] (default: the file's, else 20)",
+    )
+    parser.add_argument(
+        "--dt", type=float, metavar="S", help="time step [s] (default: the file's, else 0.001)"
+    )
     parser.add_argument("--method", help="rk4, heun or euler (default: the file's, else rk4)")
-    parser.add_argument("--record-every", type=int, metavar="N", help="record every N-th step (default: the file's, else 1)")
+    parser.add_argument(
+        "--record-every",
+        type=int,
+        metavar="N",
+        help="record every N-th step (default: the file's, else 1)",
+    )
 
 
 def scenario_of(args: argparse.Namespace) -> ScenarioFile:
@@ -56,9 +79,14 @@ def scenario_of(args: argparse.Namespace) -> ScenarioFile:
 
     words = assignments("--arg", args.arg)
     if args.scenario in PRESETS:
-        file = from_dict({"preset": args.scenario, "arguments": words}, source="--arg" if words else "")
+        file = from_dict(
+            {"preset": args.scenario, "arguments": words}, source="--arg" if words else ""
+        )
     elif words:
-        raise ValueError(f"--arg: {args.scenario} is not a preset, and only presets take arguments; use --set for parameters.")
+        raise ValueError(
+            f"--arg: {args.scenario} is not a preset, and only presets take arguments; use --set"
+            " for parameters."
+        )
     else:
         _check_exists(args.scenario)
         file = load_scenario_file(args.scenario)
@@ -75,7 +103,11 @@ def _check_exists(name: str) -> None:
     from iblf_jax.presets import PRESETS
 
     if not Path(name).is_file():
-        remedy = did_you_mean(name, PRESETS) if not name.endswith(".toml") else "Give the path of a scenario file."
+        remedy = (
+            did_you_mean(name, PRESETS)
+            if not name.endswith(".toml")
+            else "Give the path of a scenario file."
+        )
         raise ValueError(f"{name}: no such file, and no such preset. {remedy}")
 
 
@@ -87,22 +119,34 @@ def assignments(option: str, words: list[str]) -> dict[str, Any]:
     values = {}
     for word in words:
         # Of NAME the part in brackets, the name of a link, may hold an = itself.
-        found = re.fullmatch(r"""((?:\["(?:[^"\\]|\\.)*"\]|\[[^\]]*\]|[^=\[])*)=(.*)""", word, re.DOTALL)
+        found = re.fullmatch(
+            r"""((?:\["(?:[^"\\]|\\.)*"\]|\[[^\]]*\]|[^=\[])*)=(.*)""", word, re.DOTALL
+        )
         name, text = found.groups() if found else ("", "")
         if not name.strip() or not text.strip():
-            raise checks.fail(option, word, f"NAME=VALUE, such as {'law=log' if option == '--arg' else 'controller.K2=30'}")
+            raise checks.fail(
+                option,
+                word,
+                f"NAME=VALUE, such as {'law=log' if option == '--arg' else 'controller.K2=30'}",
+            )
         try:
             values[name.strip()] = toml_tables(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             values[name.strip()] = text.strip()
         except ValueError as error:
-            raise checks.fail(f"{option} {name.strip()}", text, "a value in TOML", f"It has {error}.") from None
+            raise checks.fail(
+                f"{option} {name.strip()}", text, "a value in TOML", f"It has {error}."
+            ) from None
     return values
 
 
 def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
-    """Duration, dt, method and record_every: the command line's, else the file's, else the defaults."""
-    given = {key: getattr(args, key) for key in RUN_DEFAULTS if getattr(args, key, None) is not None}
+    """Duration, dt, method and record_every: the command line's, else the file's, else the
+    defaults.
+    """
+    given = {
+        key: getattr(args, key) for key in RUN_DEFAULTS if getattr(args, key, None) is not None
+    }
     return RUN_DEFAULTS | file.run | given
 
 
@@ -112,9 +156,13 @@ def output_folder(name: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"--out: got {name!r}, expected a folder that can be written ({error.strerror}).") from error
+        raise ValueError(
+            f"--out: got {name!r}, expected a folder that can be written ({error.strerror})."
+        ) from error
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"--out: got {name!r}, expected a folder that can be written (no permission).")
+        raise ValueError(
+            f"--out: got {name!r}, expected a folder that can be written (no permission)."
+        )
     return folder
 
 
@@ -148,7 +196,10 @@ def verdict(run: Rollout) -> dict[str, Any]:
         "status": describe(status),
         "flags": [flag.name for flag in Status if flag and flag in status],
         "fastest_mode": {"value": run.fastest_mode, "unit": "1/s"},
-        "metrics": {name: {"value": value, "unit": run.metrics.units.get(name, "1")} for name, value in run.metrics.items()},
+        "metrics": {
+            name: {"value": value, "unit": run.metrics.units.get(name, "1")}
+            for name, value in run.metrics.items()
+        },
     }
 
 
@@ -171,12 +222,21 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
         values = [np.ravel(run.metrics[name]) for run in runs.values()]
         # One row a region: there may be more of them than joints.
         lines = (
-            [(f"{name}[{i}]", [x[i : i + 1] for x in values]) for i in range(values[0].size)] if name in OF_REGIONS else [(name, values)]
+            [(f"{name}[{i}]", [x[i : i + 1] for x in values]) for i in range(values[0].size)]
+            if name in OF_REGIONS
+            else [(name, values)]
         )
         for shown, numbers in lines:
             row = [shown, unit]
             for x in numbers:
-                cells = ["-" if name.endswith(("violation_joint", "violation_region")) and y < 0 else number(y) for y in x]
+                cells = [
+                    (
+                        "-"
+                        if name.endswith(("violation_joint", "violation_region")) and y < 0
+                        else number(y)
+                    )
+                    for y in x
+                ]
                 row += [*cells, *[""] * (first.n - len(cells))]
             rows.append(row)
     if any(runs):  # a name, over the first of its joints

@@ -26,15 +26,29 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "compare",
         help="run several laws side by side",
-        description="Run several laws on one scenario, at the gains they have and at equal effort (RMS torque above gravity), and print "
-        "two tables that say what was held equal.",
-        epilog="Exit code 1 if a run at the given gains failed: a bound was violated, the state ran away, or the step was too large.",
+        description=(
+            "Run several laws on one scenario, at the gains they have and at equal effort (RMS"
+            " torque above gravity), and print two tables that say what was held equal."
+        ),
+        epilog=(
+            "Exit code 1 if a run at the given gains failed: a bound was violated, the state ran"
+            " away, or the step was too large."
+        ),
     )
     add_scenario_arguments(parser, default="zhang_yan_2024")
     add_run_arguments(parser)
-    parser.add_argument("--laws", nargs="+", metavar="LAW", help="the laws, the first of which sets the effort (default: the paper's)")
+    parser.add_argument(
+        "--laws",
+        nargs="+",
+        metavar="LAW",
+        help="the laws, the first of which sets the effort (default: the paper's)",
+    )
     parser.add_argument("--gains-only", action="store_true", help="do not look for equal effort")
-    parser.add_argument("--out", metavar="DIR", help="write comparison.txt, comparison.csv, comparison.json, figures and rollouts.nc here")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="write comparison.txt, comparison.csv, comparison.json, figures and rollouts.nc here",
+    )
     parser.set_defaults(run=run)
 
 
@@ -77,4 +91,7 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
     plotting.save(figures, folder, formats=("png", "pdf"))
     save_rollouts(result.rollouts, folder / "rollouts.nc")
     named = ", ".join(figures)
-    print(f"\nwritten to {folder}: comparison.txt, comparison.csv, comparison.json, {named} (.png, .pdf), rollouts.nc")
+    print(
+        f"\nwritten to {folder}: comparison.txt, comparison.csv, comparison.json, {named} (.png,"
+        " .pdf), rollouts.nc"
+    )

@@ -1,4 +1,6 @@
-"""`identify`: finds parameters of a robot from its log and writes the scenario with them, the report and the figure."""
+"""`identify`: finds parameters of a robot from its log and writes the scenario with them, the
+report and the figure.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,27 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "identify",
         help="find parameters of a robot from its log",
-        description="Find the parameters that an identification file names (its format: iblf_jax.files.identification) from the log "
-        "that it names; print values, standard errors and what the log cannot tell.",
+        description=(
+            "Find the parameters that an identification file names (its format:"
+            " iblf_jax.files.identification) from the log that it names; print values, standard"
+            " errors and what the log cannot tell."
+        ),
         epilog="Exit code 1 if the log cannot tell one of the parameters.",
     )
     parser.add_argument("file", metavar="IDENTIFY.toml", help="an identification file")
-    parser.add_argument("--log", action="append", metavar="FILE", help="another log, .csv or .nc, in place of the file's; may be repeated")
     parser.add_argument(
-        "--out", metavar="DIR", help="write scenario.toml, identification.json, identification.html and .png into this folder"
+        "--log",
+        action="append",
+        metavar="FILE",
+        help="another log, .csv or .nc, in place of the file's; may be repeated",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help=(
+            "write scenario.toml, identification.json, identification.html and .png into this"
+            " folder"
+        ),
     )
     parser.set_defaults(run=run)
 
@@ -38,5 +53,8 @@ def run(args: argparse.Namespace) -> int:
         known.save(folder / "identification.json")
         known.save(folder / "identification.html")
         plotting.save({"identification": known.plot()}, folder, formats=("png",))
-        print(f"\nwritten to {folder}: scenario.toml, identification.json, identification.html, identification.png")
+        print(
+            f"\nwritten to {folder}: scenario.toml, identification.json, identification.html,"
+            " identification.png"
+        )
     return 1 if any(number.value is None for number in known.wanted) else 0

@@ -17,12 +17,17 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "montecarlo",
         help="run a scenario many times with parameters drawn at random",
-        description="Run the study that a file describes (a scenario file with [run], [perturbations] and [study]); print how often the "
-        "bounds were violated, quantiles of the metrics, the worst runs, and which parameters go with the margin.",
+        description=(
+            "Run the study that a file describes (a scenario file with [run], [perturbations] and"
+            " [study]); print how often the bounds were violated, quantiles of the metrics, the"
+            " worst runs, and which parameters go with the margin."
+        ),
         epilog=EPILOG,
     )
     parser.add_argument("file", metavar="STUDY.toml", help="the study file")
-    parser.add_argument("--runs", type=int, metavar="N", help="number of runs (default: the file's)")
+    parser.add_argument(
+        "--runs", type=int, metavar="N", help="number of runs (default: the file's)"
+    )
     parser.add_argument("--seed", type=int, metavar="N", help="seed (default: the file's, else 0)")
     add_study_arguments(parser)
     parser.set_defaults(run=run)
@@ -37,7 +42,9 @@ def run(args: argparse.Namespace) -> int:
         from iblf_jax.studies.monte_carlo import monte_carlo
 
         file = load_study_file(args.file, "study")
-        given = {key: getattr(args, key) for key in ("runs", "seed") if getattr(args, key) is not None}
+        given = {
+            key: getattr(args, key) for key in ("runs", "seed") if getattr(args, key) is not None
+        }
         study = monte_carlo(file.scenario, file.perturbations, **file.options | given | how)
         if distributed.rank() == 0:
             print(report(study))
@@ -56,10 +63,21 @@ def report(study: Study) -> str:
 
     rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
     for name in study.metrics if study.made.any() else ():
-        levels = np.quantile(one_number(study.metrics, name)[study.made], (0.05, 0.5, 0.95), method="inverted_cdf")
+        levels = np.quantile(
+            one_number(study.metrics, name)[study.made], (0.05, 0.5, 0.95), method="inverted_cdf"
+        )
         rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
     worst = study.worst(5)
-    lines = [repr(study), "", *as_text(rows, left=(0,)), "", f"worst runs (smallest margin first): {', '.join(map(str, worst))}"]
+    lines = [
+        repr(study),
+        "",
+        *as_text(rows, left=(0,)),
+        "",
+        f"worst runs (smallest margin first): {', '.join(map(str, worst))}",
+    ]
     found = study.correlations(["margin"]).correlation.sel(metric="margin")
-    rows = [["parameter", "rank correlation with the margin"], *([str(p), number(found.sel(parameter=p))] for p in found.parameter.values)]
+    rows = [
+        ["parameter", "rank correlation with the margin"],
+        *([str(p), number(found.sel(parameter=p))] for p in found.parameter.values),
+    ]
     return "\n".join([*lines, "", *as_text(rows, left=(0,))])

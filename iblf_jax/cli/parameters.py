@@ -1,4 +1,6 @@
-"""`parameters`: every number of a scenario that can be set, swept, perturbed or tuned, with its path."""
+"""`parameters`: every number of a scenario that can be set, swept, perturbed or tuned, with its
+path.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "parameters",
         help="list the parameters of a scenario: path, shape, unit, value",
-        description="List every parameter of a scenario with the path by which --set, sweeps and tuning address it.",
+        description=(
+            "List every parameter of a scenario with the path by which --set, sweeps and tuning"
+            " address it."
+        ),
     )
     add_scenario_arguments(parser)
     parser.set_defaults(run=run)

@@ -14,9 +14,15 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         description="List the presets, describe one, or print it as a scenario file.",
     )
     parser.add_argument("name", nargs="?", metavar="PRESET", help="describe this one")
-    parser.add_argument("--toml", action="store_true", help="print it as a scenario file: start from that")
     parser.add_argument(
-        "--arg", action="append", default=[], metavar="NAME=VALUE", help="an argument of the preset, such as law=log; may be repeated"
+        "--toml", action="store_true", help="print it as a scenario file: start from that"
+    )
+    parser.add_argument(
+        "--arg",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="an argument of the preset, such as law=log; may be repeated",
     )
     parser.set_defaults(run=run)
 
@@ -30,8 +36,14 @@ def run(args: argparse.Namespace) -> int:
 
     if args.name is None:
         if args.toml or args.arg:
-            raise ValueError("--toml and --arg: expected the name of a preset before them; `presets` lists the names.")
-        rows = [(name, " ".join((inspect.getdoc(preset) or "").partition("\n")[0].split())) for name, preset in PRESETS.items()]
+            raise ValueError(
+                "--toml and --arg: expected the name of a preset before them; `presets` lists the"
+                " names."
+            )
+        rows = [
+            (name, " ".join((inspect.getdoc(preset) or "").partition("\n")[0].split()))
+            for name, preset in PRESETS.items()
+        ]
         print(*tables.as_text(rows), sep="\n")
         return 0
     scenario = preset_scenario(args.name, assignments("--arg", args.arg))

@@ -24,21 +24,36 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "reproduce",
         help="reproduce the paper's simulation and its six figures",
-        description="Run the paper's law (integral barrier) and its comparison (log barrier), write the six figures, an animation of the "
-        "arm, the data and the metrics, and say which of the paper's claims held. "
-        "The paper prints no masses and lengths of its arm: "
-        "those of the runs are assumed, and the output says which.",
+        description=(
+            "Run the paper's law (integral barrier) and its comparison (log barrier), write the six"
+            " figures, an animation of the arm, the data and the metrics, and say which of the"
+            " paper's claims held. The paper prints no masses and lengths of its arm: those of the"
+            " runs are assumed, and the output says which."
+        ),
         epilog="Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.",
     )
-    parser.add_argument("--out", required=True, metavar="DIR", help="write everything into this folder")
+    parser.add_argument(
+        "--out", required=True, metavar="DIR", help="write everything into this folder"
+    )
     parser.add_argument(
         "--reading",
         choices=("printed", "corrected"),
         default="printed",
-        help="the law and observer as printed, or corrected so that Theorem 2 is exact (default: printed)",
+        help=(
+            "the law and observer as printed, or corrected so that Theorem 2 is exact (default:"
+            " printed)"
+        ),
     )
-    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="length of the run [s] (default: 20, the paper's)")
-    parser.add_argument("--dt", type=float, default=1e-3, metavar="S", help="time step [s] (default: 0.001)")
+    parser.add_argument(
+        "--duration",
+        type=float,
+        default=20.0,
+        metavar="S",
+        help="length of the run [s] (default: 20, the paper's)",
+    )
+    parser.add_argument(
+        "--dt", type=float, default=1e-3, metavar="S", help="time step [s] (default: 0.001)"
+    )
     parser.set_defaults(run=run)
 
 
@@ -50,7 +65,10 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     folder = output_folder(args.out)
     runs, seconds = _simulate_both(args)
-    print(f"Zhang & Yan 2024, section 4, as {args.reading}: {args.duration:g} s, dt = {args.dt:g} s, rk4, float64")
+    print(
+        f"Zhang & Yan 2024, section 4, as {args.reading}: {args.duration:g} s, dt = {args.dt:g} s,"
+        " rk4, float64"
+    )
     print("; ".join(f"{name}: {describe(int(one.status))}" for name, one in runs.items()) + "\n")
     assumption = assumed(runs)
     print(textwrap.fill(f"Assumed: {assumption}", 118) + "\n")
@@ -60,14 +78,23 @@ def run(args: argparse.Namespace) -> int:
     findings = {"assumed": assumption, "claims": claims, "remark": note}
     _write_data(folder, args, runs, findings, seconds)
     _draw(folder, runs)
-    print(f"\nsimulations: {seconds['first']:.2f} s with compilation, {seconds['again']:.2f} s for the two runs alone; ", end="")
+    print(
+        f"\nsimulations: {seconds['first']:.2f} s with compilation, {seconds['again']:.2f} s for"
+        " the two runs alone; ",
+        end="",
+    )
     print(f"all in {time.perf_counter() - begin:.1f} s")
-    print(f"written to {folder}: figure_1 ... figure_6 (.png, .pdf), arm.gif, rollouts.nc, metrics.json")
+    print(
+        f"written to {folder}: figure_1 ... figure_6 (.png, .pdf), arm.gif, rollouts.nc,"
+        " metrics.json"
+    )
     return 1 if any(int(one.status) & int(FAILED) for one in runs.values()) else 0
 
 
 def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[str, float]]:
-    """Both runs, each done twice: the first call compiles, the second is timed for what a run costs."""
+    """Both runs, each done twice: the first call compiles, the second is timed for what a run
+    costs.
+    """
     import jax
 
     from iblf_jax.engine.simulate import simulate
@@ -76,7 +103,10 @@ def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[s
     def both() -> tuple[dict[str, Rollout], float]:
         start = time.perf_counter()
         runs = {
-            name: simulate(zhang_yan_2024(law=law, reading=args.reading), duration=args.duration, dt=args.dt) for law, name in NAMES.items()
+            name: simulate(
+                zhang_yan_2024(law=law, reading=args.reading), duration=args.duration, dt=args.dt
+            )
+            for law, name in NAMES.items()
         }
         jax.block_until_ready(runs)
         return runs, time.perf_counter() - start

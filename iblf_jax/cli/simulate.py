@@ -1,4 +1,6 @@
-"""`simulate`: one run of a scenario file or preset, its verdict and metrics, and files to look at."""
+"""`simulate`: one run of a scenario file or preset, its verdict and metrics, and files to look
+at.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +30,21 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "simulate",
         help="run a scenario once",
         description="Run a scenario once; print its verdict and metrics.",
-        epilog="Exit code 1 if the run failed: a bound was violated, the state ran away, or the step was too large.",
+        epilog=(
+            "Exit code 1 if the run failed: a bound was violated, the state ran away, or the step"
+            " was too large."
+        ),
     )
     add_scenario_arguments(parser)
     add_run_arguments(parser)
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of a sensor's noise (default: 0)")
-    parser.add_argument("--out", metavar="DIR", help="write rollout.nc, metrics.json, overview.png and scenario.toml into this folder")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of a sensor's noise (default: 0)"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="write rollout.nc, metrics.json, overview.png and scenario.toml into this folder",
+    )
     parser.set_defaults(run=run)
 
 
@@ -47,7 +58,9 @@ def run(args: argparse.Namespace) -> int:
     folder = output_folder(args.out) if args.out else None
     result = simulate(file.scenario, **options, seed=args.seed)
     failed = bool(int(result.status) & int(FAILED))
-    print(f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}")
+    print(
+        f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}"
+    )
     print(f"status: {describe(int(result.status))}")
     print("\n" + metrics_table({"": result}))
     if folder is not None:
@@ -63,7 +76,12 @@ def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any], 
 
     save_scenario(result.scenario, folder / "scenario.toml", run=options)
     save_rollouts(result, folder / "rollout.nc")
-    head = {"source": source, "run": options, "seed": seed, "iblf_jax_version": iblf_jax.__version__}
+    head = {
+        "source": source,
+        "run": options,
+        "seed": seed,
+        "iblf_jax_version": iblf_jax.__version__,
+    }
     write_json(folder / "metrics.json", head | verdict(result))
     plotting.save({"overview": plotting.overview(result)}, folder, formats=("png",))
     print(f"\nwritten to {folder}: rollout.nc, metrics.json, overview.png, scenario.toml")

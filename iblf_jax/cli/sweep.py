@@ -19,12 +19,17 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "sweep",
         help="run a scenario over many values of its parameters",
-        description="Run the sweep that a file describes (a scenario file with [run], [grid], [sweep] and, if runs are perturbed, "
-        "[perturbations]).  With --store it is written unit by unit; killed or interrupted, the same command goes on from there.",
+        description=(
+            "Run the sweep that a file describes (a scenario file with [run], [grid], [sweep] and,"
+            " if runs are perturbed, [perturbations]).  With --store it is written unit by unit;"
+            " killed or interrupted, the same command goes on from there."
+        ),
         epilog=EPILOG,
     )
     parser.add_argument("file", metavar="SWEEP.toml", help="the sweep file")
-    parser.add_argument("--store", metavar="FOLDER.zarr", help="write to this store, and go on from what it holds")
+    parser.add_argument(
+        "--store", metavar="FOLDER.zarr", help="write to this store, and go on from what it holds"
+    )
     add_study_arguments(parser)
     parser.set_defaults(run=run)
 
@@ -39,7 +44,13 @@ def run(args: argparse.Namespace) -> int:
         from iblf_jax.studies.sweep import sweep
 
         file = load_study_file(args.file, "sweep")
-        data = sweep(file.scenario, file.grid, perturbations=file.perturbations, store=args.store, **file.options | how)
+        data = sweep(
+            file.scenario,
+            file.grid,
+            perturbations=file.perturbations,
+            store=args.store,
+            **file.options | how,
+        )
         if distributed.rank() == 0:
             print(report(data))
         write_netcdf(data, args.out)
@@ -49,7 +60,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report(data: xarray.Dataset) -> str:
-    """One line a point: how many runs failed, and the worst and the median of the smallest margin."""
+    """One line a point: how many runs failed, and the worst and the median of the smallest
+    margin.
+    """
     import json
 
     import numpy as np
@@ -67,13 +80,20 @@ def report(data: xarray.Dataset) -> str:
     shape = tuple(config["dims"].values())
     for point, place in enumerate(np.ndindex(shape) if shape else [()]):
         at = dict(zip(dims, place, strict=True))
-        cells = [_tick(p["values"][at[p["along"]]]) for p in config["points"].values()] if dims else ["nominal"]
+        cells = (
+            [_tick(p["values"][at[p["along"]]]) for p in config["points"].values()]
+            if dims
+            else ["nominal"]
+        )
         cells.append(f"{failed[point]} of {runs}")
         if margin is not None:
             cells += [number(np.nanmin(margin[point])), number(np.nanmedian(margin[point]))]
         rows.append(cells)
     more = [f"... and {len(rows) - 1 - MOST_ROWS} more points"] if len(rows) > MOST_ROWS + 1 else []
-    head = f"{data.attrs['cases']} runs of {data.attrs['duration']:g} s, dt = {data.attrs['dt']:g} s, seed {data.attrs['seed']}"
+    head = (
+        f"{data.attrs['cases']} runs of {data.attrs['duration']:g} s, dt = {data.attrs['dt']:g} s,"
+        f" seed {data.attrs['seed']}"
+    )
     return "\n".join([head, "", *as_text(rows[: MOST_ROWS + 1], left=(0,)), *more])
 
 

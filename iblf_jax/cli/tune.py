@@ -1,4 +1,6 @@
-"""`tune`: tunes the gains of a tuning file and writes the tuned scenario, the report and figures."""
+"""`tune`: tunes the gains of a tuning file and writes the tuned scenario, the report and
+figures.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,26 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "tune",
         help="tune gains by gradient",
-        description="Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the report, "
-        "on fresh runs where something is perturbed.",
+        description=(
+            "Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the"
+            " report, on fresh runs where something is perturbed."
+        ),
         epilog="Exit code 1 if a requirement failed or the objective did not go down.",
     )
     parser.add_argument("file", metavar="TUNE.toml", help="a tuning file")
-    parser.add_argument("--out", metavar="DIR", help="write scenario.toml, tuning.json, report.txt and tuning.png into this folder")
-    parser.add_argument("--checkpoint", metavar="FILE", help="keep the state here after each step, and go on from it if it is there")
-    parser.add_argument("--iterations", type=int, metavar="N", help="steps at most (default: the file's, else 60)")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="write scenario.toml, tuning.json, report.txt and tuning.png into this folder",
+    )
+    parser.add_argument(
+        "--checkpoint",
+        metavar="FILE",
+        help="keep the state here after each step, and go on from it if it is there",
+    )
+    parser.add_argument(
+        "--iterations", type=int, metavar="N", help="steps at most (default: the file's, else 60)"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=run)
 
@@ -28,7 +42,11 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.files.tuning import tune_file
 
     folder = output_folder(args.out) if args.out else None
-    given = {name: x for name, x in (("checkpoint", args.checkpoint), ("iterations", args.iterations)) if x is not None}
+    given = {
+        name: x
+        for name, x in (("checkpoint", args.checkpoint), ("iterations", args.iterations))
+        if x is not None
+    }
     result = tune_file(args.file, progress=False if args.quiet else None, **given)
     print(result.report)
     print(result)
@@ -36,11 +54,18 @@ def run(args: argparse.Namespace) -> int:
         from iblf_jax import plotting
         from iblf_jax.files.scenario import save_scenario
 
-        timing = {"duration": result.setup.duration, "dt": result.setup.dt, "method": result.setup.method}
+        timing = {
+            "duration": result.setup.duration,
+            "dt": result.setup.dt,
+            "method": result.setup.method,
+        }
         save_scenario(result.scenario, folder / "scenario.toml", run=timing)
         result.save(folder / "tuning.json")
         (folder / "report.txt").write_text(f"{result.report}\n{result}\n", encoding="utf-8")
         plotting.save({"tuning": result.plot()}, folder, formats=("png",))
         print(f"\nwritten to {folder}: scenario.toml, tuning.json, report.txt, tuning.png")
-    failed = any(v.verdict == "fail" for v in result.report.verdicts) or result.report.changes[0].after > result.report.changes[0].before
+    failed = (
+        any(v.verdict == "fail" for v in result.report.verdicts)
+        or result.report.changes[0].after > result.report.changes[0].before
+    )
     return 1 if failed and not (result.report.verdicts and result.report.passed) else 0

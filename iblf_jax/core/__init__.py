@@ -1,1 +1,3 @@
-"""What everything stands on: components as pytrees, checks, small linear algebra, status flags, tables of words, whole files."""
+"""What everything stands on: components as pytrees, checks, small linear algebra, status flags,
+tables of words, whole files.
+"""

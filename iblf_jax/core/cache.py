@@ -1,11 +1,14 @@
-"""The folder of the user's in which compiled programs are kept between processes, XLA's and our own kernels.
+"""The folder of the user's in which compiled programs are kept between processes, XLA's and our own
+kernels.
 
-It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of processor.  It is used from the first run
-of a process on, unless JAX has been given a folder of its own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used
-longest ago is removed once all takes more than LIMIT; removing the folder loses nothing but time.
+It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of
+processor.  It is used from the first run of a process on, unless JAX has been given a folder of its
+own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used longest ago is removed
+once all takes more than LIMIT; removing the folder loses nothing but time.
 
-JAX loads whatever it finds under the name of a program.  In our folder each of its entries therefore ends in a digest of its name and its
-content: one that is damaged, or belongs to another program, or is no file, is removed, and the program is compiled again.
+JAX loads whatever it finds under the name of a program.  In our folder each of its entries
+therefore ends in a digest of its name and its content: one that is damaged, or belongs to another
+  program, or is no file, is removed, and the program is compiled again.
 """
 
 from __future__ import annotations
@@ -39,7 +42,9 @@ IN_USE = 3600.0
 
 
 def directory() -> Path:
-    """The folder, mode 0700; OSError, whose text is one line for the user, if it cannot be made or is not this user's."""
+    """The folder, mode 0700; OSError, whose text is one line for the user, if it cannot be made or
+    is not this user's.
+    """
     path = None
     try:
         path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
@@ -61,7 +66,8 @@ def directory() -> Path:
 
 
 class VerifiedCache:
-    """JAX's cache of compiled programs (`base`, in `folder`), of which only entries that are whole and in their own place are used.
+    """JAX's cache of compiled programs (`base`, in `folder`), of which only entries that are whole
+    and in their own place are used.
 
     It offers what JAX asks of a cache: `get` and `put`.
     """
@@ -111,14 +117,16 @@ def _remove(path: Path) -> None:
 def _verify_entries(folder: Path) -> None:
     """Has JAX use `VerifiedCache` for its folder.
 
-    JAX has no public way to hand it a cache.  A release that keeps its own elsewhere is left as it is: its entries are then not verified
-    (`tests/test_toolchain.py` notices).
+    JAX has no public way to hand it a cache.  A release that keeps its own elsewhere is left as it
+    is: its entries are then not verified (`tests/test_toolchain.py` notices).
     """
     try:
         from jax._src import compilation_cache
 
         base, _ = compilation_cache.get_file_cache(str(folder))  # type: ignore[misc]
-        holds_cache = hasattr(compilation_cache, "_cache") and hasattr(compilation_cache, "_cache_initialized")
+        holds_cache = hasattr(compilation_cache, "_cache") and hasattr(
+            compilation_cache, "_cache_initialized"
+        )
     except (ImportError, AttributeError, TypeError):
         return
     if holds_cache:
@@ -128,16 +136,23 @@ def _verify_entries(folder: Path) -> None:
 
 @cache
 def keep_programs() -> None:
-    """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to, or no folder is safe; once a process."""
+    """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to,
+    or no folder is safe; once a process.
+    """
     try:
         top = directory()
         stranger = _not_ours(top)
         if stranger is None:
             _trim(top)  # kernels are here whatever JAX does
         config: Any = jax.config  # its fields are made when JAX starts
-        if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache or _reloads_badly():
+        if (
+            config.jax_compilation_cache_dir is not None
+            or not config.jax_enable_compilation_cache
+            or _reloads_badly()
+        ):
             return
-        # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are shared by machines.
+        # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are
+        # shared by machines.
         folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
         if stranger is None:
             folder.mkdir(mode=0o700, exist_ok=True)
@@ -159,7 +174,10 @@ def keep_programs() -> None:
 def processor() -> str:
     """What a compiled program is tied to: the processor's model and features."""
     names = ("model name", "flags", "Features", "CPU part")
-    return "\n".join(sorted({line for line in _cpuinfo() if line.startswith(names)})) or platform.processor() + platform.machine()
+    return (
+        "\n".join(sorted({line for line in _cpuinfo() if line.startswith(names)}))
+        or platform.processor() + platform.machine()
+    )
 
 
 def _cpuinfo() -> list[str]:
@@ -170,15 +188,19 @@ def _cpuinfo() -> list[str]:
 
 
 def _reloads_badly() -> bool:
-    """Whether XLA refuses its own programs here, with a line of complaint each (github.com/jax-ml/jax/issues/38445).
+    """Whether XLA refuses its own programs here, with a line of complaint each
+    (github.com/jax-ml/jax/issues/38445).
 
-    It takes "prefer no gather", with which LLVM tunes for the processors that have the bug GDS, for a feature that they lack.
+    It takes "prefer no gather", with which LLVM tunes for the processors that have the bug GDS, for
+    a feature that they lack.
     """
     return any(line.startswith("bugs") and "gds" in line.split() for line in _cpuinfo())
 
 
 def _entries(folder: Path) -> list[tuple[os.DirEntry, os.stat_result]]:
-    """What a folder holds and what each is, links themselves; another process may remove some meanwhile."""
+    """What a folder holds and what each is, links themselves; another process may remove some
+    meanwhile.
+    """
     found = []
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -188,15 +210,32 @@ def _entries(folder: Path) -> list[tuple[os.DirEntry, os.stat_result]]:
 
 
 def _not_ours(folder: Path) -> str | None:
-    """The name of something in a folder that another user owns, or that is a link; None if there is none."""
-    return next((x.name for x, status in _entries(folder) if x.is_symlink() or status.st_uid != os.getuid()), None)
+    """The name of something in a folder that another user owns, or that is a link; None if there is
+    none.
+    """
+    return next(
+        (
+            x.name
+            for x, status in _entries(folder)
+            if x.is_symlink() or status.st_uid != os.getuid()
+        ),
+        None,
+    )
 
 
 def _trim(folder: Path) -> None:
     """Removes what was used longest ago, until the rest is small enough."""
     top = _entries(folder)
-    inner = [Path(x.path) for x, _ in top if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False)]
-    kept = [(status, x.path) for x, status in [*top, *(y for part in inner for y in _entries(part))] if x.name.endswith(SUFFIXES)]
+    inner = [
+        Path(x.path)
+        for x, _ in top
+        if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False)
+    ]
+    kept = [
+        (status, x.path)
+        for x, status in [*top, *(y for part in inner for y in _entries(part))]
+        if x.name.endswith(SUFFIXES)
+    ]
     size = sum(status.st_size for status, _ in kept)
     for status, path in sorted(kept, key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime)):
         if size <= LIMIT or max(status.st_atime, status.st_mtime) > time.time() - IN_USE:

@@ -1,7 +1,9 @@
-"""Host-side checks: each failure is a ValueError that names the field, what came, what was expected, and the remedy.
+"""Host-side checks: each failure is a ValueError that names the field, what came, what was
+expected, and the remedy.
 
-Values that JAX is tracing have no number yet; every check passes them by, so the same constructors and entry
-points work under `jit`, `vmap` and `grad`.  What can only be known inside a run is in `status`, not here.
+Values that JAX is tracing have no number yet; every check passes them by, so the same constructors
+and entry points work under `jit`, `vmap` and `grad`.  What can only be known inside a run is in
+`status`, not here.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ LIMITS = ("limit", "positive limit")
 """Signs of leaves that may be infinite."""
 
 LONGEST_TEXT = {"field": 200, "value": 160, "words": 800, "message": 1400}
-"""Characters of an error message's parts, and of all that the command line prints of one: what a user typed may be of any length."""
+"""Characters of an error message's parts, and of all that the command line prints of one: what a
+user typed may be of any length."""
 
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e9
 """[s].  No run, step, period or delay of a robot is shorter or longer."""
@@ -73,14 +76,24 @@ def is_concrete(value: Any) -> bool:
 
 
 def is_deep(value: Any) -> bool:
-    """Whether lists, tuples and dicts are inside each other deeper than any array or file of this package is.
+    """Whether lists, tuples and dicts are inside each other deeper than any array or file of this
+    package is.
 
-    JAX must not see such a thing: it recurses, and the interpreter's count of levels is wrong ever after.
+    JAX must not see such a thing: it recurses, and the interpreter's count of levels is wrong ever
+      after.
     """
     level = [value]
     for _ in range(DEEPEST):
-        parts = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, list | tuple | dict))
-        level = list({id(x): x for part in parts for x in part if isinstance(x, list | tuple | dict)}.values())
+        parts = (
+            x.values() if isinstance(x, dict) else x
+            for x in level
+            if isinstance(x, list | tuple | dict)
+        )
+        level = list(
+            {
+                id(x): x for part in parts for x in part if isinstance(x, list | tuple | dict)
+            }.values()
+        )
         if not level:
             return False
     return True
@@ -93,7 +106,9 @@ def flat_enough(name: str, value: Any) -> None:
 
 
 def line(text: str, part: str = "words") -> str:
-    """Text as one line of a message: cut, and without characters that would break the line or cannot be printed."""
+    """Text as one line of a message: cut, and without characters that would break the line or
+    cannot be printed.
+    """
     most = LONGEST_TEXT[part]
     text = re.sub(r"\s*\n\s*", " ", text[: 4 * most])
     text = "".join(x if x.isprintable() else ascii(x)[1:-1] for x in text)
@@ -116,7 +131,10 @@ def shown(value: Any) -> str:
 
 def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
     """The one form of error message: field, value, expectation and remedy, in one line."""
-    return ValueError(f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}." + (f" {line(remedy)}" if remedy else ""))
+    return ValueError(
+        f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}."
+        + (f" {line(remedy)}" if remedy else "")
+    )
 
 
 def nearest(name: Any, known: Iterable[str]) -> str:
@@ -197,7 +215,9 @@ def _kind_of(field: dataclasses.Field) -> str:
 
 
 def renamed(**names: str) -> Callable[[F], F]:
-    """Of a function whose keywords have new names, old=new: who uses an old one is told the new one (ValueError)."""
+    """Of a function whose keywords have new names, old=new: who uses an old one is told the new one
+    (ValueError).
+    """
 
     def decorated(function: F) -> F:
         @functools.wraps(function)
@@ -205,7 +225,12 @@ def renamed(**names: str) -> Callable[[F], F]:
             for old, new in names.items():
                 if old in options:
                     call = f"{function.__name__}(..., {new}=...)"
-                    raise fail(f"{function.__name__}: {old}", options[old], f"it as {new}", f"The keyword has a new name: {call}.")
+                    raise fail(
+                        f"{function.__name__}: {old}",
+                        options[old],
+                        f"it as {new}",
+                        f"The keyword has a new name: {call}.",
+                    )
             return function(*args, **options)
 
         return cast(F, called)
@@ -226,20 +251,26 @@ def inside(where: str | os.PathLike, error: Exception) -> ValueError:
 def _is_number_like(value: Any, depth: int = 0) -> bool:
     if isinstance(value, numbers.Number | np.ndarray | np.generic | jax.Array):
         return True
-    return isinstance(value, list | tuple) and depth < DEEPEST and all(_is_number_like(x, depth + 1) for x in value)
+    return (
+        isinstance(value, list | tuple)
+        and depth < DEEPEST
+        and all(_is_number_like(x, depth + 1) for x in value)
+    )
 
 
 def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
     """Converts what a person typed for a leaf field to a floating-point array and checks it.
 
-    A field that was not declared with `leaf` is converted too if it holds numbers, and is otherwise left alone
-    (it is another component).
+    A field that was not declared with `leaf` is converted too if it holds numbers, and is otherwise
+    left alone (it is another component).
     """
     declared = field.metadata.get("leaf", False)
     name = f"{owner}.{field.name}"
     if value is None:
         if field.default is not None:
-            raise fail(name, value, "a number or an array of numbers" if declared else "a component")
+            raise fail(
+                name, value, "a number or an array of numbers" if declared else "a component"
+            )
         return None
     if isinstance(value, tuple | list) and len(value) == 0 and not declared:
         return tuple(value)
@@ -254,7 +285,9 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
         if field.metadata["shape"] == "scalar" and array.ndim != 0:
             raise fail(name, value, "one number", f"Its shape is {array.shape}.")
         if field.metadata["shape"] == "joint" and array.ndim > 1:
-            raise fail(name, value, "one number, or one a joint, (n,)", f"Its shape is {array.shape}.")
+            raise fail(
+                name, value, "one number, or one a joint, (n,)", f"Its shape is {array.shape}."
+            )
     check_values(name, array, field.metadata.get("sign"))
     return array
 
@@ -264,7 +297,9 @@ def as_floats(name: str, value: Any) -> jax.Array:
     flat_enough(name, value)
     try:
         array = _from_host(value) if _is_plain(value) else jnp.asarray(value)
-    except Exception as error:  # whatever NumPy and JAX make of it: too large, ragged, nested too deep, no numbers
+    except (
+        Exception
+    ) as error:  # whatever NumPy and JAX make of it: too large, ragged, nested too deep, no numbers
         raise fail(name, value, "numbers in a rectangular array") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array
@@ -274,14 +309,20 @@ def as_floats(name: str, value: Any) -> jax.Array:
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a value is a number, an array or a list of numbers that JAX has nothing to do with."""
+    """Whether a value is a number, an array or a list of numbers that JAX has nothing to do
+    with.
+    """
     if isinstance(value, list | tuple):
         return all(isinstance(x, int | float) for x in jax.tree.leaves(value))
-    return isinstance(value, int | float | np.ndarray | np.generic) and not isinstance(value, np.ma.MaskedArray)  # JAX refuses a mask
+    return isinstance(value, int | float | np.ndarray | np.generic) and not isinstance(
+        value, np.ma.MaskedArray
+    )  # JAX refuses a mask
 
 
 def _from_host(value: Any) -> jax.Array:
-    """The array of a plain value; `jnp.asarray` compiles a program for every new shape, 20 ms each."""
+    """The array of a plain value; `jnp.asarray` compiles a program for every new shape, 20 ms
+    each.
+    """
     host = np.array(value)  # a copy: JAX may share the memory of what it is given
     if host.dtype.kind in "iu":
         host = host.astype(jnp.result_type(float))
@@ -295,7 +336,9 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
         return
     values = np.asarray(array)
     if sign in LIMITS and np.isnan(values).any():
-        raise fail(name, array, "numbers, infinite where there is no limit", "Replace the NaN entries.")
+        raise fail(
+            name, array, "numbers, infinite where there is no limit", "Replace the NaN entries."
+        )
     if sign not in LIMITS and not np.isfinite(values).all():
         raise fail(name, array, "finite numbers", "Replace the NaN or infinite entries.")
     if sign in ("positive", "positive limit") and not (values > 0).all():
@@ -305,15 +348,22 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
 
 
 def structural(owner: str, name: str, value: Any) -> None:
-    """Raises if a static field holds something that cannot be part of a compiled program's identity."""
+    """Raises if a static field holds something that cannot be part of a compiled program's
+    identity.
+    """
     if isinstance(value, jax.Array | np.ndarray) or not isinstance(value, Hashable):
         raise fail(
-            f"{owner}.{name}", value, "a hashable value", "It is a structural field: give a number, a string or a tuple, not an array."
+            f"{owner}.{name}",
+            value,
+            "a hashable value",
+            "It is a structural field: give a number, a string or a tuple, not an array.",
         )
     try:
         hash(value)
     except Exception as error:
-        raise fail(f"{owner}.{name}", value, "a hashable value", "Give a tuple in place of a list.") from error
+        raise fail(
+            f"{owner}.{name}", value, "a hashable value", "Give a tuple in place of a list."
+        ) from error
 
 
 def one_of(name: str, value: Any, allowed: Any) -> None:
@@ -322,17 +372,36 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
         raise fail(name, value, "one of " + ", ".join(repr(x) for x in allowed))
 
 
-def conforms(name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()) -> None:
-    """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks for, except `optional`."""
-    members = {x for x in (*vars(protocol), *getattr(protocol, "__annotations__", {})) if not x.startswith("_")}
-    public = protocol.__module__.removesuffix("._base").replace("iblf_jax.simulation.metrics", "iblf_jax.metrics")
+def conforms(
+    name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()
+) -> None:
+    """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks
+    for, except `optional`.
+    """
+    members = {
+        x
+        for x in (*vars(protocol), *getattr(protocol, "__annotations__", {}))
+        if not x.startswith("_")
+    }
+    public = protocol.__module__.removesuffix("._base").replace(
+        "iblf_jax.simulation.metrics", "iblf_jax.metrics"
+    )
     expected = f"a component that fits {public}.{protocol.__name__}"
     if isinstance(value, type):
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")
-    bare = value is None or isinstance(value, str | bytes | tuple | list | dict | jax.Array | np.ndarray) or _is_number_like(value)
+    bare = (
+        value is None
+        or isinstance(value, str | bytes | tuple | list | dict | jax.Array | np.ndarray)
+        or _is_number_like(value)
+    )
     missing = sorted(x for x in members - set(optional) if bare or not hasattr(value, x))
     if bare or missing:
-        raise fail(name, value, expected, " ".join(x for x in (remedy, "" if bare else f"It lacks {', '.join(missing)}.") if x))
+        raise fail(
+            name,
+            value,
+            expected,
+            " ".join(x for x in (remedy, "" if bare else f"It lacks {', '.join(missing)}.") if x),
+        )
     for field, part in getattr(value, "__dict__", {}).items():
         flat_enough(f"{name}.{field}", part)
     try:
@@ -340,24 +409,42 @@ def conforms(name: str, value: Any, protocol: type, remedy: str = "", optional: 
     except Exception as error:
         raise fail(name, value, expected, f"JAX cannot take it apart: {error}") from error
     if any(leaf is value for leaf in leaves):
-        raise fail(name, value, expected, "JAX does not know its class: decorate it with iblf_jax.component.")
+        raise fail(
+            name,
+            value,
+            expected,
+            "JAX does not know its class: decorate it with iblf_jax.component.",
+        )
 
 
 def offers(name: str, value: Any, methods: tuple[str, ...], expected: str) -> None:
-    """Raises unless `value` is an object, not a class, an array or a word, that has these methods or fields."""
-    bare = value is None or isinstance(value, type | str | bytes | tuple | list | dict) or _is_number_like(value)
+    """Raises unless `value` is an object, not a class, an array or a word, that has these methods
+    or fields.
+    """
+    bare = (
+        value is None
+        or isinstance(value, type | str | bytes | tuple | list | dict)
+        or _is_number_like(value)
+    )
     missing = [x for x in methods if bare or not hasattr(value, x)]
     if missing:
         raise fail(name, value, expected, "" if bare else f"It lacks {', '.join(missing)}.")
 
 
 def vectors(n: int | None = None, **named: Any) -> tuple[jax.Array, ...]:
-    """Vectors with one number a joint, (n,), from arguments by name, traced or not; as long as the first if n is not given."""
+    """Vectors with one number a joint, (n,), from arguments by name, traced or not; as long as the
+    first if n is not given.
+    """
     arrays = tuple(as_floats(name, value) for name, value in named.items())
     shape = np.shape(arrays[0]) if n is None else (n,)
     for name, array in zip(named, arrays, strict=True):
         if array.ndim != 1 or array.shape != shape:
-            raise fail(name, array, f"one number a joint, shape {shape if len(shape) == 1 else '(n,)'}", f"Its shape is {array.shape}.")
+            raise fail(
+                name,
+                array,
+                f"one number a joint, shape {shape if len(shape) == 1 else '(n,)'}",
+                f"Its shape is {array.shape}.",
+            )
     return arrays
 
 
@@ -368,15 +455,22 @@ def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:
 
 
 def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> float:
-    """A finite positive Python float (or 0, if that may be) from a user's argument, or a ValueError."""
+    """A finite positive Python float (or 0, if that may be) from a user's argument, or a
+    ValueError.
+    """
     expected = f"a {'number >= 0' if zero else 'positive number'} [{unit}]"
     if isinstance(value, jax.core.Tracer):
-        remedy = "It decides how many steps are compiled: use a Python number, or static_argnames in your jit."
+        remedy = (
+            "It decides how many steps are compiled: use a Python number, or static_argnames in"
+            " your jit."
+        )
         raise fail(name, value, expected, remedy)
     array_like = isinstance(value, np.generic | np.ndarray | jax.Array)
     if isinstance(value, bool) or not (array_like or isinstance(value, numbers.Real)):
         raise fail(name, value, expected)
-    if array_like and (value.ndim != 0 or not jnp.issubdtype(value.dtype, np.number) or jnp.iscomplexobj(value)):
+    if array_like and (
+        value.ndim != 0 or not jnp.issubdtype(value.dtype, np.number) or jnp.iscomplexobj(value)
+    ):
         raise fail(name, value, expected)
     try:
         number = float(value)
@@ -430,28 +524,44 @@ def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None 
 
 
 class NoSuchEntryError(IndexError, ValueError):
-    """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's own protocols look for."""
+    """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's
+    own protocols look for.
+    """
 
 
 def seed(value: Any, name: str = "seed") -> int:
     """A seed as a Python int in [0, 2^32), or a ValueError."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer) or not 0 <= value < 2**32:
+    if (
+        isinstance(value, bool | np.bool_)
+        or not isinstance(value, int | np.integer)
+        or not 0 <= value < 2**32
+    ):
         raise fail(name, value, "a whole number from 0 to 2**32 - 1")
     return int(value)
 
 
 def entry(name: str, value: Any, count: int, what: str) -> int:
-    """A Python int from 0 to `count` - 1 from a user's index, which may count from the end; NoSuchEntryError where it leads nowhere."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -count <= value < count:
+    """A Python int from 0 to `count` - 1 from a user's index, which may count from the end;
+    NoSuchEntryError where it leads nowhere.
+    """
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | np.integer)
+        or not -count <= value < count
+    ):
         raise NoSuchEntryError(str(fail(name, value, f"one of the {what} 0 to {count - 1}")))
     return int(value) % count
 
 
 def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
-    """Raises if `count` things of that size are more than this machine's memory holds; says how many it does."""
+    """Raises if `count` things of that size are more than this machine's memory holds; says how
+    many it does.
+    """
     most = int(memory() // max(1, bytes_each))
     if count > most:
-        raise fail(name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", remedy)
+        raise fail(
+            name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", remedy
+        )
 
 
 def memory() -> int:
@@ -496,16 +606,29 @@ def devices(name: str, value: Any) -> list[jax.Device]:
     """A user's devices, all of this process if there are none given, or a ValueError."""
     if value is None:
         return default()
-    if not isinstance(value, list | tuple) or not value or not all(isinstance(x, jax.Device) for x in value):
-        raise fail(name, value, "a list of at least one device", "jax.devices() lists them; leave it out for all of them.")
+    if (
+        not isinstance(value, list | tuple)
+        or not value
+        or not all(isinstance(x, jax.Device) for x in value)
+    ):
+        raise fail(
+            name,
+            value,
+            "a list of at least one device",
+            "jax.devices() lists them; leave it out for all of them.",
+        )
     if {device.platform for device in value} != {platform()}:
         remedy = "Put the call into `with jax.default_device(device):` to compute on another one."
-        raise fail(name, value, f"devices of the platform that JAX computes on, {platform()}", remedy)
+        raise fail(
+            name, value, f"devices of the platform that JAX computes on, {platform()}", remedy
+        )
     return list(value)
 
 
 def file_path(name: str, value: Any, what: str = "a file") -> Path:
-    """A path from a user's argument that this system can spell, or a ValueError.  Nothing need be there."""
+    """A path from a user's argument that this system can spell, or a ValueError.  Nothing need be
+    there.
+    """
     expected = f"the path of {what}"
     try:
         text = os.fspath(value)
@@ -531,7 +654,12 @@ def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
     if not path.exists():
         raise MissingFileError(fail(name, str(path), f"the path of {what}", "Nothing is there."))
     if not path.is_file():
-        raise fail(name, str(path), f"the path of {what}", "It is a folder." if path.is_dir() else "It is not a file.")
+        raise fail(
+            name,
+            str(path),
+            f"the path of {what}",
+            "It is a folder." if path.is_dir() else "It is not a file.",
+        )
     return path
 
 
@@ -545,12 +673,15 @@ class UnwritableError(OSError, ValueError):
 class MissingFileError(FileNotFoundError, ValueError):
     """A path at which nothing is, or whose folder does not exist.
 
-    It is a refusal like every other, and the FileNotFoundError that programs which open files expect.
+    It is a refusal like every other, and the FileNotFoundError that programs which open files
+    expect.
     """
 
 
 def file_to_write(name: str, value: Any, what: str = "a file") -> Path:
-    """A path where a file can be written, or a ValueError; a MissingFileError where its folder does not exist."""
+    """A path where a file can be written, or a ValueError; a MissingFileError where its folder does
+    not exist.
+    """
     path = file_path(name, value, what)
     if path.is_dir():
         raise fail(name, str(path), f"the path of {what}", "It is a folder.")
@@ -593,16 +724,26 @@ def _can_be_written(name: str, path: Path, folder: Path, expected: str) -> None:
 
 
 def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
-    """The number of steps of size `dt` in `duration`, or a ValueError that says which duration, or which dt if that is free, would do."""
+    """The number of steps of size `dt` in `duration`, or a ValueError that says which duration, or
+    which dt if that is free, would do.
+    """
     duration = positive_number("duration", duration, "s")
     dt = positive_number("dt", dt, "s")
     if not duration / dt <= MOST_STEPS:
-        raise fail("duration", duration, f"at most {MOST_STEPS} steps dt = {dt:g} s", "Shorten the run or take a larger dt.")
+        raise fail(
+            "duration",
+            duration,
+            f"at most {MOST_STEPS} steps dt = {dt:g} s",
+            "Shorten the run or take a larger dt.",
+        )
     steps = round(duration / dt)
-    # A thousandth of a step is forgiven, so that a duration that has been through float32 is taken for what it was.
+    # A thousandth of a step is forgiven, so that a duration that has been through float32 is taken
+    # for what it was.
     if steps < 1 or abs(steps * dt - duration) > 1e-3 * dt + 1e-12 * duration:
         near = max(steps, 1)
-        remedy = f"Take duration={near * dt:.12g}" + (f" or dt={duration / near:.12g}." if dt_is_free else ".")
+        remedy = f"Take duration={near * dt:.12g}" + (
+            f" or dt={duration / near:.12g}." if dt_is_free else "."
+        )
         raise fail("duration", duration, f"a whole number of steps dt = {dt:g} s", remedy)
     return steps
 
@@ -610,7 +751,8 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
 def recorded_every(value: Any, steps: int) -> int:
     """Every how many steps to record, as the compiled loops count it, in int32.
 
-    Every number past the last step has the same effect: only the first instant is recorded.  A number
+    Every number past the last step has the same effect: only the first instant is recorded.  A
+      number
     that no integer type of a computer holds is a mistake, and refused.
     """
     return min(positive_integer("record_every", value, most=LARGEST_INTEGER), steps + 1, MOST_STEPS)

@@ -1,4 +1,6 @@
-"""What JAX computes on: all devices of this process, or the one that the user has made the default (`jax.default_device`)."""
+"""What JAX computes on: all devices of this process, or the one that the user has made the default
+(`jax.default_device`).
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Folders in which something is made before it is moved to its place in one piece.
 
-The maker of a draft holds a lock on its folder, which the system drops when the process ends, however it ends.  A draft whose lock can be
-had is therefore nobody's any more, and whoever makes the next one removes it.
+The maker of a draft holds a lock on its folder, which the system drops when the process ends,
+however it ends.  A draft whose lock can be had is therefore nobody's any more, and whoever makes
+the next one removes it.
 """
 
 from __future__ import annotations
@@ -23,12 +24,14 @@ except ImportError:  # Windows: age alone tells
     fcntl = None  # type: ignore[assignment]
 
 STALE = 3600.0
-"""Seconds after which a draft is nobody's where no lock can tell: made on another machine, or on a disk without locks."""
+"""Seconds after which a draft is nobody's where no lock can tell: made on another machine, or on a
+disk without locks."""
 
 
 @contextlib.contextmanager
 def draft(parent: Path, name: str) -> Iterator[Path]:
-    """A new folder in `parent` that nobody else can enter; gone at the end, with what has not been moved out of it.
+    """A new folder in `parent` that nobody else can enter; gone at the end, with what has not been
+    moved out of it.
 
     Args:
       parent: a folder that exists.
@@ -71,7 +74,9 @@ def remove_abandoned(path: Path, *, lockable: bool) -> None:
 
 
 def _locked(path: Path, *, wait: bool) -> int | None:
-    """A lock on a folder, as an open file; None where there are no locks.  BlockingIOError if another holds it and `wait` is False."""
+    """A lock on a folder, as an open file; None where there are no locks.  BlockingIOError if
+    another holds it and `wait` is False.
+    """
     if fcntl is None:
         return None
     try:

@@ -1,4 +1,5 @@
-"""What an argument `joints=` selects, with one meaning everywhere: indices, names, slices or truth values.
+"""What an argument `joints=` selects, with one meaning everywhere: indices, names, slices or truth
+values.
 
     joints=None             all joints
     joints=[0, 1]           joints 0 and 1; joints=-1 is the last one
@@ -6,7 +7,8 @@
     joints=slice(0, 3)      or "0:3" in a file
     joints=[True, False]    one truth value for each joint
 
-A selection is structure, not a number: it is kept as a hashable tuple and becomes indices where the robot is known.
+A selection is structure, not a number: it is kept as a hashable tuple and becomes indices where the
+  robot is known.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ def selection(field: str, joints: Any) -> Selection:
 
     Args:
       field: what messages call it.
-      joints: an index, a name, a slice, a sequence of these, or one truth value for each joint; None for all joints.
+      joints: an index, a name, a slice, a sequence of these, or one truth value for each joint;
+        None for all joints.
 
     Raises:
       ValueError: something else, numbers that are not whole, or nothing.
@@ -53,9 +56,13 @@ def selection(field: str, joints: Any) -> Selection:
     if joints is None:
         return None
     if isinstance(joints, jax.core.Tracer):
-        raise checks.fail(field, joints, EXPECTED, "It decides what is compiled, so it cannot be traced.")
+        raise checks.fail(
+            field, joints, EXPECTED, "It decides what is compiled, so it cannot be traced."
+        )
     if holds_weights(joints):
-        raise checks.fail(field, joints, EXPECTED, "Weights have an argument of their own, weights=.")
+        raise checks.fail(
+            field, joints, EXPECTED, "Weights have an argument of their own, weights=."
+        )
     entries = _entries(field, joints)
     found = tuple(_entry(field, joints, x) for x in entries)
     if not found:
@@ -68,7 +75,9 @@ def selection(field: str, joints: Any) -> Selection:
 
 def _entries(field: str, joints: Any) -> Sequence[Any]:
     if isinstance(joints, bool | np.bool_):
-        raise checks.fail(field, joints, EXPECTED, "Give one truth value for each joint, in a list.")
+        raise checks.fail(
+            field, joints, EXPECTED, "Give one truth value for each joint, in a list."
+        )
     if isinstance(joints, jax.Array | np.ndarray | np.generic):
         array = np.asarray(joints)
         if array.ndim > 1:
@@ -95,7 +104,9 @@ def _entry(field: str, joints: Any, entry: Any) -> int | str:
 
 def _slice_as_text(field: str, given: slice) -> str:
     parts = (given.start, given.stop, given.step)
-    if not all(x is None or (isinstance(x, int | np.integer) and not isinstance(x, bool)) for x in parts):
+    if not all(
+        x is None or (isinstance(x, int | np.integer) and not isinstance(x, bool)) for x in parts
+    ):
         raise checks.fail(field, given, "a slice of whole numbers", "Name single joints in a list.")
     words = ["" if x is None else str(int(x)) for x in parts]
     return ":".join(words if given.step is not None else words[:2])
@@ -126,7 +137,9 @@ def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, .
     twice = next((i for i in found if found.count(i) > 1), None)
     if twice is not None:
         remedy = "Weights have an argument of their own, weights=."
-        raise checks.fail(field, list(chosen), f"each joint once, but it holds joint {twice} twice", remedy)
+        raise checks.fail(
+            field, list(chosen), f"each joint once, but it holds joint {twice} twice", remedy
+        )
     return tuple(found)
 
 
@@ -135,12 +148,16 @@ def _indices_of(field: str, entry: int | str, names: Sequence[str]) -> list[int]
     if isinstance(entry, int):
         if not -n <= entry < n:
             remedy = "Weights have an argument of their own, weights=."
-            raise checks.fail(field, entry, f"an index from 0 to {n - 1}, as the robot has {n} joints", remedy)
+            raise checks.fail(
+                field, entry, f"an index from 0 to {n - 1}, as the robot has {n} joints", remedy
+            )
         return [entry % n]
     if entry in names:
         same = [i for i, name in enumerate(names) if name == entry]
         if len(same) > 1:
-            raise checks.fail(field, entry, "the name of one joint", f"Joints {same} are called so: give indices.")
+            raise checks.fail(
+                field, entry, "the name of one joint", f"Joints {same} are called so: give indices."
+            )
         return same
     if SLICE.fullmatch(entry):
         parts = [int(x) if x else None for x in entry.split(":")]

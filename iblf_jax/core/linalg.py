@@ -1,8 +1,8 @@
 """Algebra of small symmetric positive definite matrices, unrolled over their static size.
 
-Calls into a matrix library cost microseconds on a 2x2 matrix and stop XLA from fusing a time step.  A mass matrix is n x n with n
-the number of joints, known when the program is traced, so its Cholesky factor is written out as scalar operations, and products
-are sums of elementwise ones.
+Calls into a matrix library cost microseconds on a 2x2 matrix and stop XLA from fusing a time step.
+A mass matrix is n x n with n the number of joints, known when the program is traced, so its
+Cholesky factor is written out as scalar operations, and products are sums of elementwise ones.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def matmul_in_order(left: jax.Array, right: jax.Array) -> jax.Array:
-    """The product of two matrices, term by term: XLA orders those of a reduction by the number of runs beside it.
+    """The product of two matrices, term by term: XLA orders those of a reduction by the number of
+    runs beside it.
 
-    Written out, as XLA then goes over the runs once, not once a term: 4,096 runs of seven joints took 0.67 s before and after their steps
-    with a loop, and take 0.33 s so.
+    Written out, as XLA then goes over the runs once, not once a term: 4,096 runs of seven joints
+    took 0.67 s before and after their steps with a loop, and take 0.33 s so.
     """
-    # The first product is kept apart: of two in one sum a processor may round either, and batches and lone runs would differ.
+    # The first product is kept apart: of two in one sum a processor may round either, and batches
+    # and lone runs would differ.
     total = jax.lax.optimization_barrier(left[:, :1] * right[0])
     for k in range(1, len(right)):
         total = total + left[:, k, None] * right[k]
@@ -42,7 +44,8 @@ def inner(u: jax.Array, v: jax.Array) -> jax.Array:
 def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
     """Lower triangular L with L L^T = matrix, as a list of rows of scalars.
 
-    A matrix that is not positive definite gives NaN, as LAPACK does; the run is then flagged, not stopped.
+    A matrix that is not positive definite gives NaN, as LAPACK does; the run is then flagged, not
+    stopped.
     """
     n = matrix.shape[-1]
     L: list[list[jax.Array]] = []
@@ -59,9 +62,11 @@ def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
 
 
 def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]:
-    """L (rows below its unit diagonal) and 1/D with L D L^T = matrix; NaN where a pivot is not positive.
+    """L (rows below its unit diagonal) and 1/D with L D L^T = matrix; NaN where a pivot is not
+    positive.
 
-    Without roots, and with one division a row: on a processor that steps many robots at once these cost as much as all the rest.
+    Without roots, and with one division a row: on a processor that steps many robots at once these
+      cost as much as all the rest.
     """
     lower: list[list[jax.Array]] = []
     scaled: list[list[jax.Array]] = []
@@ -84,10 +89,11 @@ def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]
 
 @jax.custom_jvp
 def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """X with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand side.
+    """X with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand
+    side.
 
-    A matrix that is not positive definite gives NaN.  The derivative is that of the equation, dx = matrix^-1 (drhs - dmatrix x), with
-    the same factors.
+    A matrix that is not positive definite gives NaN.  The derivative is that of the equation, dx =
+    matrix^-1 (drhs - dmatrix x), with the same factors.
     """
     lower, inverse = _factors(matrix)
     n = len(inverse)
@@ -114,9 +120,11 @@ def _solve_spd_jvp(primals, tangents):
 
 
 def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """X with matrix X = rhs, for any (m, m) matrix and an (m, k) right-hand side, by Gauss and Jordan with pivoting.
+    """X with matrix X = rhs, for any (m, m) matrix and an (m, k) right-hand side, by Gauss and
+    Jordan with pivoting.
 
-    For what is done once a run: in a loop over the columns, quick to compile and without a call into a library, which would keep the run
+    For what is done once a run: in a loop over the columns, quick to compile and without a call
+      into a library, which would keep the run
     around it from becoming one machine function.
     """
     rows = jnp.arange(len(matrix))

@@ -2,8 +2,8 @@
 
 `warnings.warn(text, stacklevel=...)` counts frames, and the number of frames between a check and
 the user's line differs between the routes through the package.  A wrong count shows a line of the
-package with its source, and the same text again for every route, because Python takes it for another
-place.  So `warn` looks for the frame of the user, and `each_warning_once` marks a call.
+package with its source, and the same text again for every route, because Python takes it for
+another place.  So `warn` looks for the frame of the user, and `each_warning_once` marks a call.
 
 Python 3.12 has `skip_file_prefixes` for the first; the package runs on 3.11 too.
 """
@@ -25,7 +25,8 @@ NOT_THE_USER = (
     *("iblf_jax", "jax", "jaxlib", "contextlib", "functools"),
     *("importlib", "concurrent", "threading", "runpy"),
 )
-"""Packages and modules whose frames lie between a check of this package and the line of its user."""
+"""Packages and modules whose frames lie between a check of this package and the line of its
+user."""
 
 _GIVEN: ContextVar[set[str] | None] = ContextVar("iblf_jax_warnings", default=None)
 """The texts that the current call of the package has warned with; None outside of every call."""

@@ -1,8 +1,9 @@
 """The end of a process in which XLA is still at work.
 
-Ctrl-C while XLA compiles raises KeyboardInterrupt at once, and XLA goes on compiling in threads of its own.  When the interpreter
-then ends, it takes away what these threads work on, and the process crashes or hangs.  So the end waits for them; a process that ends
-by Ctrl-C does not wait, but ends by that signal without taking the interpreter down.
+Ctrl-C while XLA compiles raises KeyboardInterrupt at once, and XLA goes on compiling in threads of
+its own.  When the interpreter then ends, it takes away what these threads work on, and the process
+crashes or hangs.  So the end waits for them; a process that ends by Ctrl-C does not wait, but ends
+by that signal without taking the interpreter down.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from iblf_jax._start import AT_END
 
 TASKS = Path("/proc/self/task")
 PATIENCE = 300.0
-"""Seconds that the end of a process waits for XLA at most: a compilation takes minutes at the worst."""
+"""Seconds that the end of a process waits for XLA at most: a compilation takes minutes at the
+worst."""
 LOOKS, PAUSE = 5, 0.002
-"""Times that threads are looked at before they count as idle, and seconds between: one that waits for memory is not running."""
+"""Times that threads are looked at before they count as idle, and seconds between: one that waits
+for memory is not running."""
 
 
 def native_threads_run() -> bool:

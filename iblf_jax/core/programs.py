@@ -1,9 +1,10 @@
 """Bounds what compiled programs take of the process's memory maps.
 
-The code of a program that JAX has compiled for a CPU lies in some hundred memory maps, and Linux gives a process 65,530.  JAX keeps every
-program for as long as the process lives: after a few hundred of them (a few dozen arms, each with programs of its own) the compiler finds
-no memory, and the process ends.  So JAX forgets its programs when the maps come near to their limit; what is needed again is compiled
-again, or read from the disk (`core.cache`).
+The code of a program that JAX has compiled for a CPU lies in some hundred memory maps, and Linux
+gives a process 65,530.  JAX keeps every program for as long as the process lives: after a few
+hundred of them (a few dozen arms, each with programs of its own) the compiler finds no memory, and
+the process ends.  So JAX forgets its programs when the maps come near to their limit; what is
+needed again is compiled again, or read from the disk (`core.cache`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ MAPS, MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """JAX's event of a program that is compiled, or read from the disk."""
 SHARE = 0.6
-"""Of the maps that a process may have, from which programs are released: libraries and other threads need some too."""
+"""Of the maps that a process may have, from which programs are released: libraries and other
+threads need some too."""
 PROGRAM = 300
 """Maps of a program, about at most: one evaluation of the closed loop of an arm has 250."""
 
@@ -40,7 +42,9 @@ def most_maps() -> int | None:
 
 
 class ProgramBound:
-    """Has JAX release all programs once the process has more than `bound` memory maps of the `limit` that it may have."""
+    """Has JAX release all programs once the process has more than `bound` memory maps of the
+    `limit` that it may have.
+    """
 
     def __init__(self, limit: int, bound: int) -> None:
         self.limit = limit
@@ -48,7 +52,8 @@ class ProgramBound:
         self.released = 0
         """How many times programs were released."""
         self._until_count = 0
-        """Programs to compile before maps are counted: to count ten thousands of them takes as long as a small program."""
+        """Programs to compile before maps are counted: to count ten thousands of them takes as long
+        as a small program."""
         self._lock = threading.Lock()
 
     def __call__(self, event: str, duration_secs: float, **kwargs: str | int) -> None:

@@ -1,15 +1,21 @@
 """Components: frozen dataclasses that JAX can differentiate, batch and compile.
 
-A robot, a law, a bound is a *component*: it has behaviour (methods) and leaves (arrays).  JAX takes a
-component apart into its leaves and puts it together again at every `jit`, `vmap` and `grad`, with tracers,
-placeholders or axis numbers in the place of the numbers.  So two things must be kept apart:
+A robot, a law, a bound is a *component*: it has behaviour (methods) and leaves (arrays).  JAX takes
+  a
+component apart into its leaves and puts it together again at every `jit`, `vmap` and `grad`, with
+tracers, placeholders or axis numbers in the place of the numbers.  So two things must be kept
+apart:
 
-- **construction by a person**, `TwoLink(mass=[2, 0.85], ...)`: lists become arrays, signs and shapes are checked;
-- **reconstruction by JAX**: nothing may be converted or checked, because what comes is not a number.
+- **construction by a person**, `TwoLink(mass=[2, 0.85], ...)`: lists become arrays, signs and
+  shapes are checked;
+- **reconstruction by JAX**: nothing may be converted or checked, because what comes is not a
+  number.
 
-`component` does that: the checks live in the constructor, and the pytree is registered with an unflatten that never
-calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static` (structure: changes recompile)
-or as a plain annotation (another component).  `eq=False`: comparing arrays with `==` is ambiguous, identity is not.
+`component` does that: the checks live in the constructor, and the pytree is registered with an
+  unflatten that never
+calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static`
+(structure: changes recompile) or as a plain annotation (another component).  `eq=False`: comparing
+  arrays with `==` is ambiguous, identity is not.
 """
 
 from __future__ import annotations
@@ -27,17 +33,22 @@ from iblf_jax.core import checks
 T = TypeVar("T")
 
 Leaf: TypeAlias = Any
-"""Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a `jax.Array` from then on."""
+"""Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a
+`jax.Array` from then on."""
 
 
-def leaf(unit: str, *, sign: str | None = None, shape: str = "joint", default: Any = dataclasses.MISSING) -> Any:
-    """Declares a field that holds an array of numbers, which can be perturbed, swept, tuned and differentiated.
+def leaf(
+    unit: str, *, sign: str | None = None, shape: str = "joint", default: Any = dataclasses.MISSING
+) -> Any:
+    """Declares a field that holds an array of numbers, which can be perturbed, swept, tuned and
+    differentiated.
 
     Args:
       unit: SI unit for tables and axes, such as "kg m^2" ("1" for a pure number).
-      sign: None, "positive" or "nonnegative"; "limit" or "positive limit" for what may be infinite, because there is no limit.
-        Checked at construction and at the entry points.
-      shape: "joint" for one number a joint, (n,), where a scalar is repeated; "scalar" for (); "any" for neither.
+      sign: None, "positive" or "nonnegative"; "limit" or "positive limit" for what may be infinite,
+        because there is no limit. Checked at construction and at the entry points.
+      shape: "joint" for one number a joint, (n,), where a scalar is repeated; "scalar" for ();
+        "any" for neither.
       default: the value if none is given.
     """
     metadata = {"unit": unit, "sign": sign, "shape": shape, "leaf": True}
@@ -53,7 +64,8 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
 def component(cls: type[T]) -> type[T]:
     """Class decorator that makes a frozen dataclass a component (see the head of this module).
 
-    A class may define `check(self)`, called once after construction, to raise ValueError when fields do not fit together.
+    A class may define `check(self)`, called once after construction, to raise ValueError when
+    fields do not fit together.
     """
     if not isinstance(cls, type):
         raise checks.fail("component", cls, "a class", "Write @iblf_jax.component above it.")
@@ -61,7 +73,9 @@ def component(cls: type[T]) -> type[T]:
     try:
         cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
     except (TypeError, ValueError) as error:
-        raise checks.fail("component", cls, "a class of annotated fields, those with defaults last", f"{error}.") from error
+        raise checks.fail(
+            "component", cls, "a class of annotated fields, those with defaults last", f"{error}."
+        ) from error
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     children = tuple(f.name for f in fields if not f.metadata.get("static"))
     structure = tuple(f.name for f in fields if f.metadata.get("static"))
@@ -116,7 +130,9 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
 
 
 def layers(part: Any) -> list[Any]:
-    """A component, and what it wraps, outermost first (class attribute `wraps`: the name of the field that holds it)."""
+    """A component, and what it wraps, outermost first (class attribute `wraps`: the name of the
+    field that holds it).
+    """
     found = [part]
     while getattr(type(found[-1]), "wraps", None):
         found.append(getattr(found[-1], type(found[-1]).wraps))
@@ -129,9 +145,15 @@ def unwrapped(part: Any) -> Any:
 
 
 def rewrapped(part: Any, inner: Any) -> Any:
-    """`part` with its innermost component replaced by `inner`; `inner` itself if `part` wraps nothing."""
+    """`part` with its innermost component replaced by `inner`; `inner` itself if `part` wraps
+    nothing.
+    """
     name = getattr(type(part), "wraps", None)
-    return inner if not name else dataclasses.replace(part, **{name: rewrapped(getattr(part, name), inner)})
+    return (
+        inner
+        if not name
+        else dataclasses.replace(part, **{name: rewrapped(getattr(part, name), inner)})
+    )
 
 
 def is_leaf_field(field: dataclasses.Field) -> bool:
@@ -140,10 +162,12 @@ def is_leaf_field(field: dataclasses.Field) -> bool:
 
 
 def astype(tree: T, dtype: jax.typing.DTypeLike) -> T:
-    """The same component with all its numbers in another floating-point type, `astype(scenario, "float32")`.
+    """The same component with all its numbers in another floating-point type, `astype(scenario,
+    "float32")`.
 
     Raises:
-      ValueError: a type that is not a floating-point one, or something in the component that is no number.
+      ValueError: a type that is not a floating-point one, or something in the component that is no
+        number.
     """
     import jax.numpy as jnp
 

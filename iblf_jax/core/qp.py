@@ -1,19 +1,24 @@
-"""Small quadratic programmes inside a time loop: an interior-point method of a fixed number of iterations.
+"""Small quadratic programmes inside a time loop: an interior-point method of a fixed number of
+iterations.
 
-    minimise  w/2 x^T H x + 1/2 sum_i s_i^2     subject to     G x - s <= h,   s_i = 0 for rows that are hard
+    minimise  w/2 x^T H x + 1/2 sum_i s_i^2     subject to     G x - s <= h,   s_i = 0 for rows that
+    are hard
 
-with a weight w so small that, where there is a solution, a soft row's slack s_i = l_i, its multiplier, is far below rounding of what the
-programme is about; it is given as 0.  Where there is none, x breaks the soft rows least, in the sum of squares of their distances, and the
-slack says by how much.  Hard rows must have a common point, such as a box has.
+with a weight w so small that, where there is a solution, a soft row's slack s_i = l_i, its
+multiplier, is far below rounding of what the programme is about; it is given as 0.  Where there is
+none, x breaks the soft rows least, in the sum of squares of their distances, and the slack says by
+how much.  Hard rows must have a common point, such as a box has.
 
-Primal-dual path following by steps of Newton, in plain operations: it lowers to the generated kernels.  With y the room of a row,
+Primal-dual path following by steps of Newton, in plain operations: it lowers to the generated
+kernels.  With y the room of a row,
 
     w H x + G^T l = 0,   G x - l + y = h,   l y = m,   m -> 0,
 
-each iteration aims at a small part of the mean product m.  (With a weight 1/w on s instead, the multipliers of a programme without a
-solution have far to go, and many did not get there in 60 iterations.  Mehrotra's corrector needs fewer, and cycled in one of thousands of
-random programmes; a penalty on |s| is exact, and needs as many.)  The derivative is that of these
-equations at the solution, with the factors of one more step: no iteration is differentiated.
+each iteration aims at a small part of the mean product m.  (With a weight 1/w on s instead, the
+multipliers of a programme without a solution have far to go, and many did not get there in 60
+iterations.  Mehrotra's corrector needs fewer, and cycled in one of thousands of random programmes;
+a penalty on |s| is exact, and needs as many.)  The derivative is that of these equations at the
+solution, with the factors of one more step: no iteration is differentiated.
 
 Source: S. J. Wright, Primal-Dual Interior-Point Methods, 1997.
 """
@@ -28,7 +33,8 @@ import jax.numpy as jnp
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 
 ITERATIONS = 36
-"""Random programmes of two unknowns are solved after 29 at most, with or without a solution, of seven after 34."""
+"""Random programmes of two unknowns are solved after 29 at most, with or without a solution, of
+seven after 34."""
 WEIGHT = 1e-12
 """w, relative to the size of H and h: it moves a solution by the share 1e-8 at most (tests)."""
 CENTRING = 0.03
@@ -83,7 +89,9 @@ def _solved(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array) -> _Point
     """The solution of a scaled programme."""
     point = _Point(jnp.zeros(G.shape[1], h.dtype), jnp.maximum(h, 1.0), jnp.ones_like(h))
     # A loop: where it is not lowered, XLA compiles one iteration.
-    return jax.lax.scan(lambda at, _: (_improved(H, G, h, soft, at), None), point, length=ITERATIONS)[0]
+    return jax.lax.scan(
+        lambda at, _: (_improved(H, G, h, soft, at), None), point, length=ITERATIONS
+    )[0]
 
 
 @jax.jit  # so that the generated code holds it once
@@ -99,7 +107,9 @@ def _improved(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array, at: _Po
     part = jnp.minimum(TO_THE_EDGE * jnp.minimum(_room(at.y, dy), _room(at.l, dl)), 1.0)
     # At the solution there is nothing left to gain, and rounding would spoil the factors.
     go_on = (mean > least) & jnp.all(jnp.isfinite(dx))
-    return jax.tree.map(lambda old, new: jnp.where(go_on, old + part * new, old), at, _Point(dx, dy, dl))
+    return jax.tree.map(
+        lambda old, new: jnp.where(go_on, old + part * new, old), at, _Point(dx, dy, dl)
+    )
 
 
 def _newton(H: jax.Array, G: jax.Array, soft: jax.Array, at: _Point) -> tuple[jax.Array, jax.Array]:
@@ -121,7 +131,8 @@ def _solved_jvp(primals, tangents):
     matrix, weight = _newton(H, G, soft, at)
     turned, moved = matvec(dH, at.x) + matvec(dG.T, at.l), matvec(dG, at.x) - dh
     dx, dl = jnp.zeros_like(at.x), jnp.zeros_like(at.l)
-    # The weights of active rows take from H all but a few digits: what a solve leaves is solved for again.
+    # The weights of active rows take from H all but a few digits: what a solve leaves is solved for
+    # again.
     for _ in range(REFINED):
         left, missed = matvec(H, dx) + matvec(G.T, dl) + turned, matvec(G, dx) - dl / weight + moved
         more = solve_spd(matrix, -left - matvec(G.T, weight * missed))

@@ -1,7 +1,10 @@
-"""What can go wrong in a run, as bit flags: inside `jit` nothing raises, each run carries its status to the end.
+"""What can go wrong in a run, as bit flags: inside `jit` nothing raises, each run carries its
+status to the end.
 
-`Status.OK` is 0.  Flags combine: a run may violate a bound and saturate its torque.  The first group says that the
-run is not to be believed or not to be accepted (`FAILED`), the second tells what happened on the way.
+`Status.OK` is 0.  Flags combine: a run may violate a bound and saturate its torque.  The first
+  group says that the
+run is not to be believed or not to be accepted (`FAILED`), the second tells what happened on the
+way.
 """
 
 from __future__ import annotations
@@ -18,53 +21,71 @@ class Status(enum.IntFlag):
     BOUND_VIOLATED = 1
     """A joint touched or left its bound."""
     NOT_FINITE = 2
-    """The state ran away (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is no number); it was frozen at its last good value."""
+    """The state ran away (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is no number); it
+    was frozen at its last good value."""
     STEP_TOO_LARGE = 4
-    """dt is beyond the stability limit of the integrator for the fastest mode of the closed loop."""
+    """dt is beyond the stability limit of the integrator for the fastest mode of the closed
+    loop."""
     INFEASIBLE_REFERENCE = 8
-    """The reference touches or leaves a bound during the run: Assumption 2 fails and no law can keep both."""
+    """The reference touches or leaves a bound during the run: Assumption 2 fails and no law can
+    keep both."""
     TORQUE_SATURATED = 16
     """The torque that the law asked for was cut to the actuator's limit."""
     GUARD_ACTIVE = 32
-    """A joint came so near its bound that the barrier's slope was held at its greatest finite value."""
+    """A joint came so near its bound that the barrier's slope was held at its greatest finite
+    value."""
     INADMISSIBLE_DRAW = 64
-    """A study drew a value that its leaf does not admit (a negative mass, say): the run was not made, its metrics are NaN."""
+    """A study drew a value that its leaf does not admit (a negative mass, say): the run was not
+    made, its metrics are NaN."""
     INACCURATE = 128
-    """The estimated error of the positions is more than 0.5 % of the tube (`accuracy.TOLERANCE`): take a smaller dt."""
+    """The estimated error of the positions is more than 0.5 % of the tube (`accuracy.TOLERANCE`):
+    take a smaller dt."""
     GUARD_STAYED = 256
-    """The guard was active beyond the first instant: there another law ran, softer than the one that was asked for."""
+    """The guard was active beyond the first instant: there another law ran, softer than the one
+    that was asked for."""
 
     SAMPLING_TOO_SLOW = 512
-    """The loop grows from one period to the next (spectral radius above 1) at one of the instants that were looked at: sample faster."""
+    """The loop grows from one period to the next (spectral radius above 1) at one of the instants
+    that were looked at: sample faster."""
 
     VELOCITY_VIOLATED = 1024
     """A joint's velocity touched or left its bound."""
     ALPHA_INFEASIBLE = 2048
-    """The virtual velocity touched or left the velocities' bounds: there no law that follows it can keep them, and nothing is claimed."""
+    """The virtual velocity touched or left the velocities' bounds: there no law that follows it can
+    keep them, and nothing is claimed."""
 
     FILTER_INFEASIBLE = 4096
-    """A safety filter's conditions had no common torque at some time: the torque broke them by the least slack, which the run records."""
+    """A safety filter's conditions had no common torque at some time: the torque broke them by the
+    least slack, which the run records."""
 
     REGION_VIOLATED = 8192
-    """The tip, or the origin of a joint, touched or crossed the wall of a region that it must stay in."""
+    """The tip, or the origin of a joint, touched or crossed the wall of a region that it must stay
+    in."""
 
     INFINITE_SLOPE = 16384
-    """A run is inaccurate, or its step too large, and at an instant that was looked at a derivative of the loop is infinite, as that of
+    """A run is inaccurate, or its step too large, and at an instant that was looked at a derivative
+    of the loop is infinite, as that of
     |e2|^a sign(e2) with a < 1 is at e2 = 0, or nearly so, as that of sharp dry friction is at a reversal."""
 
 
 VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED
 """The flags of a constraint that was not kept."""
 
-FAILED = VIOLATED | Status.NOT_FINITE | Status.STEP_TOO_LARGE | Status.INFEASIBLE_REFERENCE | Status.INADMISSIBLE_DRAW
+FAILED = (
+    VIOLATED
+    | Status.NOT_FINITE
+    | Status.STEP_TOO_LARGE
+    | Status.INFEASIBLE_REFERENCE
+    | Status.INADMISSIBLE_DRAW
+)
 """The flags that make a run one that did not do its job."""
 
 UNTRUSTED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 """The flags of a run whose numbers say nothing: no loss and no certificate is made of them."""
 
 VELOCITY_LIMIT = 1e4
-"""rad/s (or m/s).  No robot moves so; beyond it a run has diverged, and stopping there keeps every number finite in
-float32, so that neither a batch nor its gradient meets an infinity."""
+"""rad/s (or m/s).  No robot moves so; beyond it a run has diverged, and stopping there keeps every
+number finite in float32, so that neither a batch nor its gradient meets an infinity."""
 
 WORDS = {
     Status.BOUND_VIOLATED: "a bound was violated",
@@ -80,7 +101,9 @@ WORDS = {
     Status.VELOCITY_VIOLATED: "a velocity bound was violated",
     Status.REGION_VIOLATED: "a region was left",
     Status.FILTER_INFEASIBLE: "the safety filter's conditions could not all be met",
-    Status.INFINITE_SLOPE: "a derivative of the loop is infinite, or nearly so, at an isolated instant",
+    Status.INFINITE_SLOPE: (
+        "a derivative of the loop is infinite, or nearly so, at an isolated instant"
+    ),
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
 """What each flag says, in the order in which it is told."""

@@ -16,7 +16,8 @@ def as_text(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) 
 
     Args:
       rows: cells, as many in each row; the heading is the first.
-      left: numbers of the columns that begin at the left, the others end at the right; None for all.
+      left: numbers of the columns that begin at the left, the others end at the right; None for
+        all.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
 
@@ -26,7 +27,9 @@ def as_text(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) 
     return ["  ".join(cell(i, text) for i, text in enumerate(row)).rstrip() for row in rows]
 
 
-def as_html(heading: Sequence[str], rows: Iterable[Sequence[str]], bold: Collection[int] = ()) -> str:
+def as_html(
+    heading: Sequence[str], rows: Iterable[Sequence[str]], bold: Collection[int] = ()
+) -> str:
     """The rows as an HTML table.
 
     Args:
@@ -38,7 +41,11 @@ def as_html(heading: Sequence[str], rows: Iterable[Sequence[str]], bold: Collect
     body = []
     for i, row in enumerate(rows):
         weight = ' style="font-weight:bold"' if i in bold else ""
-        body.append(f"<tr{weight}>" + "".join(f'<td style="text-align:left">{html.escape(x)}</td>' for x in row) + "</tr>")
+        body.append(
+            f"<tr{weight}>"
+            + "".join(f'<td style="text-align:left">{html.escape(x)}</td>' for x in row)
+            + "</tr>"
+        )
     return f"<table><tr>{head}</tr>{''.join(body)}</table>"
 
 

@@ -1,8 +1,8 @@
 """Parts of a scenario that change with time: what they are at an instant, and when they jump.
 
-A part that changes with time may have `at(t)`, which returns the part as it is at time t [s].  A part
-that is discontinuous in time declares the instants by `jump_times()`, and steps of a run are divided
-there.  Both methods are optional in every family, but for the `jump_times` of disturbances.
+A part that changes with time may have `at(t)`, which returns the part as it is at time t [s].  A
+part that is discontinuous in time declares the instants by `jump_times()`, and steps of a run are
+divided there.  Both methods are optional in every family, but for the `jump_times` of disturbances.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ def jump_times_of(name: str, part: Any, dtype: jax.typing.DTypeLike | None = Non
         times = jnp.asarray(part.jump_times(), dtype)
     except Exception as error:
         got = f"{type(error).__name__}: {checks.line(str(error))}"
-        remedy = "Their number may not depend on the numbers of the fields; return jnp.zeros(0) for none."
+        remedy = (
+            "Their number may not depend on the numbers of the fields; return jnp.zeros(0) for"
+            " none."
+        )
         raise checks.fail(f"{name}.jump_times()", got, expected, remedy) from error
     if times.ndim > 1 or not jnp.issubdtype(times.dtype, jnp.floating):
         raise checks.fail(f"{name}.jump_times()", times, expected)

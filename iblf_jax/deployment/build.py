@@ -1,4 +1,6 @@
-"""Compilers of C for what is exported: the system's, or the one that comes with `ziglang`, which also makes WebAssembly."""
+"""Compilers of C for what is exported: the system's, or the one that comes with `ziglang`, which
+also makes WebAssembly.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ MOST_OUTPUT = 2000
 
 
 def c_compiler() -> list[str]:
-    """The command of a C compiler: $CC if it is set, else cc, gcc, clang or ziglang's; ToolchainError if there is none."""
+    """The command of a C compiler: $CC if it is set, else cc, gcc, clang or ziglang's;
+    ToolchainError if there is none.
+    """
     wanted = os.environ.get("CC")
     for name in [wanted] if wanted else ["cc", "gcc", "clang"]:
         path = shutil.which(name)
@@ -26,20 +30,27 @@ def c_compiler() -> list[str]:
             return [path]
     if not wanted and has_ziglang():
         return zig()
-    raise ToolchainError("there is no C compiler" + (f" {wanted!r} ($CC)" if wanted else " (cc, gcc, clang; pip install ziglang has one)"))
+    raise ToolchainError(
+        "there is no C compiler"
+        + (f" {wanted!r} ($CC)" if wanted else " (cc, gcc, clang; pip install ziglang has one)")
+    )
 
 
 def zig() -> list[str]:
     """The command of ziglang's C compiler; ToolchainError if it is not installed."""
     if not has_ziglang():
-        raise ToolchainError('ziglang is not installed: pip install ziglang, or ".[export]" in a clone')
+        raise ToolchainError(
+            'ziglang is not installed: pip install ziglang, or ".[export]" in a clone'
+        )
     return list(ziglang("cc"))
 
 
 def build(command: Sequence[str], folder: Path) -> None:
     """Runs a compiler in a folder; ToolchainError with what it says if it fails."""
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ToolchainError(f"the C compiler could not be run: {error}") from None
     if done.returncode:
@@ -48,6 +59,8 @@ def build(command: Sequence[str], folder: Path) -> None:
 
 def fmi_platform() -> tuple[str, str]:
     """FMI 3.0's name of this platform, and how its shared libraries end."""
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
     system = platform.system().lower()
     return f"{machine}-{system}", {"windows": ".dll", "darwin": ".dylib"}.get(system, ".so")

@@ -1,7 +1,8 @@
-"""Parameters as a C struct whose fields are the paths of leaves; and what may stand in C's names, comments and strings.
+"""Parameters as a C struct whose fields are the paths of leaves; and what may stand in C's names,
+comments and strings.
 
-Nothing that comes from a file or a user's class reaches code unescaped: a name keeps letters, digits and underscores, a comment is a JSON
-string in ASCII that cannot end it.
+Nothing that comes from a file or a user's class reaches code unescaped: a name keeps letters,
+digits and underscores, a comment is a JSON string in ASCII that cannot end it.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ FILES = frozenset(
         all clean edit_cache help install m package package_source preinstall rebuild_cache test""",
     )
 )
-"""What no file may be called, in small letters: those beside it, headers of C, and targets and libraries of CMake."""
+"""What no file may be called, in small letters: those beside it, headers of C, and targets and
+libraries of CMake."""
 
 
 def identifier(name: str) -> str:
@@ -51,12 +53,20 @@ def identifier(name: str) -> str:
 
 
 def comment(text: str) -> str:
-    """Text that can stand in a C comment, whatever is in it: ASCII without the marks of comments, trigraphs or a line's end."""
-    return re.sub(r"\?(?=\?)", "? ", json.dumps(text)[1:-1].replace("*/", "* /").replace("/*", "/ *").replace("\\", "|"))
+    """Text that can stand in a C comment, whatever is in it: ASCII without the marks of comments,
+    trigraphs or a line's end.
+    """
+    return re.sub(
+        r"\?(?=\?)",
+        "? ",
+        json.dumps(text)[1:-1].replace("*/", "* /").replace("/*", "/ *").replace("\\", "|"),
+    )
 
 
 def number(x: float, is_float: bool) -> str:
-    """A C literal of exactly this number, as a float or a double; what is not finite is a name of `math.h`."""
+    """A C literal of exactly this number, as a float or a double; what is not finite is a name of
+    `math.h`.
+    """
     with np.errstate(over="ignore"):
         value = float(np.float32(x)) if is_float else float(x)
     if math.isnan(value):
@@ -91,7 +101,9 @@ class Parameters(NamedTuple):
 
     @staticmethod
     def of(scenario: Scenario, programs: Iterable[Program]) -> Parameters:
-        """Those of a scenario that any of the programs reads, as fields of a struct `p` points to."""
+        """Those of a scenario that any of the programs reads, as fields of a struct `p` points
+        to.
+        """
         read = {node.value for program in programs for node in program.nodes if node.op == "shared"}
         fields, numbers = list[Field](), list[str]()
         for leaf in parameters(scenario, named=False):
@@ -153,16 +165,30 @@ def _members(tree: dict[str, Any], depth: int, real: str, joints: Sequence[str])
     lines, indent = list[str](), "  " * depth
     for name, part in tree.items():
         if isinstance(part, Field):
-            of = f", joint by joint: {', '.join(map(str, joints))}" if joints and part.shape[:1] == (len(joints),) else ""
-            lines.append(f"{indent}{real} {name}{_index(part.shape)};  /* {comment(part.path)} [{comment(part.unit)}]{comment(of)} */")
+            of = (
+                f", joint by joint: {', '.join(map(str, joints))}"
+                if joints and part.shape[:1] == (len(joints),)
+                else ""
+            )
+            lines.append(
+                f"{indent}{real} {name}{_index(part.shape)};  /* {comment(part.path)}"
+                f" [{comment(part.unit)}]{comment(of)} */"
+            )
         else:
-            lines += [f"{indent}struct {{", *_members(part, depth + 1, real, joints), f"{indent}}} {name};"]
+            lines += [
+                f"{indent}struct {{",
+                *_members(part, depth + 1, real, joints),
+                f"{indent}}} {name};",
+            ]
     return lines
 
 
 def _initialiser(part: Any, is_float: bool, depth: int = 0) -> str:
     if isinstance(part, dict):
-        inner = ",\n".join(f"{'  ' * (depth + 1)}.{name} = {_initialiser(x, is_float, depth + 1)}" for name, x in part.items())
+        inner = ",\n".join(
+            f"{'  ' * (depth + 1)}.{name} = {_initialiser(x, is_float, depth + 1)}"
+            for name, x in part.items()
+        )
         return f"{{\n{inner}\n{'  ' * depth}}}"
     value = part.value if isinstance(part, Field) else part
     if value.ndim == 0:

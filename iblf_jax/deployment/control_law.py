@@ -1,7 +1,9 @@
-"""What a robot's computer runs once a period, as scalar programs: the start, and a sample of velocity filter, observer and law.
+"""What a robot's computer runs once a period, as scalar programs: the start, and a sample of
+velocity filter, observer and law.
 
-It is `closed_loop.answered`, with the sensor's velocity filter before it.  What an encoder does to a position (counts, offset, noise) the
-robot's own does.  Which leaves of the scenario the programs read decides what a user of the generated code can set.
+It is `closed_loop.answered`, with the sensor's velocity filter before it.  What an encoder does to
+a position (counts, offset, noise) the robot's own does.  Which leaves of the scenario the programs
+read decides what a user of the generated code can set.
 """
 
 from __future__ import annotations
@@ -86,7 +88,9 @@ def _at(scenario: Scenario, told: Told) -> Scenario:
     """The scenario, with the reference that it is told if it is."""
     if isinstance(told.q_d, tuple):
         return scenario
-    return dataclasses.replace(scenario, reference=GivenReference(told.t, told.q_d, told.dq_d, told.ddq_d))
+    return dataclasses.replace(
+        scenario, reference=GivenReference(told.t, told.q_d, told.dq_d, told.ddq_d)
+    )
 
 
 def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
@@ -95,7 +99,9 @@ def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
     q, dq = told.q, told.dq
     observer = stepping_observer(scenario).init(q, dq, scenario.model)
     filtered = () if velocity is None else velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
-    return Memory(scenario.controller.init(q, dq, scenario.setting), observer, filtered), scenario.model.gravity(q)
+    return Memory(
+        scenario.controller.init(q, dq, scenario.setting), observer, filtered
+    ), scenario.model.gravity(q)
 
 
 def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Outputs]:
@@ -103,8 +109,11 @@ def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Outp
     scenario, velocity, n = _at(scenario, told), _velocity(scenario), scenario.n
     dq, filtered = told.dq, ()
     if velocity is not None:
+        assert scenario.sampling is not None
         normal = jnp.zeros((velocity.draws, n), told.q.dtype)
-        dq, filtered = velocity.estimate(told.q, told.dq, normal, scenario.sampling.period, memory.velocity)  # type: ignore[union-attr]
+        dq, filtered = velocity.estimate(
+            told.q, told.dq, normal, scenario.sampling.period, memory.velocity
+        )
     answer = answered(scenario, told.t, Measurement(told.q, dq), memory.controller, memory.observer)
     command, tube = answer.command, scenario.setting.tube(told.t)
     infeasible = jnp.zeros((), bool)
@@ -128,7 +137,9 @@ def _velocity(scenario: Scenario) -> Any:
 
 
 class ControlLaw(NamedTuple):
-    """The programs of a scenario's law; leaves of the scenario are shared, numbers of `Told` are a lane's."""
+    """The programs of a scenario's law; leaves of the scenario are shared, numbers of `Told` are a
+    lane's.
+    """
 
     start: Program
     """Of `start`; its samples are the memory and the torque."""
@@ -153,10 +164,17 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
     """
     if not isinstance(scenario.sensor, Ideal) and not hasattr(scenario.sensor, "velocity"):
         kind = type(scenario.sensor).__name__
-        raise checks.fail("scenario.sensor", kind, "one with a field `velocity`, or sensors.Ideal()", "It says how q' follows from q.")
+        raise checks.fail(
+            "scenario.sensor",
+            kind,
+            "one with a field `velocity`, or sensors.Ideal()",
+            "It says how q' follows from q.",
+        )
     told = told_at(jnp.zeros((), scenario.initial.q.dtype), scenario.initial.q, told_reference)
     dtype = told.q.dtype
-    like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, told)[0])
+    like = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, told)[0]
+    )
     memory = as_floats(like, dtype)
 
     def first(scenario, told, carry, index):
@@ -168,7 +186,10 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
         return as_floats(memory, dtype), said
 
     begin, step = program_of(first, scenario, told, ()), program_of(one, scenario, told, memory)
-    reads = any(node.op == "lane" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n for node in step.nodes)
+    reads = any(
+        node.op == "lane" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n
+        for node in step.nodes
+    )
     return ControlLaw(begin, step, number_names(memory), reads)
 
 
@@ -179,7 +200,9 @@ def as_floats(memory: Any, dtype: Any) -> Any:
 
 def of_floats(memory: Any, like: Any) -> Any:
     """What `as_floats` was given, of the types of `like`."""
-    return jax.tree.map(lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), memory, like)
+    return jax.tree.map(
+        lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), memory, like
+    )
 
 
 def told_at(t: jax.Array, q: jax.Array, told_reference: bool) -> Told:
@@ -188,7 +211,8 @@ def told_at(t: jax.Array, q: jax.Array, told_reference: bool) -> Told:
 
 
 def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -> Program:
-    """The scalar program of `function(scenario, given, carry, index) -> (carry, results)`, written out.
+    """The scalar program of `function(scenario, given, carry, index) -> (carry, results)`, written
+    out.
 
     Args:
       function: what is computed.
@@ -202,12 +226,17 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
     trees = [jax.tree.structure(x) for x in (scenario, given, carry)]
 
     def on_leaves(shared, lane, carried, index):
-        parts = [jax.tree.unflatten(tree, x) for tree, x in zip(trees, (shared, lane, carried), strict=True)]
+        parts = [
+            jax.tree.unflatten(tree, x)
+            for tree, x in zip(trees, (shared, lane, carried), strict=True)
+        ]
         after, results = function(*parts, index)
         return jax.tree.leaves(after), jax.tree.leaves(results)
 
     shapes = [Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry)]
-    return written_out(lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program)
+    return written_out(
+        lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program
+    )
 
 
 def number_names(tree: Any) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """`cosimulate`: a scenario's law, sampled, against a robot that MuJoCo moves.
 
-Sensor, law, observer, actuator, delay and disturbance are those of `simulate`; plant and integrator are MuJoCo's.  The run goes step by
-step in Python; its samples, metrics and flags follow from the motion when it is over.
+Sensor, law, observer, actuator, delay and disturbance are those of `simulate`; plant and integrator
+are MuJoCo's.  The run goes step by step in Python; its samples, metrics and flags follow from the
+motion when it is over.
 """
 
 from __future__ import annotations
@@ -59,37 +60,45 @@ def cosimulate(
     seed: int = 0,
     film: str | Path | None = None,
 ) -> Rollout:
-    """Runs a scenario's law against a robot that MuJoCo moves, contacts and mechanical stops included.
+    """Runs a scenario's law against a robot that MuJoCo moves, contacts and mechanical stops
+    included.
 
         tau_k = law(t_k, sensor(q, q'))  once a period,   x' = MuJoCo(x, tau + disturbance)  between
 
-    The law knows the scenario's `model`; what MuJoCo knows besides (a payload, friction, a stop, a table) is uncertainty to it.  Of the
-    scenario's `plant` only the names of its joints and what a disturbance asks of it are used.  Torque changes when a command
-    arrives, also within a step.  A disturbance and an actuator go along with the stages of MuJoCo's integrator.  Joints have the
-    scenario's names in MuJoCo's model, or its order where the scenario's have none; other joints of the same arm are locked at their
-    reference, and a model's own drives of the arm are switched off.
+    The law knows the scenario's `model`; what MuJoCo knows besides (a payload, friction, a stop, a
+    table) is uncertainty to it.  Of the scenario's `plant` only the names of its joints and what a
+    disturbance asks of it are used.  Torque changes when a command arrives, also within a step.  A
+    disturbance and an actuator go along with the stages of MuJoCo's integrator.  Joints have the
+    scenario's names in MuJoCo's model, or its order where the scenario's have none; other joints of
+    the same arm are locked at their reference, and a model's own drives of the arm are switched
+    off.
 
     Args:
       scenario: the law and all around it, of n joints.
-      plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`.  A URDF's shapes whose mesh is not there are left out.
+      plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`.  A URDF's shapes
+        whose mesh is not there are left out.
       duration: length of the run [s], a whole number of steps.
       period: of the law [s]; the scenario's `sampling.period` if not given.
-      dt: step of MuJoCo [s], which divides the period; the model's own, or the next shorter one that does, if not given.
+      dt: step of MuJoCo [s], which divides the period; the model's own, or the next shorter one
+        that does, if not given.
       integrator: "RK4", "Euler", "implicit" or "implicitfast"; None for the model's own.
       locked: joint name -> position [rad or m], for joints of the model that are not to move.
-      record_every: record every so-many-th step; metrics and status cover every step whatever is recorded.
+      record_every: record every so-many-th step; metrics and status cover every step whatever is
+        recorded.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
       seed: fixes the noise of a sensor, as in `simulate`.
-      film: file to write the motion to, ".gif" or ".html": MuJoCo's picture where it can draw one and the arm has shapes, the arm's
-        skeleton otherwise.
+      film: file to write the motion to, ".gif" or ".html": MuJoCo's picture where it can draw one
+        and the arm has shapes, the arm's skeleton otherwise.
 
     Returns:
-      A `Rollout` as `simulate` gives.  Of MuJoCo's robot nothing is known but how it moves: `fastest_mode` is NaN, there is no
-      `numerical_error`, and no flag tells of too large a step or too long a period.
+      A `Rollout` as `simulate` gives.  Of MuJoCo's robot nothing is known but how it moves:
+      `fastest_mode` is NaN, there is no `numerical_error`, and no flag tells of too large a step or
+      too long a period.
 
     Raises:
-      ValueError: bad arguments, or joints that are not in MuJoCo's model; the message names the field, the value and the remedy.
+      ValueError: bad arguments, or joints that are not in MuJoCo's model; the message names the
+        field, the value and the remedy.
       SimulationError: with `throw`, when a bound was violated or the state ran away.
       ImportError: the extra `robots` is not installed.
 
@@ -104,7 +113,9 @@ def cosimulate(
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
     robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
     sampling: Any = scenario.sampling
-    own = float(sampling.period) / max(1, math.ceil(float(sampling.period) / robot.timestep - NEARLY))
+    own = float(sampling.period) / max(
+        1, math.ceil(float(sampling.period) / robot.timestep - NEARLY)
+    )
     dt = own if dt is None else checks.time_span("dt", dt)
     check_step(scenario, dt)
     steps = checks.whole_steps(duration, dt, dt_is_free=False)
@@ -120,7 +131,9 @@ def cosimulate(
 
 
 def _film_writer(path: str | Path) -> Callable:
-    """What writes a film there.  Matplotlib comes with it, so it is imported where a film is asked for."""
+    """What writes a film there.  Matplotlib comes with it, so it is imported where a film is asked
+    for.
+    """
     from iblf_jax.deployment.film import film_run
     from iblf_jax.plotting.animation import film_path
 
@@ -130,13 +143,20 @@ def _film_writer(path: str | Path) -> Callable:
 def check_single(scenario: Scenario) -> Scenario:
     """The scenario; ValueError for no scenario, a batch of them, or one of traced values."""
     if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
+        raise checks.fail(
+            "scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario."
+        )
     if np.ndim(scenario.initial.q) != 1:
         raise checks.fail(
-            "scenario", f"a batch, initial.q of shape {np.shape(scenario.initial.q)}", "one scenario", "Call it once for each."
+            "scenario",
+            f"a batch, initial.q of shape {np.shape(scenario.initial.q)}",
+            "one scenario",
+            "Call it once for each.",
         )
     if not checks.is_concrete(scenario):
-        raise checks.fail("scenario", "traced values", "numbers", "Call this outside of jit, vmap and grad.")
+        raise checks.fail(
+            "scenario", "traced values", "numbers", "Call this outside of jit, vmap and grad."
+        )
     return scenario
 
 
@@ -144,19 +164,27 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
     """The scenario, its law sampled with this period."""
     if period is None:
         if scenario.sampling is None:
-            raise checks.fail("period", None, "the period of the law [s]", "Outside of the package a law is sampled: period=1e-3.")
+            raise checks.fail(
+                "period",
+                None,
+                "the period of the law [s]",
+                "Outside of the package a law is sampled: period=1e-3.",
+            )
         return scenario
     period = checks.time_span("period", period)
     if scenario.sampling is None:
         return dataclasses.replace(scenario, sampling=Sampling(period))
     queue = max(scenario.sampling.queue, under_way(float(scenario.sampling.delay), period))
-    return dataclasses.replace(scenario, sampling=dataclasses.replace(scenario.sampling, period=period, queue=queue))
+    return dataclasses.replace(
+        scenario, sampling=dataclasses.replace(scenario.sampling, period=period, queue=queue)
+    )
 
 
 class _Motion(NamedTuple):
     """What has happened, row by row (R first), and sample by sample.
 
-    There is a row for each instant, and where torque or law signals jump one before the jump and one after it.
+    There is a row for each instant, and where torque or law signals jump one before the jump and
+    one after it.
     """
 
     t: Any
@@ -189,14 +217,22 @@ def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
 def _delivered(scenario: Scenario, t, q, dq, asked, state):
     """What the actuator delivers, and the torque with what disturbs."""
     delivered = as_at(scenario.actuator, t).deliver(asked, dq, state)
-    return delivered, delivered.tau + scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
+    return delivered, delivered.tau + scenario.disturbance.torque(
+        t, q, dq, at_time(scenario.plant, t), scenario.model
+    )
 
 
 def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: int) -> _Motion:
     """Moves the robot."""
     sampling: Any = scenario.sampling
-    period, delay, every = float(sampling.period), float(sampling.delay), round(float(sampling.period) / dt)
-    noise = noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else jnp.zeros(4, jnp.float32)
+    period, delay, every = (
+        float(sampling.period),
+        float(sampling.delay),
+        round(float(sampling.period) / dt),
+    )
+    noise = (
+        noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else jnp.zeros(4, jnp.float32)
+    )
     state, asked = initial_state(scenario), np.asarray(scenario.model.gravity(scenario.initial.q))
     plain = isinstance(scenario.actuator, Ideal) and isinstance(scenario.disturbance, Nothing)
     commands: list[np.ndarray] = []
@@ -242,7 +278,18 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
         if not plain:
             delivered, _ = _delivered(scenario, beside(t), q, dq, asked, stages.state)
             tau, limited = np.asarray(delivered.tau), np.asarray(delivered.limited)
-        return t, instant, q, dq, ddq, tau, limited, stages.state, len(commands) - 1, robot.data.qpos.copy()
+        return (
+            t,
+            instant,
+            q,
+            dq,
+            ddq,
+            tau,
+            limited,
+            stages.state,
+            len(commands) - 1,
+            robot.data.qpos.copy(),
+        )
 
     def change(until: float) -> None:
         """Takes up the commands that have arrived and the jumps that are over by then."""
@@ -267,7 +314,13 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
             if index > 0 and (due or arrives(now + near) or jumps(now + near)):
                 rows.append(row(now, False))
             if due:
-                state = _law(scenario, t, state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)), len(commands), noise)
+                state = _law(
+                    scenario,
+                    t,
+                    state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)),
+                    len(commands),
+                    noise,
+                )
                 states.append(state)
                 commands.append(np.asarray(state.held.commands[0]))
             change(now + near)
@@ -284,7 +337,9 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
                     rows.append(row(now, False))
                     change(now + near)
                     rows.append(row(now, False))
-    columns: list[Any] = [jax.tree.map(lambda *x: np.stack(x), *column) for column in zip(*rows, strict=True)]
+    columns: list[Any] = [
+        jax.tree.map(lambda *x: np.stack(x), *column) for column in zip(*rows, strict=True)
+    ]
     return _Motion._make([*columns, jax.tree.map(lambda *x: np.stack(x), *states), broken])
 
 
@@ -303,11 +358,15 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     return samples, folded(folds, samples), raised
 
 
-def _rollout(scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_every: int, method: str) -> Rollout:
+def _rollout(
+    scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_every: int, method: str
+) -> Rollout:
     """The motion as a run."""
     step_size = jnp.asarray(dt, scenario.initial.q.dtype)
     samples, results, raised = _observed(scenario, folds, step_size, motion)
-    status = np.bitwise_or.reduce(np.asarray(raised)) | (int(Status.NOT_FINITE) if motion.broken else 0)
+    status = np.bitwise_or.reduce(np.asarray(raised)) | (
+        int(Status.NOT_FINITE) if motion.broken else 0
+    )
     at = np.flatnonzero(motion.instant)[::record_every]
     recorded = jax.tree.map(lambda x: x[at], samples)
     states = jax.tree.map(lambda x: jnp.asarray(x[motion.sample[at]]), motion.states)

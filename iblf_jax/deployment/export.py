@@ -37,7 +37,8 @@ TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
 """Seconds of the run that the self-test compares with."""
 SAMPLES_AT_START = 3
-"""Samples of a law in a closed loop that are looked at before the loop is written: the first torque comes back by the observer."""
+"""Samples of a law in a closed loop that are looked at before the loop is written: the first torque
+comes back by the observer."""
 DECIMALS = 9
 LONGEST_STEP = 1e-3
 """Seconds of that run's steps, at most."""
@@ -85,29 +86,35 @@ def export(
 
         (tau_k, z_(k+1)) = law(t_k, y_k, z_k)
 
-    "c": law, observer and velocity filter as one C99 file and its header, without allocation, global state or anything but libm, with
-    `name_init` and `name_step`; gains and model are a struct whose fields are the paths of the leaves, filled in; a self-test with 20 s
-    of a simulated run; how to build it.  "fmu": the same law as `name.fmu`, FMI 3.0 for co-simulation, with the binary of this platform.
-    "fmu-loop": the whole closed loop as one.  "wasm": the whole closed loop as `name.wasm` for a browser, and `name.json`, the table of its
-    parameters and records.
+    "c": law, observer and velocity filter as one C99 file and its header, without allocation,
+    global state or anything but libm, with `name_init` and `name_step`; gains and model are a
+    struct whose fields are the paths of the leaves, filled in; a self-test with 20 s of a simulated
+    run; how to build it.  "fmu": the same law as `name.fmu`, FMI 3.0 for co-simulation, with the
+    binary of this platform. "fmu-loop": the whole closed loop as one.  "wasm": the whole closed
+    loop as `name.wasm` for a browser, and `name.json`, the table of its parameters and records.
 
     Args:
-      scenario: the law and all around it.  Of a law alone, what an encoder does to a position (counts, offset, noise), the actuator and the
-        delay are the robot's own, and are in the simulated run only.
+      scenario: the law and all around it.  Of a law alone, what an encoder does to a position
+        (counts, offset, noise), the actuator and the delay are the robot's own, and are in the
+        simulated run only.
       folder: where to write; made if it is not there, and files of these names are replaced.
       target: "c", "fmu", "fmu-loop" or "wasm".
-      period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop may do without.
+      period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop may do
+        without.
       dtype: numbers of the code, "double" or "float"; an FMU's are double.
       reference: of a law, "inside", as a function of time, or "told": q_d, q_d', q_d" are inputs.
-      name: what begins every name in the code, a C identifier; "iblf_law" or "iblf_loop" if not given.
+      name: what begins every name in the code, a C identifier; "iblf_law" or "iblf_loop" if not
+        given.
       dt, method, seed: of a closed loop, as in `simulate`.
 
     Returns:
       An `Exported`: files, sizes and operations of a call; prints as a table.
 
     Raises:
-      ValueError: bad arguments, what cannot be written out, or a law that yields no finite torque; the message says why.
-      ToolchainError: no compiler for an FMU (cc, gcc, clang) or for WebAssembly (`ziglang`, of the extra `export`), or it failed.
+      ValueError: bad arguments, what cannot be written out, or a law that yields no finite torque;
+        the message says why.
+      ToolchainError: no compiler for an FMU (cc, gcc, clang) or for WebAssembly (`ziglang`, of the
+        extra `export`), or it failed.
 
     Source: design of this package; FMI standard 3.0, Modelica Association, 2022.
     """
@@ -121,7 +128,12 @@ def export(
     if target.startswith("fmu") and dtype != "double":
         raise checks.fail("dtype", dtype, '"double" for an FMU', "FMI's own numbers are.")
     if is_loop and reference == "told":
-        raise checks.fail("reference", reference, '"inside" for a closed loop', "Only a law alone is told its reference.")
+        raise checks.fail(
+            "reference",
+            reference,
+            '"inside" for a closed loop',
+            "Only a law alone is told its reference.",
+        )
     check_single(scenario)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
@@ -134,28 +146,58 @@ def export(
             return _loop(scenario, folder, target, name, dt, method, seed)
         return _law(scenario, folder, target, name, reference == "told")
     except UnsupportedError as error:
-        raise checks.fail("scenario", f"what has no C ({error})", "a scenario whose operations are lowered") from None
+        raise checks.fail(
+            "scenario", f"what has no C ({error})", "a scenario whose operations are lowered"
+        ) from None
 
 
 def _law(scenario: Scenario, folder: Path, target: str, name: str, is_told: bool) -> Exported:
     joints = tuple(getattr(scenario.model, "joints", ()))
-    law = Law(scenario, control_law(scenario, is_told), name, is_told, vectors(scenario, is_told), joints, _as_file(scenario))
+    law = Law(
+        scenario,
+        control_law(scenario, is_told),
+        name,
+        is_told,
+        vectors(scenario, is_told),
+        joints,
+        _as_file(scenario),
+    )
     made = written(law)
     if target == "c":
         files = _written_to(folder, made.files)
     else:
         law_fmu(law, made, folder / f"{name}.fmu")
         files = (f"{name}.fmu",)
-    sizes = {"state": made.state_bytes, "parameters": made.parameter_bytes, "stack, without optimisation": made.stack_bytes}
-    return Exported(folder, target, files, made.operations, sizes, tuple(field.path for field in made.parameters.fields))
+    sizes = {
+        "state": made.state_bytes,
+        "parameters": made.parameter_bytes,
+        "stack, without optimisation": made.stack_bytes,
+    }
+    return Exported(
+        folder,
+        target,
+        files,
+        made.operations,
+        sizes,
+        tuple(field.path for field in made.parameters.fields),
+    )
 
 
-def _loop(scenario: Scenario, folder: Path, target: str, name: str, dt: float, method: str, seed: int) -> Exported:
+def _loop(
+    scenario: Scenario, folder: Path, target: str, name: str, dt: float, method: str, seed: int
+) -> Exported:
     check_step(scenario, dt)
     _check_start(scenario)
     loop = loop_program(scenario, method)
     made = loop_files(scenario, loop, name, method, tuple(getattr(scenario.plant, "joints", ())))
-    settings = [dt, *(np.asarray(noise_key(jax.random.key(seed)), float).tolist() if has_noise(scenario) else [])]
+    settings = [
+        dt,
+        *(
+            np.asarray(noise_key(jax.random.key(seed)), float).tolist()
+            if has_noise(scenario)
+            else []
+        ),
+    ]
     if target == "wasm":
         files = tuple(wasm_files(made, folder, settings))
     else:
@@ -163,7 +205,14 @@ def _loop(scenario: Scenario, folder: Path, target: str, name: str, dt: float, m
         files = (f"{name}.fmu",)
     width = loop.step.dtype.itemsize
     sizes = {"state": width * loop.size + 8, "parameters": width * made.parameters.size}
-    return Exported(folder, target, files, operations_of(loop.step), sizes, tuple(field.path for field in made.parameters.fields))
+    return Exported(
+        folder,
+        target,
+        files,
+        operations_of(loop.step),
+        sizes,
+        tuple(field.path for field in made.parameters.fields),
+    )
 
 
 def checked_name(name: Any, default: str) -> str:
@@ -193,7 +242,10 @@ def _available(dtype: str) -> str:
     wanted = TYPES[dtype]
     if jax.dtypes.canonicalize_dtype(wanted) != wanted:
         raise checks.fail(
-            "dtype", dtype, '"float", as JAX computes in float32 here', 'Call jax.config.update("jax_enable_x64", True) first.'
+            "dtype",
+            dtype,
+            '"float", as JAX computes in float32 here',
+            'Call jax.config.update("jax_enable_x64", True) first.',
         )
     return wanted
 
@@ -225,15 +277,18 @@ def vectors(scenario: Scenario, told_reference: bool) -> Vectors:
     asked = Told(t, *(_rounded(x, samples, dtype) for x in (run.measured.q, run.measured.dq)))
     first = Told(t[:1], scenario.initial.q[None], scenario.initial.dq[None])
     if told_reference:
-        asked, first = ((Told(*x[:3], *(_rounded(y, samples, dtype) for y in _reference(scenario, x.t)))) for x in (asked, first))
+        asked, first = (
+            (Told(*x[:3], *(_rounded(y, samples, dtype) for y in _reference(scenario, x.t))))
+            for x in (asked, first)
+        )
     first = jax.tree.map(lambda x: x[0], first)
     torques = np.asarray(_answers(scenario, first, asked))
     _check_answers(scenario, first, asked, torques, " of the simulated run")
     status = int(run.status)
     if status & int(FAILED | Status.SAMPLING_TOO_SLOW):
         notices.warn(
-            f"the simulated run with this law every {period:g} s: {describe(status)}. What is written is that law; "
-            "ij.recommended_period(scenario) says how long a period may be."
+            f"the simulated run with this law every {period:g} s: {describe(status)}. What is"
+            " written is that law; ij.recommended_period(scenario) says how long a period may be."
         )
     tau = torques[::CHECKED]
     given = tuple(np.asarray(x) for x in asked[3:]) if told_reference else ()
@@ -241,8 +296,12 @@ def vectors(scenario: Scenario, told_reference: bool) -> Vectors:
     return Vectors(begin, np.asarray(asked.q), np.asarray(asked.dq), given, tau)
 
 
-def _check_answers(scenario: Scenario, first: Told, asked: Told, torques: np.ndarray, where: str) -> None:
-    """Refuses a law that yields no numbers, from its torques (K, n) at K samples; ValueError says why and `where`."""
+def _check_answers(
+    scenario: Scenario, first: Told, asked: Told, torques: np.ndarray, where: str
+) -> None:
+    """Refuses a law that yields no numbers, from its torques (K, n) at K samples; ValueError says
+    why and `where`.
+    """
     wrong = ~np.isfinite(torques).all(axis=1)
     if not wrong.any():
         return
@@ -267,8 +326,12 @@ def _check_start(scenario: Scenario) -> None:
 
 @jax.jit
 def _first_torque(scenario: Scenario) -> jax.Array:
-    """The torque of a law that is not sampled at t = 0, (1, n) [N m]; what it accelerates a joint by where that is not finite."""
-    rate, found = evaluate(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
+    """The torque of a law that is not sampled at t = 0, (1, n) [N m]; what it accelerates a joint
+    by where that is not finite.
+    """
+    rate, found = evaluate(
+        scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
+    )
     return jnp.where(jnp.isfinite(rate.dq), found.tau, rate.dq)[None]
 
 

@@ -1,4 +1,6 @@
-"""The motion of a run against MuJoCo as a film: MuJoCo's own picture where it can draw one, the arm's skeleton otherwise."""
+"""The motion of a run against MuJoCo as a film: MuJoCo's own picture where it can draw one, the
+arm's skeleton otherwise.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,13 @@ SIZE = (480, 640)
 SHOWN_GROUPS = 3
 """Groups of shapes that MuJoCo draws unasked: the first ones."""
 AMBIENT, DIFFUSE = 0.5, 0.6
-"""Of the camera's lamp, at least, in a model without lights: MuJoCo's own leaves a grey arm nearly black."""
+"""Of the camera's lamp, at least, in a model without lights: MuJoCo's own leaves a grey arm nearly
+black."""
 
 
-def film_run(run: Rollout, robot: MujocoPlant, positions: np.ndarray, dt: float, path: Path) -> Path:
+def film_run(
+    run: Rollout, robot: MujocoPlant, positions: np.ndarray, dt: float, path: Path
+) -> Path:
     """Writes the film of a run.
 
     Args:
@@ -40,27 +45,43 @@ def film_run(run: Rollout, robot: MujocoPlant, positions: np.ndarray, dt: float,
         return animate(run, path, FPS)
     times = frame_times((len(positions) - 1) * dt, FPS)
     with renderer:
-        pictures = [Image.fromarray(x) for x in _pictures(renderer, robot, positions[np.round(times / dt).astype(int)])]
+        pictures = [
+            Image.fromarray(x)
+            for x in _pictures(renderer, robot, positions[np.round(times / dt).astype(int)])
+        ]
     return write_film(pictures, path, FPS)
 
 
 def _renderer(robot: MujocoPlant) -> Any:
     """MuJoCo's renderer; None where nothing can be drawn, or nothing of the arm can be seen."""
-    return robot.mujoco.Renderer(robot.model, *SIZE) if has_shapes(robot.model) and _can_draw() else None
+    return (
+        robot.mujoco.Renderer(robot.model, *SIZE)
+        if has_shapes(robot.model) and _can_draw()
+        else None
+    )
 
 
 def has_shapes(model: Any) -> bool:
-    """Whether MuJoCo's picture of a model has something that moves: the arm of a URDF whose meshes are not there has no shape."""
+    """Whether MuJoCo's picture of a model has something that moves: the arm of a URDF whose meshes
+    are not there has no shape.
+    """
     seen = (model.geom_group < SHOWN_GROUPS) & (model.geom_rgba[:, 3] > 0)
     return bool(np.any(model.body_weldid[model.geom_bodyid[seen]] > 0))
 
 
 @cache
 def _can_draw() -> bool:
-    """Whether MuJoCo can draw on this machine, tried in a process of its own: without a display, the second try ends the process."""
+    """Whether MuJoCo can draw on this machine, tried in a process of its own: without a display,
+    the second try ends the process.
+    """
     words = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>')).render()"
     try:
-        return subprocess.run([sys.executable, "-c", words], capture_output=True, timeout=60).returncode == 0
+        return (
+            subprocess.run(
+                [sys.executable, "-c", words], capture_output=True, timeout=60
+            ).returncode
+            == 0
+        )
     except (OSError, subprocess.TimeoutExpired):
         return False
 
@@ -73,5 +94,8 @@ def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Itera
         renderer.update_scene(data)
         if not robot.model.nlight:
             lamp = renderer.scene.lights[0]
-            lamp.ambient, lamp.diffuse = np.maximum(lamp.ambient, AMBIENT), np.maximum(lamp.diffuse, DIFFUSE)
+            lamp.ambient, lamp.diffuse = (
+                np.maximum(lamp.ambient, AMBIENT),
+                np.maximum(lamp.diffuse, DIFFUSE),
+            )
         yield renderer.render().copy()

@@ -1,4 +1,6 @@
-"""A law or a closed loop as an FMU: FMI 3.0 for co-simulation, with the binary of this platform and its sources."""
+"""A law or a closed loop as an FMU: FMI 3.0 for co-simulation, with the binary of this platform and
+its sources.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,13 @@ from iblf_jax.deployment.write_loop import WrittenLoop
 from iblf_jax.simulation.scenario import Scenario
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
-BASE = {"rad": (0, 0, 0, 1), "m": (0, 1, 0, 0), "s": (0, 0, 1, 0), "kg": (1, 0, 0, 0), "N": (1, 1, -2, 0)}
+BASE = {
+    "rad": (0, 0, 0, 1),
+    "m": (0, 1, 0, 0),
+    "s": (0, 0, 1, 0),
+    "kg": (1, 0, 0, 0),
+    "N": (1, 1, -2, 0),
+}
 """Exponents of kg, m, s, rad."""
 FIXED = ("sampling.period",)
 """Parameters that the FMU is built for."""
@@ -39,7 +47,9 @@ class Variable(NamedTuple):
 
 
 def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
-    """Exponents of kg, m, s, rad of a unit such as "N m s/rad" or "kg m^2"; None for what is no product of these."""
+    """Exponents of kg, m, s, rad of a unit such as "N m s/rad" or "kg m^2"; None for what is no
+    product of these.
+    """
     found = [0, 0, 0, 0]
     above, _, below = unit.partition("/")
     for sign, words in ((1, above), (-1, below)):
@@ -60,8 +70,13 @@ def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
     start = [np.asarray(x, float) for x in law.vectors.first]
     told = zip(REFERENCE, ("rad", "rad/s", "rad/s^2"), strict=True) if law.told_reference else ()
     names = [("q", "rad"), ("dq", "rad/s"), *told]
-    inputs = [Variable(name, "input", unit, (n,), x) for (name, unit), x in zip(names, start, strict=True)]
-    outputs = [Variable(name, "output", unit, (n,)) for name, unit in (("tau", "N m"), ("alpha", "rad/s"), ("f_hat", "N m"))]
+    inputs = [
+        Variable(name, "input", unit, (n,), x) for (name, unit), x in zip(names, start, strict=True)
+    ]
+    outputs = [
+        Variable(name, "output", unit, (n,))
+        for name, unit in (("tau", "N m"), ("alpha", "rad/s"), ("f_hat", "N m"))
+    ]
     return [*_settable(parameters), *inputs, *outputs, Variable("status", "output", "1", ())]
 
 
@@ -73,12 +88,20 @@ def loop_variables(scenario: Scenario, parameters: Parameters) -> list[Variable]
 
 def _settable(parameters: Parameters) -> list[Variable]:
     return [
-        Variable(field.path, "constant" if field.path in FIXED else "parameter", field.unit, field.shape, np.asarray(field.value, float))
+        Variable(
+            field.path,
+            "constant" if field.path in FIXED else "parameter",
+            field.unit,
+            field.shape,
+            np.asarray(field.value, float),
+        )
         for field in parameters.fields
     ]
 
 
-def model_description(name: str, title: str, token: str, step: float, variables: Sequence[Variable]) -> str:
+def model_description(
+    name: str, title: str, token: str, step: float, variables: Sequence[Variable]
+) -> str:
     """The XML that says what an FMU is."""
     root = Xml.Element(
         "fmiModelDescription",
@@ -92,7 +115,9 @@ def model_description(name: str, title: str, token: str, step: float, variables:
     known = {"s": BASE["s"]} | {unit: x for unit, x in units.items() if x is not None and any(x)}
     definitions = Xml.SubElement(root, "UnitDefinitions")
     for unit, powers in sorted(known.items()):
-        base: dict[str, Any] = {k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p}
+        base: dict[str, Any] = {
+            k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p
+        }
         Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", **base)
     categories = Xml.SubElement(root, "LogCategories")
     for category in ("logStatusWarning", "logStatusError"):
@@ -100,7 +125,14 @@ def model_description(name: str, title: str, token: str, step: float, variables:
     Xml.SubElement(root, "DefaultExperiment", startTime="0", stopTime="20", stepSize=repr(step))
     listed = Xml.SubElement(root, "ModelVariables")
     Xml.SubElement(
-        listed, "Float64", name="time", valueReference="0", causality="independent", variability="continuous", unit="s", description="time"
+        listed,
+        "Float64",
+        name="time",
+        valueReference="0",
+        causality="independent",
+        variability="continuous",
+        unit="s",
+        description="time",
     )
     for k, v in enumerate(variables, start=1):
         kinds: dict[str, Any] = {
@@ -109,9 +141,15 @@ def model_description(name: str, title: str, token: str, step: float, variables:
             "input": {"causality": "input", "variability": "continuous"},
             "output": {"causality": "output", "variability": "discrete"},
         }[v.causality]
-        first: dict[str, Any] = {} if v.start is None else {"start": " ".join(map(repr, np.ravel(v.start).tolist())).replace("inf", "INF")}
+        first: dict[str, Any] = (
+            {}
+            if v.start is None
+            else {"start": " ".join(map(repr, np.ravel(v.start).tolist())).replace("inf", "INF")}
+        )
         unit_of: dict[str, Any] = {"unit": v.unit} if v.unit in known else {}
-        element = Xml.SubElement(listed, "Float64", name=v.name, valueReference=str(k), **kinds, **unit_of, **first)
+        element = Xml.SubElement(
+            listed, "Float64", name=v.name, valueReference=str(k), **kinds, **unit_of, **first
+        )
         for size in v.shape:
             Xml.SubElement(element, "Dimension", start=str(size))
     structure = Xml.SubElement(root, "ModelStructure")
@@ -120,20 +158,35 @@ def model_description(name: str, title: str, token: str, step: float, variables:
         for reference in outputs:
             Xml.SubElement(structure, kind, valueReference=reference)
     Xml.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, encoding="unicode") + "\n"
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, encoding="unicode") + "\n"
+    )
 
 
-def source_of(name: str, title: str, token: str, variables: Sequence[Variable], block: str, values: dict[str, Any]) -> str:
+def source_of(
+    name: str,
+    title: str,
+    token: str,
+    variables: Sequence[Variable],
+    block: str,
+    values: dict[str, Any],
+) -> str:
     """The C around a law or a loop."""
     table, place, starts = list[str](), 0, list[str]()
     for v in variables:
         size = math.prod(v.shape)
         table.append(f"  {{{place}, {size}, {int(v.causality in ('parameter', 'input'))}}},")
         place += size
-    counts = {kind: sum(math.prod(v.shape) for v in variables if v.causality in kinds) for kind, kinds in _KINDS.items()}
+    counts = {
+        kind: sum(math.prod(v.shape) for v in variables if v.causality in kinds)
+        for kind, kinds in _KINDS.items()
+    }
     begin = 0
     for v in (v for v in variables if v.causality == "input"):
-        starts += [f"  f->inputs[{begin + i}] = {x!r};\n" for i, x in enumerate(np.ravel(np.asarray(v.start)).tolist())]
+        starts += [
+            f"  f->inputs[{begin + i}] = {x!r};\n"
+            for i, x in enumerate(np.ravel(np.asarray(v.start)).tolist())
+        ]
         begin += math.prod(v.shape)
     return filled(
         "fmi3.c",
@@ -176,19 +229,48 @@ def law_fmu(law: Law, made: Written, path: Path) -> None:
         "dq": f"q + {n}" if law.programs.reads_velocity else "NULL",
     }  # fmt: skip
     sources = {file: made.files[file] for file in (f"{name}.h", f"{name}.c")}
-    _package(path, name, title_of(law.scenario), step, law_variables(law, made.parameters), "fmu_law.c", values, sources)
+    _package(
+        path,
+        name,
+        title_of(law.scenario),
+        step,
+        law_variables(law, made.parameters),
+        "fmu_law.c",
+        values,
+        sources,
+    )
 
 
 def loop_fmu(scenario: Scenario, made: WrittenLoop, settings: Sequence[float], path: Path) -> None:
     """Writes a closed loop as an FMU; raises ToolchainError."""
     name = made.values["name"]
-    values = {"name": name, "step": repr(settings[0]), "setting_values": ", ".join(map(repr, settings))}
+    values = {
+        "name": name,
+        "step": repr(settings[0]),
+        "setting_values": ", ".join(map(repr, settings)),
+    }
     title = f"the closed loop of {made.values['title']}"
-    _package(path, name, title, settings[0], loop_variables(scenario, made.parameters), "fmu_loop.c", values, made.files)
+    _package(
+        path,
+        name,
+        title,
+        settings[0],
+        loop_variables(scenario, made.parameters),
+        "fmu_loop.c",
+        values,
+        made.files,
+    )
 
 
 def _package(
-    path: Path, name: str, title: str, step: float, variables: list[Variable], block: str, values: dict[str, Any], sources: dict[str, str]
+    path: Path,
+    name: str,
+    title: str,
+    step: float,
+    variables: list[Variable],
+    block: str,
+    values: dict[str, Any],
+    sources: dict[str, str],
 ) -> None:
     """The archive: description, sources, and the binary that is built of them here."""
     text = "\n".join(sources[key] for key in sorted(sources))
@@ -198,10 +280,15 @@ def _package(
     with tempfile.TemporaryDirectory() as folder:
         for file, content in sources.items():
             (Path(folder) / file).write_text(content)
-        build([*c_compiler(), *FLAGS, f"{name}.c", f"{name}_fmi3.c", "-lm", "-o", f"{name}{suffix}"], Path(folder))
+        build(
+            [*c_compiler(), *FLAGS, f"{name}.c", f"{name}_fmi3.c", "-lm", "-o", f"{name}{suffix}"],
+            Path(folder),
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", model_description(name, title, token, step, variables))
+            archive.writestr(
+                "modelDescription.xml", model_description(name, title, token, step, variables)
+            )
             archive.write(Path(folder) / f"{name}{suffix}", f"binaries/{system}/{name}{suffix}")
             for file, content in sources.items():
                 archive.writestr(f"sources/{file}", content)

@@ -1,4 +1,6 @@
-"""`explore`: a scenario's closed loop with sliders, as one page that computes in the browser; in notebooks the same page in a frame."""
+"""`explore`: a scenario's closed loop with sliders, as one page that computes in the browser; in
+notebooks the same page in a frame.
+"""
 
 from __future__ import annotations
 
@@ -49,15 +51,25 @@ class Page:
     def _repr_html_(self) -> str:
         if self.fallback:
             return self.fallback
-        return f'<iframe srcdoc="{html.escape(self.text, quote=True)}" style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
+        return (
+            f'<iframe srcdoc="{html.escape(self.text, quote=True)}" style="width: 100%; height:'
+            f' {HEIGHT}px; border: 0"></iframe>'
+        )
 
 
 @notices.each_warning_once
-def explore(scenario: Scenario | Mapping[str, Scenario], *, duration: float = 10.0, dt: float = 1e-3, method: str = "rk4") -> Page:
-    """A page on which gains, start and bounds are moved by sliders, and the run follows while they move.
+def explore(
+    scenario: Scenario | Mapping[str, Scenario],
+    *,
+    duration: float = 10.0,
+    dt: float = 1e-3,
+    method: str = "rk4",
+) -> Page:
+    """A page on which gains, start and bounds are moved by sliders, and the run follows while they
+    move.
 
-    The closed loop runs in the browser, as WebAssembly (`export`), without Python.  Where `ziglang` is not installed a notebook shows the
-    scenario's table and figure instead.
+    The closed loop runs in the browser, as WebAssembly (`export`), without Python.  Where `ziglang`
+    is not installed a notebook shows the scenario's table and figure instead.
 
     Args:
       scenario: what runs; or several by name, to choose from.  Each keeps its own sliders.
@@ -123,12 +135,28 @@ def _loop(scenario: Scenario, dt: float, method: str) -> dict[str, Any]:
 
 
 def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
-    """Ends of a parameter's sliders: of gains one for all joints, of starts and bounds one a joint; nothing for others."""
+    """Ends of a parameter's sliders: of gains one for all joints, of starts and bounds one a joint;
+    nothing for others.
+    """
     path, values = row["path"], np.ravel(row["value"])
     if len(row["shape"]) > 1 or any(x is None for x in values):
         return {}
     if path.startswith(("controller.", "observer.")) and sign_at(scenario, path) == "positive":
-        return {"slider": [[float(values[0]) / SPAN, float(values[0]) * SPAN]], "positive": True, "each": False}
-    if path in ("initial.q", "bounds.lower.offset", "bounds.upper.offset", "bounds.lower.value", "bounds.upper.value"):
-        return {"slider": [[float(x) - ROOM, float(x) + ROOM] for x in values], "positive": False, "each": True}
+        return {
+            "slider": [[float(values[0]) / SPAN, float(values[0]) * SPAN]],
+            "positive": True,
+            "each": False,
+        }
+    if path in (
+        "initial.q",
+        "bounds.lower.offset",
+        "bounds.upper.offset",
+        "bounds.lower.value",
+        "bounds.upper.value",
+    ):
+        return {
+            "slider": [[float(x) - ROOM, float(x) + ROOM] for x in values],
+            "positive": False,
+            "each": True,
+        }
     return {}

@@ -1,4 +1,6 @@
-"""A step of a whole closed loop as a scalar program: robot, disturbance, sensor, law, observer, actuator, as `simulate` steps them."""
+"""A step of a whole closed loop as a scalar program: robot, disturbance, sensor, law, observer,
+actuator, as `simulate` steps them.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,17 @@ from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
-OUTPUTS = {"q": "rad", "dq": "rad/s", "tau": "N m", "e1": "rad", "q_d": "rad", "lower": "rad", "upper": "rad", "f": "N m", "f_hat": "N m"}
+OUTPUTS = {
+    "q": "rad",
+    "dq": "rad/s",
+    "tau": "N m",
+    "e1": "rad",
+    "q_d": "rad",
+    "lower": "rad",
+    "upper": "rad",
+    "f": "N m",
+    "f_hat": "N m",
+}
 """What a step tells of its start, one number a joint: name -> unit."""
 OF_SAMPLE = {"f": "disturbance", "f_hat": "disturbance_estimate"}
 """Outputs that a `Sample` calls otherwise."""
@@ -32,7 +44,9 @@ class Settings(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """The programs of a closed loop; leaves of the scenario are shared, numbers of `Settings` are a lane's."""
+    """The programs of a closed loop; leaves of the scenario are shared, numbers of `Settings` are a
+    lane's.
+    """
 
     start: Program
     """Its samples are the memory before the first step."""
@@ -61,14 +75,29 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
 
     def step(scenario, settings, carry, index):
         state, status = of_floats(carry, like)
-        noise = settings.noise if has_noise(scenario) else () if scenario.sampling is None else jnp.zeros((4,), dtype)
+        noise = (
+            settings.noise
+            if has_noise(scenario)
+            else ()
+            if scenario.sampling is None
+            else jnp.zeros((4,), dtype)
+        )
         inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), noise)
         size = accuracy.places(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
-        done = advance(inputs, blank._replace(state=state, status=status), index, method, Form(scalar=True))
+        done = advance(
+            inputs, blank._replace(state=state, status=status), index, method, Form(scalar=True)
+        )
         told = [getattr(done.sample, OF_SAMPLE.get(name, name)) for name in OUTPUTS]
-        return as_floats((done.carry.state, done.carry.status), dtype), (*told, done.carry.status.astype(dtype))
+        return as_floats((done.carry.state, done.carry.status), dtype), (
+            *told,
+            done.carry.status.astype(dtype),
+        )
 
     shapes = as_floats(like, dtype)
     begin = program_of(first, scenario, settings, ())
-    return Loop(begin, program_of(step, scenario, settings, shapes), sum(x.size for x in jax.tree.leaves(shapes)))
+    return Loop(
+        begin,
+        program_of(step, scenario, settings, shapes),
+        sum(x.size for x in jax.tree.leaves(shapes)),
+    )

@@ -1,7 +1,8 @@
 """A robot that MuJoCo moves: with its own model, contacts, stops and integrator.
 
-The joints of a scenario are found in MuJoCo's model by their names, or by their order where the scenario's have none.  What else moves on
-the same arm, such as the fingers of a gripper, is locked as `robots.load` locks it; what stands apart moves freely.
+The joints of a scenario are found in MuJoCo's model by their names, or by their order where the
+scenario's have none.  What else moves on the same arm, such as the fingers of a gripper, is locked
+as `robots.load` locks it; what stands apart moves freely.
 """
 
 from __future__ import annotations
@@ -30,11 +31,19 @@ Push = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 class MujocoPlant:
     """A compiled model, of which some joints are driven."""
 
-    def __init__(self, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float], integrator: str | None) -> None:
+    def __init__(
+        self,
+        plant: Any,
+        names: tuple[str, ...],
+        n: int,
+        locked: Mapping[str, float],
+        integrator: str | None,
+    ) -> None:
         """What `cosimulate` is given.
 
         Args:
-          plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`; the last two stay as they are.
+          plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`; the last two stay
+            as they are.
           names: of the joints to drive; none to take the model's in their order.
           n: how many there are.
           locked: joint -> position [rad or m].
@@ -50,7 +59,12 @@ class MujocoPlant:
             joints, others = _joints(Tree(model, mujoco, "world", {}), names, n, locked)
             if others:
                 remedy = "Give the file or an MjSpec, in which they can be locked."
-                raise checks.fail("plant", Shown("an MjModel in which more moves"), f"one whose arm has {n} joints that move", remedy)
+                raise checks.fail(
+                    "plant",
+                    Shown("an MjModel in which more moves"),
+                    f"one whose arm has {n} joints that move",
+                    remedy,
+                )
         else:
             model, joints = _locked(mujoco, _specification(mujoco, plant), plant, names, n, locked)
         self.model = model
@@ -86,7 +100,9 @@ class MujocoPlant:
 
     @contextmanager
     def driven(self, push: Push) -> Iterator[None]:
-        """Inside, MuJoCo asks `push` for the torque whenever it needs one: at every stage of its integrator."""
+        """Inside, MuJoCo asks `push` for the torque whenever it needs one: at every stage of its
+        integrator.
+        """
         mujoco, before = self.mujoco, self.mujoco.get_mjcb_control()
 
         def control(model: Any, data: Any) -> None:
@@ -116,7 +132,11 @@ class MujocoPlant:
 class Stages:
     """What has a rate of its own, integrated along with MuJoCo's stages."""
 
-    def __init__(self, rate: Callable[[float, np.ndarray, np.ndarray, Any], tuple[np.ndarray, Any]], state: Any) -> None:
+    def __init__(
+        self,
+        rate: Callable[[float, np.ndarray, np.ndarray, Any], tuple[np.ndarray, Any]],
+        state: Any,
+    ) -> None:
         """`rate` gives torque and rate of the state at a time, q, q' and state."""
         self.rate, self.state = rate, state
         self.begin(0.0)
@@ -140,7 +160,11 @@ class Stages:
     def moved(self, h: float, slopes: list, weights: tuple[float, ...]) -> Any:
         """The state after h [s]."""
         steps = [h * weight for weight in weights[: len(slopes)]]
-        return jax.tree.map(lambda x, *rates: x + sum(w * rate for w, rate in zip(steps, rates, strict=True)), self.state, *slopes)
+        return jax.tree.map(
+            lambda x, *rates: x + sum(w * rate for w, rate in zip(steps, rates, strict=True)),
+            self.state,
+            *slopes,
+        )
 
 
 # ------------------------------------------------------------------------------------------------------- the model and its joints
@@ -159,7 +183,9 @@ def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
     of = {wraps.mjWRAP_JOINT: model.jnt_bodyid, wraps.mjWRAP_SITE: model.site_bodyid}
     for w in range(start, start + model.tendon_num[target]):
         if wraps(int(model.wrap_type[w])) != wraps.mjWRAP_PULLEY:
-            bodies.append(of.get(wraps(int(model.wrap_type[w])), model.geom_bodyid)[model.wrap_objid[w]])
+            bodies.append(
+                of.get(wraps(int(model.wrap_type[w])), model.geom_bodyid)[model.wrap_objid[w]]
+            )
     return bodies
 
 
@@ -168,7 +194,9 @@ def _specification(mujoco: Any, plant: Any) -> Any:
     if isinstance(plant, mujoco.MjSpec):
         return plant.copy()
     if not isinstance(plant, str | os.PathLike):
-        raise checks.fail("plant", plant, "the path of an MJCF or URDF, a mujoco.MjSpec or a mujoco.MjModel")
+        raise checks.fail(
+            "plant", plant, "the path of an MJCF or URDF, a mujoco.MjSpec or a mujoco.MjModel"
+        )
     root, path = read(plant, "plant"), Path(plant)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -181,15 +209,27 @@ def _specification(mujoco: Any, plant: Any) -> Any:
 
 def _refused(plant: Any, error: ValueError) -> ValueError:
     """What MuJoCo does not accept, in its words."""
-    name, words = plant if isinstance(plant, str | os.PathLike) else "plant", " ".join(str(error).split())
-    return ValueError(f"{name}: {words}" + (". Put the file where the model looks for it." if "opening file" in words else ""))
+    name, words = (
+        plant if isinstance(plant, str | os.PathLike) else "plant",
+        " ".join(str(error).split()),
+    )
+    return ValueError(
+        f"{name}: {words}"
+        + (". Put the file where the model looks for it." if "opening file" in words else "")
+    )
 
 
 def _without_missing_meshes(spec: Any, path: Path) -> None:
-    """Takes the shapes of a URDF whose files are not there out of it: its links have their weights from numbers."""
+    """Takes the shapes of a URDF whose files are not there out of it: its links have their weights
+    from numbers.
+    """
     folder = path.parent
     place = folder / spec.meshdir
-    missing = {mesh.name for mesh in spec.meshes if not (place / (Path(mesh.file).name if spec.strippath else mesh.file)).exists()}
+    missing = {
+        mesh.name
+        for mesh in spec.meshes
+        if not (place / (Path(mesh.file).name if spec.strippath else mesh.file)).exists()
+    }
     shapes = [geom for geom in spec.geoms if geom.meshname in missing]
     if shapes:
         reason = "as their meshes are not there: these touch nothing."
@@ -201,32 +241,50 @@ def _without_missing_meshes(spec: Any, path: Path) -> None:
             spec.delete(mesh)
 
 
-def _joints(tree: Tree, names: tuple[str, ...], n: int, locked: Mapping[str, float]) -> tuple[list[int], dict[int, float]]:
-    """The joints to drive, and where those stay that are locked: the given ones, and what else moves on the same arm."""
+def _joints(
+    tree: Tree, names: tuple[str, ...], n: int, locked: Mapping[str, float]
+) -> tuple[list[int], dict[int, float]]:
+    """The joints to drive, and where those stay that are locked: the given ones, and what else
+    moves on the same arm.
+    """
     m = tree.model
     held = {tree.joint(name): locked_position(name, position) for name, position in locked.items()}
     movable = [j for j in range(m.njnt) if m.jnt_type[j] in (HINGE, SLIDE) and j not in held]
     if names:
         for name in names:
             if name not in tree.joint_names:
-                raise unknown("plant", name, "a model that has the scenario's joints", tree.joint_names)
+                raise unknown(
+                    "plant", name, "a model that has the scenario's joints", tree.joint_names
+                )
         joints = [tree.joint_names.index(name) for name in names]
         for j in joints:
             if j in held:
-                raise checks.fail("locked", tree.joint_names[j], "joints that the scenario does not move")
+                raise checks.fail(
+                    "locked", tree.joint_names[j], "joints that the scenario does not move"
+                )
             if j not in movable:
-                raise checks.fail(f"joint {tree.joint_names[j]!r}", Shown("a free joint or a ball"), "a hinge or slide")
+                raise checks.fail(
+                    f"joint {tree.joint_names[j]!r}",
+                    Shown("a free joint or a ball"),
+                    "a hinge or slide",
+                )
     elif len(movable) != n:
         more = "Lock the others, or name the scenario's joints: robots.load does."
         remedy = more if len(movable) > n else "Only hinges and slides count."
-        raise checks.fail("plant", Shown(f"{len(movable)} joints that move"), f"{n}, as the scenario has", remedy)
+        raise checks.fail(
+            "plant", Shown(f"{len(movable)} joints that move"), f"{n}, as the scenario has", remedy
+        )
     else:
         joints = movable
     arm = {int(m.body_rootid[m.jnt_bodyid[j]]) for j in joints}
     for j in range(m.njnt):
         if j not in joints and j not in held and int(m.body_rootid[m.jnt_bodyid[j]]) in arm:
             if m.jnt_type[j] not in (HINGE, SLIDE):
-                raise checks.fail(f"joint {tree.joint_names[j]!r}", Shown("free or a ball"), "an arm on a base that stands still")
+                raise checks.fail(
+                    f"joint {tree.joint_names[j]!r}",
+                    Shown("free or a ball"),
+                    "an arm on a base that stands still",
+                )
             held[j] = float(m.qpos0[m.jnt_qposadr[j]])
     return joints, held
 
@@ -239,8 +297,12 @@ def _compiled(spec: Any, plant: Any) -> Any:
         raise _refused(plant, error) from None
 
 
-def _locked(mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float]) -> tuple[Any, list[int]]:
-    """The compiled model without the joints that are locked, their bodies where these hold them, and the numbers of the driven ones."""
+def _locked(
+    mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float]
+) -> tuple[Any, list[int]]:
+    """The compiled model without the joints that are locked, their bodies where these hold them,
+    and the numbers of the driven ones.
+    """
     spec.compiler.fusestatic = False
     whole = _compiled(spec, plant)
     joints, held = _joints(Tree(whole, mujoco, "world", {}), names, n, locked)
@@ -250,7 +312,9 @@ def _locked(mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, 
     for j, position in held.items():
         data.qpos[whole.jnt_qposadr[j]] = position
     mujoco.mj_kinematics(whole, data)
-    gone = _in_the_way(mujoco, spec, held)  # before any frame is added, with which the numbers of joints are lost
+    gone = _in_the_way(
+        mujoco, spec, held
+    )  # before any frame is added, with which the numbers of joints are lost
     for body in {int(whole.jnt_bodyid[j]) for j in held}:
         _weld(mujoco, whole, data, spec, body, held)
     for x in gone:
@@ -260,7 +324,9 @@ def _locked(mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, 
 
 
 def _in_the_way(mujoco: Any, spec: Any, held: dict[int, float]) -> list[Any]:
-    """The locked joints, and what cannot be without them: tendons over them, what couples, drives or senses these, keyframes."""
+    """The locked joints, and what cannot be without them: tendons over them, what couples, drives
+    or senses these, keyframes.
+    """
     gone = [joint for joint in spec.joints if joint.id in held]
     tendons = []
     for tendon in spec.tendons:
@@ -269,14 +335,27 @@ def _in_the_way(mujoco: Any, spec: Any, held: dict[int, float]) -> list[Any]:
             if not all(joint.id in held for joint in wrapped):
                 got = Shown("a tendon over a joint that is locked and one that moves")
                 raise checks.fail(
-                    f"tendon {tendon.name!r}", got, "one or the other", "Take it out of the model, or lock or drive all of its joints."
+                    f"tendon {tendon.name!r}",
+                    got,
+                    "one or the other",
+                    "Take it out of the model, or lock or drive all of its joints.",
                 )
             tendons.append(tendon)
     known = {x.name for x in gone} - {""}, {x.name for x in tendons} - {""}
     of_joints = {mujoco.mjtEq.mjEQ_JOINT: 0, mujoco.mjtEq.mjEQ_TENDON: 1}
-    coupled = [x for x in spec.equalities if x.type in of_joints and {x.name1, x.name2} & known[of_joints[x.type]]]
-    kinds = {mujoco.mjtTrn.mjTRN_JOINT: 0, mujoco.mjtTrn.mjTRN_JOINTINPARENT: 0, mujoco.mjtTrn.mjTRN_TENDON: 1}
-    driven = [x for x in spec.actuators if x.trntype in kinds and x.target in known[kinds[x.trntype]]]
+    coupled = [
+        x
+        for x in spec.equalities
+        if x.type in of_joints and {x.name1, x.name2} & known[of_joints[x.type]]
+    ]
+    kinds = {
+        mujoco.mjtTrn.mjTRN_JOINT: 0,
+        mujoco.mjtTrn.mjTRN_JOINTINPARENT: 0,
+        mujoco.mjtTrn.mjTRN_TENDON: 1,
+    }
+    driven = [
+        x for x in spec.actuators if x.trntype in kinds and x.target in known[kinds[x.trntype]]
+    ]
     return [*coupled, *driven, *spec.sensors, *spec.keys, *tendons, *gone]
 
 
@@ -288,12 +367,19 @@ def _weld(mujoco: Any, model: Any, data: Any, spec: Any, body: int, held: dict[i
         return
     element = spec.bodies[body]
     if not all(j in held for j in own):
-        got, remedy = "a locked joint beside one that moves", "Write each into a body of its own, or lock it at its reference."
-        raise checks.fail(f"body {element.name!r}", Shown(got), "joints that are locked alone", remedy)
+        got, remedy = (
+            "a locked joint beside one that moves",
+            "Write each into a body of its own, or lock it at its reference.",
+        )
+        raise checks.fail(
+            f"body {element.name!r}", Shown(got), "joints that are locked alone", remedy
+        )
     parent, back, turned = int(model.body_parentid[body]), np.zeros(4), np.zeros(4)
     mujoco.mju_negQuat(back, data.xquat[parent])
     mujoco.mju_mulQuat(turned, back, data.xquat[body])
     element.pos = data.xmat[parent].reshape(3, 3).T @ (data.xpos[body] - data.xpos[parent])
     element.quat, element.alt.type = turned, mujoco.mjtOrientation.mjORIENTATION_QUAT
-    if element.frame is not None:  # its place is in the parent now: a frame there that moves nothing takes the other's place
+    if (
+        element.frame is not None
+    ):  # its place is in the parent now: a frame there that moves nothing takes the other's place
         element.set_frame(spec.bodies[parent].add_frame())

@@ -20,7 +20,8 @@ from iblf_jax.kernels.program import INPUTS, Program
 from iblf_jax.simulation.scenario import Scenario
 
 SEGMENT = 500
-"""Operations of a function, at most: compilers' time grows with the square of its length, and so does its stack without optimisation."""
+"""Operations of a function, at most: compilers' time grows with the square of its length, and so
+does its stack without optimisation."""
 LONG = 16
 """Cost (`operations.OPERATIONS`) above which an operation is an elementary function."""
 REFERENCE = ("q_d", "dq_d", "ddq_d")
@@ -48,7 +49,16 @@ def operations_of(program: Program) -> Counter[str]:
     for node in program.nodes:
         if node.op not in INPUTS and node.op != "const":
             cost = OPERATIONS[node.op].cost
-            counts[roots.get(node.op, "sums, products and choices" if cost is not None and cost <= LONG else "elementary functions")] += 1
+            counts[
+                roots.get(
+                    node.op,
+                    (
+                        "sums, products and choices"
+                        if cost is not None and cost <= LONG
+                        else "elementary functions"
+                    ),
+                )
+            ] += 1
     return counts
 
 
@@ -59,18 +69,34 @@ def told(counts: Counter[str]) -> str:
 
 
 def stack_of(text: str, real_bytes: int) -> int:
-    """Bytes that the longest chain of calls of a generated function takes, every number of it in memory."""
+    """Bytes that the longest chain of calls of a generated function takes, every number of it in
+    memory.
+    """
     bodies = re.split(r"^(?:static|SEPARATE) void ", text, flags=re.MULTILINE)[1:]
     own = [len(re.findall(r"^  [FI] v\d+ =", body, re.MULTILINE)) for body in bodies]
-    rooms = sum(map(int, re.findall(r"^  F x\[(\d+)\]; I y\[(\d+)\];$", bodies[-1], re.MULTILINE)[0])) if len(bodies) > 1 else 0
+    rooms = (
+        sum(map(int, re.findall(r"^  F x\[(\d+)\]; I y\[(\d+)\];$", bodies[-1], re.MULTILINE)[0]))
+        if len(bodies) > 1
+        else 0
+    )
     return real_bytes * (max(own[:-1], default=0) + own[-1] + rooms) + FRAME * (1 + (len(own) > 1))
 
 
 def words_for(text: str) -> str:
-    """The lines of `c/plain.h` whose words a text uses; what they use themselves are functions of C and `MASK`, which is kept with them."""
+    """The lines of `c/plain.h` whose words a text uses; what they use themselves are functions of C
+    and `MASK`, which is kept with them.
+    """
     lines = header("plain.h").splitlines()
-    used = [line for line in lines if (found := re.match(r"#define (\w+)", line)) and re.search(rf"\b{found[1]}\b", text)]
-    mask = [line for line in lines if line.startswith("#define MASK") and line not in used and any("MASK(" in x for x in used)]
+    used = [
+        line
+        for line in lines
+        if (found := re.match(r"#define (\w+)", line)) and re.search(rf"\b{found[1]}\b", text)
+    ]
+    mask = [
+        line
+        for line in lines
+        if line.startswith("#define MASK") and line not in used and any("MASK(" in x for x in used)
+    ]
     return "\n".join(mask + used)
 
 
@@ -125,22 +151,40 @@ def written(law: Law) -> Written:
     scenario, programs, name, n = law.scenario, law.programs, law.name, law.scenario.n
     parameters = Parameters.of(scenario, (programs.start, programs.sample))
     size, real_bytes = len(programs.memory), 4 if law.is_float else 8
-    lane = ["t[0]", *(f"{x}[{i}]" for x in ("q", "dq", *(REFERENCE if law.told_reference else ())) for i in range(n))]
+    lane = [
+        "t[0]",
+        *(
+            f"{x}[{i}]"
+            for x in ("q", "dq", *(REFERENCE if law.told_reference else ()))
+            for i in range(n)
+        ),
+    ]
     seen = [f"const {name}_parameters *p", "const F *m", "const F *t", "const F *q", "const F *dq"]
     seen += [f"const F *{x}" for x in REFERENCE] if law.told_reference else []
     inputs = {"shared": parameters.numbers, "lane": lane, "carry": [f"m[{k}]" for k in range(size)]}
     results = len(programs.start.samples), size + len(programs.sample.samples)
-    start = plain_function(programs.start, f"{name}_start", [seen[0], *seen[2:]], inputs, _places(results[0]), SEGMENT)
-    sample = plain_function(programs.sample, f"{name}_sample", seen, inputs, _places(results[1]), SEGMENT)
+    start = plain_function(
+        programs.start, f"{name}_start", [seen[0], *seen[2:]], inputs, _places(results[0]), SEGMENT
+    )
+    sample = plain_function(
+        programs.sample, f"{name}_sample", seen, inputs, _places(results[1]), SEGMENT
+    )
     operations = operations_of(programs.sample)
     state_bytes = real_bytes * (max(size, 1) + 3 * n)
     parameter_bytes = real_bytes * max(1, parameters.size)
-    stack_bytes = max(stack_of(start, real_bytes), stack_of(sample, real_bytes)) + real_bytes * results[1]
+    stack_bytes = (
+        max(stack_of(start, real_bytes), stack_of(sample, real_bytes)) + real_bytes * results[1]
+    )
     keep = "memcpy(s->memory, result, sizeof s->memory);\n{}" if size else ""
-    values = shared_values(scenario, name, programs.sample.dtype, parameters, law.joints, start, sample) | {
+    values = shared_values(
+        scenario, name, programs.sample.dtype, parameters, law.joints, start, sample
+    ) | {
         "period": "sampling.period",
         "operations": told(operations),
-        "memory": "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(programs.memory)) or "       nothing\n",
+        "memory": (
+            "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(programs.memory))
+            or "       nothing\n"
+        ),
         "memory_size": max(size, 1),
         "memory_count": size,
         "flags": len(FLAGS),
@@ -148,7 +192,11 @@ def written(law: Law) -> Written:
         "keep_sample": keep.format("    "),
         "default_dq": "(void)still;" if programs.reads_velocity else "if (dq == NULL) dq = still;",
         "dq_argument": "dq" if programs.reads_velocity else "NULL",
-        "dq_note": "" if programs.reads_velocity else "\n   dq is the velocity that the filter starts with; NULL for 0.",
+        "dq_note": (
+            ""
+            if programs.reads_velocity
+            else "\n   dq is the velocity that the filter starts with; NULL for 0."
+        ),
         **_reference_text(law.told_reference, name, n),
     }
     texts = {f"{name}.h": filled("law.h", values), f"{name}.c": filled("law.c", values)}
@@ -161,9 +209,17 @@ def _places(count: int) -> list[str]:
 
 
 def shared_values(
-    scenario: Scenario, name: str, dtype: np.dtype, parameters: Parameters, joints: Sequence[str], start: str, sample: str
+    scenario: Scenario,
+    name: str,
+    dtype: np.dtype,
+    parameters: Parameters,
+    joints: Sequence[str],
+    start: str,
+    sample: str,
 ) -> dict[str, Any]:
-    """What the templates of laws and loops ask for alike; `start` and `sample` are generated functions."""
+    """What the templates of laws and loops ask for alike; `start` and `sample` are generated
+    functions.
+    """
     is_float = dtype == np.float32
     values = {
         "name": name,
@@ -194,7 +250,14 @@ def title_of(scenario: Scenario) -> str:
 def _reference_text(told_reference: bool, name: str, n: int) -> dict[str, str]:
     if not told_reference:
         return dict.fromkeys(
-            ("reference_arguments", "reference_declarations", "reference_parameters", "reference_finite", "reference_values"), ""
+            (
+                "reference_arguments",
+                "reference_declarations",
+                "reference_parameters",
+                "reference_finite",
+                "reference_values",
+            ),
+            "",
         )
     return {
         "reference_arguments": ", q_d, dq_d, ddq_d",
@@ -211,7 +274,10 @@ def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> di
     of = "".join(f", {x}[k]" for x in REFERENCE) if v.reference else ""
     told_velocity = "It is told positions and velocities."
     dtype, where = "float" if law.is_float else "double", "told" if v.reference else "inside"
-    again = f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype} --reference {where}"
+    again = (
+        f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
+        f" --reference {where}"
+    )
     row = f"\n| `scenario.toml` | what it was written from: `{again}` writes it again |"
     values |= {
         "samples": len(v.q),
@@ -227,13 +293,29 @@ def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> di
         "parameter_bytes": sizes[1],
         "stack_bytes": sizes[2],
         "period": repr(period),
-        "velocity": told_velocity if reads else "It is told positions alone; velocities follow by the scenario's filter.",
+        "velocity": (
+            told_velocity
+            if reads
+            else "It is told positions alone; velocities follow by the scenario's filter."
+        ),
         "inside": _inside(law),
-        "reference": "The reference is told at every sample." if v.reference else "The reference is inside, a function of t.",
+        "reference": (
+            "The reference is told at every sample."
+            if v.reference
+            else "The reference is inside, a function of t."
+        ),
         "scenario_row": "" if law.file is None else row,
-        "time_note": "Time as a float loses a millisecond after four hours: start again before.  " if law.is_float else "",
+        "time_note": (
+            "Time as a float loses a millisecond after four hours: start again before.  "
+            if law.is_float
+            else ""
+        ),
     }
-    arrays = {"q": v.q, "torque": v.tau} | ({"dq": v.dq} if reads else {}) | dict(zip(REFERENCE, v.reference, strict=bool(v.reference)))
+    arrays = (
+        {"q": v.q, "torque": v.tau}
+        | ({"dq": v.dq} if reads else {})
+        | dict(zip(REFERENCE, v.reference, strict=bool(v.reference)))
+    )
     return {
         "selftest.c": filled("selftest.c", values),
         "vectors.h": _vectors(law, arrays),
@@ -245,8 +327,16 @@ def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> di
 
 def _inside(law: Law) -> str:
     s = law.scenario
-    parts = [type(s.controller).__name__, type(s.observer).__name__, f"the model ({type(s.model).__name__})", "the bounds"]
-    return ", ".join(parts + ([] if law.programs.reads_velocity else [f"the filter {type(s.sensor.velocity).__name__}"]))  # type: ignore[attr-defined]
+    parts = [
+        type(s.controller).__name__,
+        type(s.observer).__name__,
+        f"the model ({type(s.model).__name__})",
+        "the bounds",
+    ]
+    if not law.programs.reads_velocity:
+        velocity = s.sensor.velocity  # type: ignore[attr-defined]
+        parts.append(f"the filter {type(velocity).__name__}")
+    return ", ".join(parts)
 
 
 def _vectors(law: Law, arrays: dict[str, np.ndarray]) -> str:
@@ -258,6 +348,12 @@ def _vectors(law: Law, arrays: dict[str, np.ndarray]) -> str:
     lines = ["/* Samples of a simulated run, for selftest.c; the torque of every CHECKED-th. */"]
     lines.append(f"enum {{ SAMPLES = {len(v.q)}, CHECKED = {CHECKED} }};")
     names = ("q", "dq", *REFERENCE)[: len(v.first)]
-    lines += [f"static const {real} first_{x}[{n}] = {row(y)};" for x, y in zip(names, v.first, strict=True)]
-    lines += [f"static const {real} {x}[{len(rows)}][{n}] = {{\n" + ",\n".join(map(row, rows)) + "\n};" for x, rows in arrays.items()]
+    lines += [
+        f"static const {real} first_{x}[{n}] = {row(y)};"
+        for x, y in zip(names, v.first, strict=True)
+    ]
+    lines += [
+        f"static const {real} {x}[{len(rows)}][{n}] = {{\n" + ",\n".join(map(row, rows)) + "\n};"
+        for x, rows in arrays.items()
+    ]
     return "\n".join(lines) + "\n"

@@ -32,7 +32,9 @@ class WrittenLoop(NamedTuple):
     """What its templates are filled with."""
 
 
-def loop_files(scenario: Scenario, loop: Loop, name: str, method: str, joints: tuple[str, ...]) -> WrittenLoop:
+def loop_files(
+    scenario: Scenario, loop: Loop, name: str, method: str, joints: tuple[str, ...]
+) -> WrittenLoop:
     """Header and source of a closed loop."""
     parameters = Parameters.of(scenario, (loop.start, loop.step))
     settings = 1 + (4 if has_noise(scenario) else 0)
@@ -44,8 +46,17 @@ def loop_files(scenario: Scenario, loop: Loop, name: str, method: str, joints: t
         "index": ["index"],
     }
     p, places = f"const {name}_parameters *p", [f"r[{k}]" for k in range(loop.size + told)]
-    begin = plain_function(loop.start, f"{name}_begin", [p, "const F *u"], inputs, places[: loop.size], SEGMENT)
-    step = plain_function(loop.step, f"{name}_advance", [p, "const F *m", "const F *u", "I index"], inputs, places, SEGMENT)
+    begin = plain_function(
+        loop.start, f"{name}_begin", [p, "const F *u"], inputs, places[: loop.size], SEGMENT
+    )
+    step = plain_function(
+        loop.step,
+        f"{name}_advance",
+        [p, "const F *m", "const F *u", "I index"],
+        inputs,
+        places,
+        SEGMENT,
+    )
     values = shared_values(scenario, name, loop.step.dtype, parameters, joints, begin, step) | {
         "method": method,
         "settings": settings,
@@ -56,7 +67,11 @@ def loop_files(scenario: Scenario, loop: Loop, name: str, method: str, joints: t
         "rows": ROWS,
         "array": "Float32Array" if loop.step.dtype == np.float32 else "Float64Array",
     }
-    return WrittenLoop({f"{name}.h": filled("loop.h", values), f"{name}.c": filled("loop.c", values)}, parameters, values)
+    return WrittenLoop(
+        {f"{name}.h": filled("loop.h", values), f"{name}.c": filled("loop.c", values)},
+        parameters,
+        values,
+    )
 
 
 def _finite(value: np.ndarray) -> Any:
@@ -70,13 +85,35 @@ def table(written: WrittenLoop, settings: list[float]) -> dict[str, Any]:
     """What a page must know of a module: its parameters, settings and records."""
     rows, offset = [], 0
     for field in written.parameters.fields:
-        rows.append({"path": field.path, "offset": offset, "shape": field.shape, "unit": field.unit, "value": _finite(field.value)})
+        rows.append(
+            {
+                "path": field.path,
+                "offset": offset,
+                "shape": field.shape,
+                "unit": field.unit,
+                "value": _finite(field.value),
+            }
+        )
         offset += math.prod(field.shape)
     values, n = written.values, written.values["joints"]
-    columns = [{"name": name, "unit": unit, "offset": k * n, "size": n} for k, (name, unit) in enumerate(OUTPUTS.items())]
+    columns = [
+        {"name": name, "unit": unit, "offset": k * n, "size": n}
+        for k, (name, unit) in enumerate(OUTPUTS.items())
+    ]
     columns.append({"name": "status", "unit": "1", "offset": len(OUTPUTS) * n, "size": 1})
-    said = {"parameters": rows, "count": offset, "settings": settings, "records": columns, "record": values["told"]}
-    return said | {"bytes": 8 if values["type"] == "double" else 4, "joints": n, "method": values["method"], "version": __version__}
+    said = {
+        "parameters": rows,
+        "count": offset,
+        "settings": settings,
+        "records": columns,
+        "record": values["told"],
+    }
+    return said | {
+        "bytes": 8 if values["type"] == "double" else 4,
+        "joints": n,
+        "method": values["method"],
+        "version": __version__,
+    }
 
 
 def wasm_files(written: WrittenLoop, folder: Path, settings: list[float]) -> list[str]:
@@ -93,5 +130,8 @@ def wasm_files(written: WrittenLoop, folder: Path, settings: list[float]) -> lis
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
         (folder / file).write_text(text)
-    build([*command, *WASM_FLAGS, f"{name}.c", f"{name}_module.c", "-lm", "-o", f"{name}.wasm"], folder)
+    build(
+        [*command, *WASM_FLAGS, f"{name}.c", f"{name}_module.c", "-lm", "-o", f"{name}.wasm"],
+        folder,
+    )
     return [*texts, f"{name}.wasm"]

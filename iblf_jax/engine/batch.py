@@ -1,4 +1,6 @@
-"""A batch of runs, or one: which leaves differ between the runs, and the way from the start to the outcome, whatever steps them."""
+"""A batch of runs, or one: which leaves differ between the runs, and the way from the start to the
+outcome, whatever steps them.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ class Leaves(NamedTuple):
     def together(self, shared: Sequence, lane: Sequence):
         """The pytree again, from one run's leaves."""
         one, other = iter(shared), iter(lane)
-        return jax.tree.unflatten(self.treedef, [next(other) if lane else next(one) for lane in self.is_lane])
+        return jax.tree.unflatten(
+            self.treedef, [next(other) if lane else next(one) for lane in self.is_lane]
+        )
 
     @property
     def first(self):
@@ -53,13 +57,17 @@ class Leaves(NamedTuple):
 
 
 def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
-    """The leaves of what runs are made from: those that `varied` replaces in the scenario become one value a run."""
+    """The leaves of what runs are made from: those that `varied` replaces in the scenario become
+    one value a run.
+    """
     before, treedef = jax.tree.flatten(inputs)
 
     def replaced(values):
         leaves = {path: x for path, x in values.items() if path != NOISE_NAME}
         noise = values[NOISE_NAME].astype(inputs.dt.dtype) if NOISE_NAME in values else inputs.noise
-        return jax.tree.leaves(inputs._replace(scenario=with_parameters(inputs.scenario, leaves), noise=noise))
+        return jax.tree.leaves(
+            inputs._replace(scenario=with_parameters(inputs.scenario, leaves), noise=noise)
+        )
 
     touched: list[bool] = []
 
@@ -70,7 +78,12 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
 
     lane = jax.vmap(look)(dict(varied)) if varied else []
     touched = touched or [False] * len(before)
-    return Leaves(treedef, tuple(touched), [x for x, yes in zip(before, touched, strict=True) if not yes], list(lane))
+    return Leaves(
+        treedef,
+        tuple(touched),
+        [x for x, yes in zip(before, touched, strict=True) if not yes],
+        list(lane),
+    )
 
 
 TOGETHER = Shape("together", "none", False)
@@ -89,7 +102,12 @@ class Batch(NamedTuple):
     """What of the robots is compiled in."""
 
     @staticmethod
-    def of(inputs: Inputs, varied: Mapping[str, jax.Array] | None, shape: Shape = TOGETHER, mechanism: Mechanism | None = None) -> Batch:
+    def of(
+        inputs: Inputs,
+        varied: Mapping[str, jax.Array] | None,
+        shape: Shape = TOGETHER,
+        mechanism: Mechanism | None = None,
+    ) -> Batch:
         """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
         runs = jax.tree.leaves(dict(varied))[0].shape[0] if varied else None
         return Batch(split(inputs, varied or {}), runs, shape, mechanism)
@@ -100,7 +118,10 @@ class Batch(NamedTuple):
         if self.mechanism is None:
             return ()
         one, other = iter(self.leaves.shared), iter(self.leaves.lane)
-        sizes = [math.prod(next(other).shape[1:]) if lane else next(one).size for lane in self.leaves.is_lane]
+        sizes = [
+            math.prod(next(other).shape[1:]) if lane else next(one).size
+            for lane in self.leaves.is_lane
+        ]
         return self.mechanism.of_shared(self.leaves.is_lane, sizes)
 
     @property
@@ -119,13 +140,17 @@ class Batch(NamedTuple):
         if self.shape.runs == "in turn":
             return jax.lax.map(lambda each: one(*each), (self.leaves.lane, *args))
         together = jax.vmap(one, axis_size=self.runs)
-        return (machine_function(together) if self.shape.function == "parts" else together)(self.leaves.lane, *args)
+        return (machine_function(together) if self.shape.function == "parts" else together)(
+            self.leaves.lane, *args
+        )
 
 
 Executor = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
-"""(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step recorded, from the first on).
+"""(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step
+recorded, from the first on).
 
-All arrays have the run axis first, records then the time axis; `every` is None where nothing is recorded."""
+All arrays have the run axis first, records then the time axis; `every` is None where nothing is
+recorded."""
 
 
 def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
@@ -138,13 +163,20 @@ def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
 
 
 def _without_folds(leaves: Leaves) -> Leaves:
-    """The leaves of inputs without what a `Probe` does not read: one program of it serves all metrics and derivatives."""
+    """The leaves of inputs without what a `Probe` does not read: one program of it serves all
+    metrics and derivatives.
+    """
     places: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_lane)))
     kept, treedef = jax.tree.flatten(places._replace(folds=(), noise=(), direction=()))
     shared, lane = iter(leaves.shared), iter(leaves.lane)
     values = [next(lane if is_lane else shared) for is_lane in leaves.is_lane]
     is_lane = tuple(leaves.is_lane[i] for i in kept)
-    return Leaves(treedef, is_lane, [values[i] for i in kept if not leaves.is_lane[i]], [values[i] for i in kept if leaves.is_lane[i]])
+    return Leaves(
+        treedef,
+        is_lane,
+        [values[i] for i in kept if not leaves.is_lane[i]],
+        [values[i] for i in kept if leaves.is_lane[i]],
+    )
 
 
 def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]:
@@ -153,12 +185,20 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]
     def around(inputs):
         unseen = accuracy.unseen(inputs.scenario, method, inputs.dt, inputs.steps)
         state = initial_state(inputs.scenario)
-        return probed(jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen)
+        return probed(
+            jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen
+        )
 
     found = _probed(executor, batch, batch.each(around))
-    return batch.each(
-        lambda inputs, found: start(inputs, method, resolved(found.jacobian, inputs.scenario.sampling is not None)), found
-    ), found
+    return (
+        batch.each(
+            lambda inputs, found: start(
+                inputs, method, resolved(found.jacobian, inputs.scenario.sampling is not None)
+            ),
+            found,
+        ),
+        found,
+    )
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
@@ -172,12 +212,22 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
 
 
 def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Probed) -> Outcome:
-    """The outcome after the last step, without records; `at_start` is what a `Probe` has found there."""
+    """The outcome after the last step, without records; `at_start` is what a `Probe` has found
+    there.
+    """
 
     def critical(inputs, carry):
-        instants = ((carry.nearest.t, carry.nearest.around), (inputs.dt * inputs.steps, surroundings(carry.state)))
-        watched, nothing = at_start.jacobian.shape[-1], accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3)
-        return jax.tree.map(lambda *xs: jnp.stack(xs), *(probed(*instant, watched, nothing) for instant in instants))
+        instants = (
+            (carry.nearest.t, carry.nearest.around),
+            (inputs.dt * inputs.steps, surroundings(carry.state)),
+        )
+        watched, nothing = (
+            at_start.jacobian.shape[-1],
+            accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3),
+        )
+        return jax.tree.map(
+            lambda *xs: jnp.stack(xs), *(probed(*instant, watched, nothing) for instant in instants)
+        )
 
     def judged(inputs, carry, at_start, later):
         instants = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later)

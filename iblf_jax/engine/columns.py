@@ -1,8 +1,9 @@
 """Derivatives of a run by the numbers of its leaves, one run a column.
 
-A run with one tangent is a step as any other; a tangent of that one is a second derivative.  Directions are data (`Inputs.direction`), so
-one program serves all columns, however many there are: it is what compiles soonest.  Where many runs are differentiated at once, and
-compiling pays, `derivatives` computes the law once for all tangents.
+A run with one tangent is a step as any other; a tangent of that one is a second derivative.
+Directions are data (`Inputs.direction`), so one program serves all columns, however many there are:
+it is what compiles soonest.  Where many runs are differentiated at once, and compiling pays,
+`derivatives` computes the law once for all tangents.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ class WithTangent(NamedTuple):
 
 
 def _floats(carry: Carry | WithTangent) -> tuple[list[jax.Array], Callable]:
-    """The numbers of a carry that have tangents, and the function that puts others in their place."""
+    """The numbers of a carry that have tangents, and the function that puts others in their
+    place.
+    """
     if not isinstance(carry, WithTangent):
         return floats_of_carry(carry)
     inner, replaced = _floats(carry.carry)
@@ -99,7 +102,9 @@ class TangentStep:
             return (_floats(after)[0], floats_of(record)), after
 
         zero = jnp.zeros_like(inputs.dt)
-        _, (tangent, record), after = jax.jvp(of, (zero, floats), (jnp.ones_like(zero), carry.tangent), has_aux=True)
+        _, (tangent, record), after = jax.jvp(
+            of, (zero, floats), (jnp.ones_like(zero), carry.tangent), has_aux=True
+        )
         return WithTangent(after, tangent), record
 
 
@@ -142,7 +147,13 @@ def _directed(batch: Batch, places: Places, directions: list[list[Any]]) -> tupl
     lane = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.lane]
     # One column of a derivative beside every column of the others, for every run.
     added = [
-        [jnp.tile(jnp.repeat(x, math.prod(sizes[k + 1 :]), axis=0), (runs * math.prod(sizes[:k]), *[1] * (x.ndim - 1))) for x in level]
+        [
+            jnp.tile(
+                jnp.repeat(x, math.prod(sizes[k + 1 :]), axis=0),
+                (runs * math.prod(sizes[:k]), *[1] * (x.ndim - 1)),
+            )
+            for x in level
+        ]
         for k, level in enumerate(directions)
     ]
     inputs = leaves.together(leaves.shared, leaves.lane)._replace(direction=added)
@@ -163,26 +174,35 @@ def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
     return [jnp.shape(x) for x in jax.tree.leaves(batch.leaves.first.scenario)]
 
 
-def _stepped(executor: Executor, batch: Batch, step: TangentStep, directions: list[list[Any]], run: Run) -> tuple[list[jax.Array], Any]:
+def _stepped(
+    executor: Executor, batch: Batch, step: TangentStep, directions: list[list[Any]], run: Run
+) -> tuple[list[jax.Array], Any]:
     """The derivatives of what a step records and of the metrics, (R, P, ...)."""
     wide, sizes = _directed(batch, step.places, directions)
     before = wide.each(lambda inputs: _begun(inputs, run.method, step.places))
     after, records = executor(step, wide, before, run.steps + 1, run.record_every)
     metrics = wide.each(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
-    return jax.tree.map(lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics))
+    return jax.tree.map(
+        lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics)
+    )
 
 
-def columns(executor: Executor, batch: Batch, places: Places, run: Run) -> tuple[list[jax.Array], dict[str, jax.Array]]:
-    """The derivative of records and metrics of every run by the numbers of some leaves, or a second derivative.
+def columns(
+    executor: Executor, batch: Batch, places: Places, run: Run
+) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+    """The derivative of records and metrics of every run by the numbers of some leaves, or a second
+    derivative.
 
     Args:
       executor: what steps.
       batch: of R runs.
-      places: of the leaves by whose numbers, P of them, it is; for a second derivative two such tuples, P and Q.
+      places: of the leaves by whose numbers, P of them, it is; for a second derivative two such
+        tuples, P and Q.
       run: what to run.
 
     Returns:
-      Of each float that is recorded (R, P, T, ...), or (R, P, Q, T, ...), and by name of each metric that is a float (R, P, ...).
+      Of each float that is recorded (R, P, T, ...), or (R, P, Q, T, ...), and by name of each
+      metric that is a float (R, P, ...).
     """
     shapes = _scenario_shapes(batch)
     directions = [_units([shapes[place] for place in level], batch.dtype) for level in places]
@@ -202,9 +222,16 @@ def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
 def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
     """As `run_with_tangents`, one run a tangent."""
     inputs = batch.leaves.first
-    zero, units = jnp.zeros(directions.tangents, batch.dtype), np.eye(directions.tangents, dtype=batch.dtype)
+    zero, units = (
+        jnp.zeros(directions.tangents, batch.dtype),
+        np.eye(directions.tangents, dtype=batch.dtype),
+    )
     before = jax.tree.leaves(inputs.scenario)
-    places = tuple(i for i, x in enumerate(jax.tree.leaves(directions.moved(inputs.scenario, zero))) if x is not before[i])
+    places = tuple(
+        i
+        for i, x in enumerate(jax.tree.leaves(directions.moved(inputs.scenario, zero)))
+        if x is not before[i]
+    )
 
     def leaves_at(eps):
         moved = jax.tree.leaves(directions.moved(inputs.scenario, eps))
@@ -213,10 +240,18 @@ def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run
     along = jax.vmap(lambda unit: jax.jvp(leaves_at, (zero,), (unit,))[1])(units)
     every = 1 if any(hasattr(fold, "curvatures") for fold in inputs.folds) else None
     run = run._replace(record_every=every)
-    outcome, weights = run_step(executor, batch, TimeStep(run.method, _weights if every else None), run)
+    outcome, weights = run_step(
+        executor, batch, TimeStep(run.method, _weights if every else None), run
+    )
     step = TangentStep(TimeStep(run.method, outer_vectors if every else None), (places,))
     found, tangents = _stepped(executor, batch, step, [along], run)
     still = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
-    nothing = {name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype) for name, x in still.items()}
-    products = [jnp.einsum("rptm,rtm,rqtm->rpq", y, weight, y) for y, weight in zip(found, weights, strict=True)]
+    nothing = {
+        name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype)
+        for name, x in still.items()
+    }
+    products = [
+        jnp.einsum("rptm,rtm,rqtm->rpq", y, weight, y)
+        for y, weight in zip(found, weights, strict=True)
+    ]
     return Tangents(outcome, nothing | tangents, tuple(products))

@@ -1,14 +1,17 @@
-"""Values and forward sensitivities of a batch, in one pass: several tangents a run, stepped beside it.
+"""Values and forward sensitivities of a batch, in one pass: several tangents a run, stepped beside
+it.
 
-Every direction u of the parameters has a tangent x_u of the state; gains are few, so forward mode beats reverse mode and needs no memory
-along time.  A fold may offer `curvature(acc, sample)`, a tuple of `curvatures` many `Outer`: vectors y with weights w, whose
-Gauss-Newton matrices
+Every direction u of the parameters has a tangent x_u of the state; gains are few, so forward mode
+beats reverse mode and needs no memory along time.  A fold may offer `curvature(acc, sample)`, a
+tuple of `curvatures` many `Outer`: vectors y with weights w, whose Gauss-Newton matrices
 
     N_uv = sum_k w(t_k) y_u(t_k) . y_v(t_k),      y_u = tangent of y,
 
-are summed up along the way, at next to no cost.  With w = 2 dt that is the second-order information of every integral of squares.
+are summed up along the way, at next to no cost.  With w = 2 dt that is the second-order information
+of every integral of squares.
 
-The step with its tangents is a step as any other: every executor steps it.  As a scalar program it holds what all tangents share once,
+The step with its tangents is a step as any other: every executor steps it.  As a scalar program it
+  holds what all tangents share once,
 because equal nodes are one node.
 """
 
@@ -35,7 +38,9 @@ FLAG_FIELDS = ("guard_active", "saturated")
 
 
 class Outer(NamedTuple):
-    """What one sample adds to a curvature matrix: N <- N + sum_i weight_i y_iu y_iv, y_u the tangent of `vector`."""
+    """What one sample adds to a curvature matrix: N <- N + sum_i weight_i y_iu y_iv, y_u the
+    tangent of `vector`.
+    """
 
     vector: jax.Array
     """y, (m,)."""
@@ -63,7 +68,9 @@ class Directions(NamedTuple):
     def of(directions: Mapping[str, Any]) -> Directions:
         """From path -> (P, *shape of the leaf)."""
         arrays = {path: np.asarray(x, float) for path, x in directions.items()}
-        return Directions(tuple((path, x.shape, tuple(x.ravel().tolist())) for path, x in arrays.items()))
+        return Directions(
+            tuple((path, x.shape, tuple(x.ravel().tolist())) for path, x in arrays.items())
+        )
 
     @property
     def tangents(self) -> int:
@@ -80,7 +87,9 @@ class Directions(NamedTuple):
 
 
 class Differentiated(NamedTuple):
-    """What goes from step to step: the carry, P tangents of state and accumulators, the products of each `Outer`."""
+    """What goes from step to step: the carry, P tangents of state and accumulators, the products of
+    each `Outer`.
+    """
 
     carry: Carry
     tangents: list[jax.Array]
@@ -89,7 +98,9 @@ class Differentiated(NamedTuple):
 
 
 def floats_of_carry(carry: Carry) -> tuple[list[jax.Array], Callable]:
-    """The numbers of a carry that have tangents, and the function that puts others in their place."""
+    """The numbers of a carry that have tangents, and the function that puts others in their
+    place.
+    """
     leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
     places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
@@ -103,11 +114,14 @@ def floats_of_carry(carry: Carry) -> tuple[list[jax.Array], Callable]:
     return [leaves[i] for i in places], replaced
 
 
-def pushed(function: Callable, directions: Directions, scenario, before: Differentiated | None, dtype):
+def pushed(
+    function: Callable, directions: Directions, scenario, before: Differentiated | None, dtype
+):
     """function(scenario, carry, eps) and its derivative along every direction.
 
     Args:
-      function: of a scenario, a carry and how far it is moved along the directions; gives a list of floats and anything else.
+      function: of a scenario, a carry and how far it is moved along the directions; gives a list of
+        floats and anything else.
       directions: P of them.
       scenario: where.
       before: carry and tangents, or None where the function takes no carry.
@@ -119,7 +133,9 @@ def pushed(function: Callable, directions: Directions, scenario, before: Differe
         return function(directions.moved(scenario, eps), replaced(floats), eps)
 
     def along(unit, tangents):
-        value, tangent, rest = jax.jvp(of, (jnp.zeros_like(unit), floats), (unit, tangents), has_aux=True)
+        value, tangent, rest = jax.jvp(
+            of, (jnp.zeros_like(unit), floats), (unit, tangents), has_aux=True
+        )
         return value, tangent, rest
 
     units = np.eye(directions.tangents, dtype=dtype)
@@ -132,11 +148,12 @@ def without_flags(sample: Sample) -> Any:
 
 
 def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable:
-    """`closed_loop.evaluate`, its Jacobian by directions and state (of a sampled loop torque and time too) worked out once and applied to
-    every tangent.
+    """`closed_loop.evaluate`, its Jacobian by directions and state (of a sampled loop torque and
+    time too) worked out once and applied to every tangent.
 
-    One tangent through the law costs as much as the law; applying the Jacobian costs a tenth of it.  Of a sampled loop a stage is the plant
-    alone: value and derivatives by 12 gains of `presets.ur5` take 4.0 times as long as the value, and 7.4 times without this.
+    One tangent through the law costs as much as the law; applying the Jacobian costs a tenth of it.
+    Of a sampled loop a stage is the plant alone: value and derivatives by 12 gains of `presets.ur5`
+      take 4.0 times as long as the value, and 7.4 times without this.
     """
     jumps = scenario.jump_times().size > 0
 
@@ -148,13 +165,18 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
         here, unravel = ravel_pytree([x for x, yes in zip(leaves, real, strict=True) if yes])
         flags = [x for x, yes in zip(leaves, real, strict=True) if not yes]
 
-        # All that it reads is handed in: within a branch of JAX's it may close over nothing that is traced.
+        # All that it reads is handed in: within a branch of JAX's it may close over nothing that is
+        # traced.
         def numbers(flat, eps, scenario, flags, t, dt):
             parts, rest = iter(unravel(flat)), iter(flags)
-            state, torque, time = jax.tree.unflatten(structure, [next(parts if yes else rest) for yes in real])
+            state, torque, time = jax.tree.unflatten(
+                structure, [next(parts if yes else rest) for yes in real]
+            )
             (t,) = time or (t,)
             slope, sample = evaluate(directions.moved(scenario, eps), t, state, dt, *torque)
-            return (slope, without_flags(sample)), {name: getattr(sample, name) for name in FLAG_FIELDS}
+            return (slope, without_flags(sample)), {
+                name: getattr(sample, name) for name in FLAG_FIELDS
+            }
 
         @jax.custom_jvp
         def floats(flat, eps, *rest):
@@ -168,7 +190,9 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
             here, along = jnp.concatenate([flat, eps]), jnp.concatenate(tangents[:2])
             columns = jax.vmap(lambda unit: jax.jvp(value, (here,), (unit,))[1])(units)
             # Number by number: what a stage does not read of the sample is not computed.
-            return floats(*primals), jax.tree.map(lambda column: jnp.tensordot(along, column, 1), columns)
+            return floats(*primals), jax.tree.map(
+                lambda column: jnp.tensordot(along, column, 1), columns
+            )
 
         at = here, eps, scenario, flags, t, jnp.asarray(dt, t.dtype)
         slope, values = floats(*at)
@@ -194,7 +218,9 @@ def outers_of_step(folds, found: Advanced) -> list[Outer]:
         if node.counts is not True:
             outers = tuple(Outer(y, jnp.where(node.counts, weight, 0.0)) for y, weight in outers)
         samples.append([Outer(y, jnp.broadcast_to(weight, y.shape)) for y, weight in outers])
-    return [Outer(*map(jnp.concatenate, zip(*same, strict=True))) for same in zip(*samples, strict=True)]
+    return [
+        Outer(*map(jnp.concatenate, zip(*same, strict=True))) for same in zip(*samples, strict=True)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,19 +237,29 @@ class DerivativeStep:
 
         def one(scenario, before, eps):
             # On arrays a Jacobian for a few tangents would cost more than the tangents.
-            loop = preaccumulated(inputs.scenario, self.directions, eps) if form.scalar else evaluate
-            found = advance(inputs._replace(scenario=scenario), before, index, self.method, form, loop)
+            loop = (
+                preaccumulated(inputs.scenario, self.directions, eps) if form.scalar else evaluate
+            )
+            found = advance(
+                inputs._replace(scenario=scenario), before, index, self.method, form, loop
+            )
             outers = outers_of_step(inputs.folds, found)
-            vectors, weights = ([getattr(outer, part) for outer in outers] for part in Outer._fields)
+            vectors, weights = (
+                [getattr(outer, part) for outer in outers] for part in Outer._fields
+            )
             return (floats_of_carry(found.carry)[0], vectors), (found.carry, weights)
 
-        _, (tangents, vectors), (after, weights) = pushed(one, self.directions, inputs.scenario, carry, inputs.dt.dtype)
+        _, (tangents, vectors), (after, weights) = pushed(
+            one, self.directions, inputs.scenario, carry, inputs.dt.dtype
+        )
         terms = zip(carry.products, vectors, weights, strict=True)
         products = [N + jnp.sum(weight * y[rows] * y[columns], axis=-1) for N, y, weight in terms]
         return Differentiated(after, tangents, products), ()
 
 
-def run_with_tangents(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
+def run_with_tangents(
+    executor: Executor, batch: Batch, directions: Directions, run: Run
+) -> Tangents:
     """All runs with their tangents, from the start to the outcome; `run` records nothing."""
     rows, columns = np.triu_indices(directions.tangents)
 
@@ -237,14 +273,21 @@ def run_with_tangents(executor: Executor, batch: Batch, directions: Directions, 
 
     def at_end(inputs, before):
         def metrics(scenario, carry, eps):
-            found: dict[str, jax.Array] = dict.fromkeys((name for name, _ in accuracy.UNITS), jnp.zeros_like(inputs.dt))
+            found: dict[str, jax.Array] = dict.fromkeys(
+                (name for name, _ in accuracy.UNITS), jnp.zeros_like(inputs.dt)
+            )
             found[accuracy.ERROR] = jnp.zeros_like(carry.accuracy.error)
             results = finished(inputs.folds, carry.accumulators).items()
-            return found | {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}, ()
+            return (
+                found | {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)},
+                (),
+            )
 
         _, tangents, _ = pushed(metrics, directions, inputs.scenario, before, inputs.dt.dtype)
         full = jnp.zeros((directions.tangents,) * 2, inputs.dt.dtype)
-        return tangents, tuple(full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products)
+        return tangents, tuple(
+            full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products
+        )
 
     carry, instant = begin(executor, batch, run.method)
     before = batch.each(at_start, carry)

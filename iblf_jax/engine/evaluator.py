@@ -1,6 +1,7 @@
 """Evaluates the nodes of a scalar program on arrays, in operations of XLA.
 
-On CPU it says to XLA where to stop fusing: what is used several times is computed once, and a long program is cut into parts.
+On CPU it says to XLA where to stop fusing: what is used several times is computed once, and a long
+  program is cut into parts.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ from iblf_jax.kernels.program import Node, Program, needed
 
 
 class Entry(NamedTuple):
-    """One number of a row of the table, not yet read: what uses it reads it, rather than each number being copied out."""
+    """One number of a row of the table, not yet read: what uses it reads it, rather than each
+    number being copied out.
+    """
 
     part: str
     place: int
 
     def read(self, row: Table) -> jax.Array:
         """The number, ()."""
-        return lax.squeeze(lax.slice(getattr(row, self.part), (self.place,), (self.place + 1,)), (0,))
+        return lax.squeeze(
+            lax.slice(getattr(row, self.part), (self.place,), (self.place + 1,)), (0,)
+        )
 
 
 class Table(NamedTuple):
@@ -49,11 +54,17 @@ class Evaluator:
         self.sines = frozenset(vector_math.XLA_OWN) if self.bordered else frozenset()
         self.types = {"f": program.dtype, "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
 
-    def compute(self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None) -> None:
+    def compute(
+        self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None
+    ) -> None:
         """Adds `wanted`, and what it needs, to `known` (node -> array, or entry of `row`)."""
         nodes = self.program.nodes
         missing = needed(nodes, wanted, known)
-        known |= {i: np.asarray(nodes[i].value, self.types[nodes[i].kind]) for i in missing if nodes[i].op == "const"}
+        known |= {
+            i: np.asarray(nodes[i].value, self.types[nodes[i].kind])
+            for i in missing
+            if nodes[i].op == "const"
+        }
         order = [i for i in missing if nodes[i].op != "const"]
         stored = self._stored(order, wanted)
         size = plan.XLA_SEGMENT if self.bordered else max(len(order), 1)
@@ -61,20 +72,32 @@ class Evaluator:
             self._segment(known, order[start : start + size], order[start + size :], stored, row)
 
     def _stored(self, order: list[int], wanted: Iterable[int]) -> set[int]:
-        """The nodes of `order` to be stored: what is wanted, and what costs more to compute again than to read."""
+        """The nodes of `order` to be stored: what is wanted, and what costs more to compute again
+        than to read.
+        """
         nodes, cost, stored = self.program.nodes, dict.fromkeys(order, 0), set(wanted)
         uses = Counter([a for i in order for a in nodes[i].args] + list(stored))
         for i in order:
-            here = (1 if OPERATIONS[nodes[i].op].cheap else plan.XLA_DEAR) + sum(cost.get(a, 0) for a in nodes[i].args if a not in stored)
+            here = (1 if OPERATIONS[nodes[i].op].cheap else plan.XLA_DEAR) + sum(
+                cost.get(a, 0) for a in nodes[i].args if a not in stored
+            )
             cost[i] = here
             if uses[i] > 1 and here >= plan.XLA_STORED:
                 stored.add(i)
         return stored
 
-    def _segment(self, known: dict[int, Any], order: list[int], later: list[int], stored: set[int], row: Table | None) -> None:
+    def _segment(
+        self,
+        known: dict[int, Any],
+        order: list[int],
+        later: list[int],
+        stored: set[int],
+        row: Table | None,
+    ) -> None:
         """Adds the nodes of `order` to `known`.
 
-        On CPU in a function of its own: XLA computes each of its results once, and nothing across its border.  The barrier keeps
+        On CPU in a function of its own: XLA computes each of its results once, and nothing across
+          its border.  The barrier keeps
         results that nobody reads, which are there to be stored only.
         """
         nodes, here = self.program.nodes, set(order)
@@ -97,17 +120,29 @@ class Evaluator:
                         local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
                     elif i not in local:
                         together = tables[nodes[i].args, len(nodes[i].value)]
-                        local |= zip(together, self._looked_up(together, local[nodes[i].args[0]]), strict=True)
+                        local |= zip(
+                            together,
+                            self._looked_up(together, local[nodes[i].args[0]]),
+                            strict=True,
+                        )
                 if sines:
                     angles = [jnp.broadcast_to(local[nodes[i].args[0]], self.shape) for i in sines]
-                    local |= zip(sines, vector_math.sines([nodes[i].op for i in sines], angles), strict=True)
+                    local |= zip(
+                        sines, vector_math.sines([nodes[i].op for i in sines], angles), strict=True
+                    )
             return [local[i] for i in outputs]
 
-        results = lax.optimization_barrier(as_function(body)(row, arrays)) if self.bordered else body(row, arrays)
+        results = (
+            lax.optimization_barrier(as_function(body)(row, arrays))
+            if self.bordered
+            else body(row, arrays)
+        )
         known |= zip(outputs, results, strict=True)
 
     def _rounds(self, order: list[int]) -> list[tuple[list[int], list[int]]]:
-        """`order` as rounds: nodes, then the sines and cosines that these and earlier rounds allow, which are computed together."""
+        """`order` as rounds: nodes, then the sines and cosines that these and earlier rounds allow,
+        which are computed together.
+        """
         nodes, done = self.program.nodes, dict[int, int]()
         rounds: list[tuple[list[int], list[int]]] = [([], [])]
         for i in order:
@@ -133,10 +168,14 @@ class Evaluator:
         The barriers keep it from computing index and rows again for every use.
         """
         tables = jnp.asarray([self.program.nodes[i].value for i in lookups], self.program.dtype)
-        columns = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(1,), start_index_map=(1,))
+        columns = lax.GatherDimensionNumbers(
+            offset_dims=(0,), collapsed_slice_dims=(1,), start_index_map=(1,)
+        )
         index = lax.optimization_barrier(jnp.broadcast_to(index, self.shape))
         places = lax.expand_dims(index, (len(self.shape),))
-        return lax.optimization_barrier(lax.gather(tables, places, columns, (len(lookups), 1), mode=lax.GatherScatterMode.CLIP))
+        return lax.optimization_barrier(
+            lax.gather(tables, places, columns, (len(lookups), 1), mode=lax.GatherScatterMode.CLIP)
+        )
 
 
 def on_cpu() -> bool:

@@ -1,12 +1,13 @@
-"""Runs, batches and their derivatives, executed as `plan` decides.  The physics is written once, for one run.
+"""Runs, batches and their derivatives, executed as `plan` decides.  The physics is written once,
+for one run.
 
     scan     the step as it is: any scenario, any device; a user calls it "vmap"
-    xla      the step's scalar program, one (batch,) array a number: any device, nothing needed but jax
-    native   the same program as C, built by the system's compiler, SIMD over runs and threads: CPU
-    gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs
+    xla      the step's scalar program, one (batch,) array a number: any device, nothing needed but
+    jax native   the same program as C, built by the system's compiler, SIMD over runs and threads:
+    CPU gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs
 
-All give the same results.  What a scalar program cannot express runs on scan, and what has no compiler, or is for another device, on xla;
-a `BackendWarning` says why, once.
+All give the same results.  What a scalar program cannot express runs on scan, and what has no
+compiler, or is for another device, on xla; a `BackendWarning` says why, once.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ def _tell(text: str) -> None:
 
 
 def automatic() -> tuple[str, str | None]:
-    """The backend that "auto" takes for what lowers, and why it is not a compiled one, in one line (None if it is)."""
+    """The backend that "auto" takes for what lowers, and why it is not a compiled one, in one line
+    (None if it is).
+    """
     best = plan.executors_for("auto", devices.platform())[0]
     if best == "xla":
         return best, f"no kernels are compiled for {devices.platform()}"
@@ -73,7 +76,9 @@ def _asked_for(backend: str) -> tuple[str, ...]:
     return plan.executors_for(backend, platform)
 
 
-def _first_that_can(names: Sequence[str], run_on: Callable, on_scan: Callable, tell: Callable[[str], None]) -> Any:
+def _first_that_can(
+    names: Sequence[str], run_on: Callable, on_scan: Callable, tell: Callable[[str], None]
+) -> Any:
     """`run_on` the first of some names that can, or `on_scan()`."""
     for name in names:
         try:
@@ -91,7 +96,8 @@ def _slower(reason: object) -> str:
 
 
 def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
-    """`run_on(name)` on the executor that was asked for, or the next one that can; `on_scan()` is scan.
+    """`run_on(name)` on the executor that was asked for, or the next one that can; `on_scan()` is
+    scan.
 
     Args:
       backend: one of `plan.BACKENDS`.
@@ -106,14 +112,24 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
 
 def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: Any = None) -> Inputs:
     """What a run is made from; `noise` is the key of a sampled loop's."""
-    noise = () if scenario.sampling is None else jnp.zeros((4,), dt.dtype) if noise is None else noise.astype(dt.dtype)
+    noise = (
+        ()
+        if scenario.sampling is None
+        else jnp.zeros((4,), dt.dtype)
+        if noise is None
+        else noise.astype(dt.dtype)
+    )
     steps: Any = np.asarray(run.steps, dt.dtype)
     return Inputs(scenario, folds, dt, steps, noise=noise)
 
 
 def executor_named(name: str) -> Executor:
     """The executor of scalar programs with this name."""
-    return lowered_on(native.run, native.pack, native.unpack) if name == "native" else lowered_on(EXECUTORS[name].run)
+    return (
+        lowered_on(native.run, native.pack, native.unpack)
+        if name == "native"
+        else lowered_on(EXECUTORS[name].run)
+    )
 
 
 def _nodes(name: str, program: Program) -> int:
@@ -121,8 +137,12 @@ def _nodes(name: str, program: Program) -> int:
     return len(written_out(program).nodes) if name == "xla" else program.size
 
 
-def _lowered_batch(inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, nested: bool = False) -> Batch:
-    shape = plan.lowered_shape(devices.platform(), operations(inputs), len(next(iter(varied.values()))), nested)
+def _lowered_batch(
+    inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, nested: bool = False
+) -> Batch:
+    shape = plan.lowered_shape(
+        devices.platform(), operations(inputs), len(next(iter(varied.values()))), nested
+    )
     return Batch.of(inputs, varied, shape, run.mechanism)
 
 
@@ -132,7 +152,9 @@ def _program(batch: Batch, run: Run) -> Program:
 
 
 def _build_ahead(batch: Batch, run: Run, program: Program) -> None:
-    """Starts to build the longest kernel of a run, beside whatever else is made: compilers use one core."""
+    """Starts to build the longest kernel of a run, beside whatever else is made: compilers use one
+    core.
+    """
     sizes = Shapes.of(batch.leaves.shared).size, Shapes.of(batch.leaves.lane, 1).size
     native.ahead(program, *sizes, batch.runs or 1, run.steps + 1)
 
@@ -172,14 +194,18 @@ def _shape(inputs: Inputs, runs: int | None, nested: bool) -> plan.Shape:
     return plan.scan_shape(devices.platform(), operations(inputs), runs, nested)
 
 
-def _scanned(inputs: Inputs, varied: Mapping[str, jax.Array] | None, nested: bool, run: Callable) -> Any:
+def _scanned(
+    inputs: Inputs, varied: Mapping[str, jax.Array] | None, nested: bool, run: Callable
+) -> Any:
     """`run(batch)` by the scan executor, as one machine function where that pays."""
     shape = _shape(inputs, len(next(iter(varied.values()))) if varied else None, nested)
 
     def whole(inputs, varied):
         return run(Batch.of(inputs, varied, shape))
 
-    return (machine_function(whole) if shape.function == "whole" else whole)(inputs, dict(varied or {}))
+    return (machine_function(whole) if shape.function == "whole" else whole)(
+        inputs, dict(varied or {})
+    )
 
 
 def run_batch(
@@ -196,7 +222,8 @@ def run_batch(
 
     Args:
       scenario: the scenario that all runs share, canonical.
-      varied: path -> values, batch axis first; each run replaces these leaves, and `sampling.NOISE_NAME`, the key of its noise.
+      varied: path -> values, batch axis first; each run replaces these leaves, and
+        `sampling.NOISE_NAME`, the key of its noise.
       folds: the metrics.
       dt: time step, () [s].
       run: what to run, static.
@@ -220,21 +247,34 @@ def run_batch(
     return with_fallback(backend, run_on, on_scan)
 
 
-def run_one(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
+def run_one(
+    scenario: Scenario,
+    folds: Any,
+    dt: jax.Array,
+    run: Run,
+    *,
+    backend: str = "auto",
+    noise: Any = None,
+) -> Outcome:
     """One run; do not batch or differentiate it from outside.
 
-    Where it is lowered it is compiled in three parts, and only the one in the middle depends on the number of steps and what is recorded.
-    A structure whose kernel could not be built is not tried again in this process.
+    Where it is lowered it is compiled in three parts, and only the one in the middle depends on the
+    number of steps and what is recorded. A structure whose kernel could not be built is not tried
+    again in this process.
 
     Args:
       scenario, folds, dt, run: as `run_batch`, of one run.
-      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", the one of the first two that is for this platform,
-        where it can be built.  What is long or does not lower is, on "auto" and "xla", on scan, without a warning.
+      backend: "native" or "gpu", which fall back with a warning; "xla"; or "auto", the one of the
+        first two that is for this platform, where it can be built.  What is long or does not lower
+        is, on "auto" and "xla", on scan, without a warning.
       noise: key of a sampled loop's noise.
     """
     leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, run, noise))
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    decisive = run._replace(steps=plan.NATIVE_FEW if run.steps >= plan.NATIVE_FEW else 0, record_every=run.record_every and 1)
+    decisive = run._replace(
+        steps=plan.NATIVE_FEW if run.steps >= plan.NATIVE_FEW else 0,
+        record_every=run.record_every and 1,
+    )
     around = run._replace(steps=0, record_every=None)
     names, shape, unsupported = _way_of_one(backend, decisive, automatic(), structure, shapes)
 
@@ -281,10 +321,11 @@ class Way(NamedTuple):
 def _way_of_one(
     backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple
 ) -> tuple[tuple[str, ...], plan.Shape, str | None]:
-    """The executors that one run is lowered for, best first; its shape; why it does not lower.  The first one's kernel is begun.
+    """The executors that one run is lowered for, best first; its shape; why it does not lower.  The
+    first one's kernel is begun.
 
-    All of it depends on structure and shapes, and the trace takes longer than many a run.  Of the run's length and record it counts whether
-    there are few steps and whether there is a record.
+    All of it depends on structure and shapes, and the trace takes longer than many a run.  Of the
+    run's length and record it counts whether there are few steps and whether there is a record.
     """
 
     def trace(leaves):
@@ -292,7 +333,9 @@ def _way_of_one(
         platform, size = devices.platform(), operations(inputs)
         shape = plan.lowered_shape(platform, size, 1, nested=False)
         asked = backend in plan.COMPILED.values()
-        compiled = available[0] if backend == "auto" and available[0] in plan.COMPILED.values() else None
+        compiled = (
+            available[0] if backend == "auto" and available[0] in plan.COMPILED.values() else None
+        )
         best = plan.executor_of_one_run(compiled, platform, size)
         names = _asked_for(backend) if asked else (best,) if best else ()
         if names:
@@ -325,12 +368,16 @@ def _before_steps(way: Way, run: Run, leaves: list) -> tuple[Carry, Probed]:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
-    carry, records = executor_named(way.executor)(TimeStep.of(run), way.batch(leaves, run), carry, run.steps + 1, run.record_every)
+    carry, records = executor_named(way.executor)(
+        TimeStep.of(run), way.batch(leaves, run), carry, run.steps + 1, run.record_every
+    )
     return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
 
 
 def _all_steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
-    """All steps of one run, in calls that are short enough for Python to see Ctrl-C between them; the numbers are those of one call."""
+    """All steps of one run, in calls that are short enough for Python to see Ctrl-C between them;
+    the numbers are those of one call.
+    """
     steps = run.steps + 1
     if way.executor != "native" or steps * plan.LONGEST_ONE_RUN["native"] <= plan.NATIVE_UNSEEN:
         return _steps(way, run, leaves, carry)
@@ -351,13 +398,18 @@ def _all_steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, A
 def _nodes_of(way: Way, run: Run, leaves: list) -> int:
     """Nodes of a step's program, which is traced once."""
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    return _nodes_by_structure(way, run._replace(steps=0, record_every=run.record_every and 1), shapes)
+    return _nodes_by_structure(
+        way, run._replace(steps=0, record_every=run.record_every and 1), shapes
+    )
 
 
 @lru_cache(maxsize=256)
 def _nodes_by_structure(way: Way, run: Run, shapes: tuple) -> int:
     found = list[int]()
-    jax.eval_shape(lambda leaves: found.append(_program(way.batch(leaves, run), run).size), [jax.ShapeDtypeStruct(*x) for x in shapes])
+    jax.eval_shape(
+        lambda leaves: found.append(_program(way.batch(leaves, run), run).size),
+        [jax.ShapeDtypeStruct(*x) for x in shapes],
+    )
     return found[0]
 
 
@@ -365,27 +417,38 @@ def _nodes_by_structure(way: Way, run: Run, shapes: tuple) -> int:
 def _stretch(way: Way, run: Run, leaves: list, carry: Carry, first: jax.Array) -> tuple[Carry, Any]:
     """`run.steps` steps of one run from step `first` on, by the kernel for many steps."""
     executor = lowered_on(partial(native.run, first=first, narrow=True), native.pack, native.unpack)
-    carry, records = executor(TimeStep.of(run), way.batch(leaves, run), carry, run.steps, run.record_every)
+    carry, records = executor(
+        TimeStep.of(run), way.batch(leaves, run), carry, run.steps, run.record_every
+    )
     return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _after_steps(way: Way, run: Run, leaves: list, carry: Carry, at_start: Probed) -> Outcome:
-    return jax.tree.map(lambda x: x[0], end(executor_named(way.executor), way.batch(leaves, run), run, carry, at_start))
+    return jax.tree.map(
+        lambda x: x[0],
+        end(executor_named(way.executor), way.batch(leaves, run), run, carry, at_start),
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _one_by_scan(structure: Any, run: Run, leaves: list) -> Outcome:
-    return _scanned(jax.tree.unflatten(structure, leaves), None, False, lambda batch: run_all(scan, batch, run))
+    return _scanned(
+        jax.tree.unflatten(structure, leaves), None, False, lambda batch: run_all(scan, batch, run)
+    )
 
 
-def run_for_reverse(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: jax.Array | None = None) -> Outcome:
+def run_for_reverse(
+    scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: jax.Array | None = None
+) -> Outcome:
     """One run for reverse mode: few states are in memory at a time; `run` records nothing."""
     inputs = inputs_of(scenario, folds, dt, run, noise)
     return run_all(checkpointed, Batch.of(inputs, None, _shape(inputs, None, True)), run)
 
 
-def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps: int = 1) -> tuple[Any, Any]:
+def run_from(
+    scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps: int = 1
+) -> tuple[Any, Any]:
     """A step of a kind of its own, made `steps` times from each of many states.
 
     Args:
@@ -398,13 +461,23 @@ def run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps:
     Returns:
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
-    return _run_from(scenario, dt, carry, step=step, run=Run(steps, mechanism=known_of(scenario) if automatic()[0] != "xla" else None))
+    return _run_from(
+        scenario,
+        dt,
+        carry,
+        step=step,
+        run=Run(steps, mechanism=known_of(scenario) if automatic()[0] != "xla" else None),
+    )
 
 
 @partial(jax.jit, static_argnames=("step", "run"))
-def _run_from(scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, run: Run) -> tuple[Any, Any]:
+def _run_from(
+    scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, run: Run
+) -> tuple[Any, Any]:
     inputs, steps = inputs_of(scenario, (), dt, run), run.steps
-    batch = Batch.of(inputs, None, plan.STATES, run.mechanism)._replace(runs=jax.tree.leaves(carry)[0].shape[0])
+    batch = Batch.of(inputs, None, plan.STATES, run.mechanism)._replace(
+        runs=jax.tree.leaves(carry)[0].shape[0]
+    )
     name = automatic()[0]
     if name != "xla" and operations(inputs) <= plan.LONG_EVALUATION:
         try:
@@ -425,18 +498,20 @@ def run_batch_jvp(
     backend: str = "auto",
     nested: bool = False,
 ) -> Tangents:
-    """Values of a batch and their derivatives along P directions in the space of leaves, in one pass; call it inside `jit`.
+    """Values of a batch and their derivatives along P directions in the space of leaves, in one
+    pass; call it inside `jit`.
 
     Args:
       scenario, varied, folds, dt, run, nested: as `run_batch`.
-      backend: as `run_batch`; "auto" makes those of long programs (many joints and directions), which take minutes to compile, one run a
-        direction.
-      directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run: direction p moves each of these
-        leaves along its p-th row.  For the derivative by each entry of one gain of two joints: `{"controller.K2": np.eye(2)}`.
+      backend: as `run_batch`; "auto" makes those of long programs (many joints and directions),
+        which take minutes to compile, one run a direction.
+      directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run:
+        direction p moves each of these leaves along its p-th row.  For the derivative by each entry
+        of one gain of two joints: `{"controller.K2": np.eye(2)}`.
 
     Returns:
-      The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton matrices (batch, P, P) of the
-      folds that offer `curvature`.
+      The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton
+      matrices (batch, P, P) of the folds that offer `curvature`.
 
     Raises:
       ValueError: an unknown backend or path.
@@ -448,13 +523,24 @@ def run_batch_jvp(
         if backend == "auto":
             program, _ = program_of(TimeStep(run.method), batch, carry_shapes(batch, run.method))
             if not plan.lowers_derivatives(name, _nodes(name, program), along.tangents):
-                kept = numbers_of(inputs, outer_vectors) * along.tangents * (run.steps + 1) * (batch.runs or 1)
+                kept = (
+                    numbers_of(inputs, outer_vectors)
+                    * along.tangents
+                    * (run.steps + 1)
+                    * (batch.runs or 1)
+                )
                 by_columns = name in plan.COMPILED.values() and plan.keeps_columns(1, kept)
-                return run_by_columns(executor_named(name), batch, along, run) if by_columns else on_scan()
+                return (
+                    run_by_columns(executor_named(name), batch, along, run)
+                    if by_columns
+                    else on_scan()
+                )
         return run_with_tangents(executor_named(name), batch, along, run)
 
     def on_scan():
-        return _scanned(inputs, varied, nested, lambda batch: run_with_tangents(scan, batch, along, run))
+        return _scanned(
+            inputs, varied, nested, lambda batch: run_with_tangents(scan, batch, along, run)
+        )
 
     return with_fallback(backend, run_on, on_scan)
 
@@ -469,7 +555,8 @@ def chosen_backend(
     method: str,
     mechanism: Mechanism | None = None,
 ) -> str:
-    """The backend that a batch will run on, fallbacks and their warnings included; builds the kernels if it is a compiled one.
+    """The backend that a batch will run on, fallbacks and their warnings included; builds the
+    kernels if it is a compiled one.
 
     Args:
       backend, scenario, folds, dt, method, mechanism: as `run_batch`, and its `run`.
@@ -483,7 +570,9 @@ def chosen_backend(
     """
     flat, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
     run = Run(1, method, mechanism=mechanism)
-    return _chosen_backend(backend, run, automatic(), structure, tuple((x.shape, x.dtype) for x in flat))
+    return _chosen_backend(
+        backend, run, automatic(), structure, tuple((x.shape, x.dtype) for x in flat)
+    )
 
 
 def _up_to_the_end(executor: Executor, batch: Batch, run: Run) -> Any:
@@ -492,15 +581,21 @@ def _up_to_the_end(executor: Executor, batch: Batch, run: Run) -> Any:
     return executor(TimeStep.of(run), batch, carry, run.steps + 1, None)
 
 
-def _judge_for_xla(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+def _judge_for_xla(
+    step: Any, batch: Batch, carry: Any, steps: int, every: int | None
+) -> tuple[Any, Any]:
     """An executor that makes the program and goes no further: XLA has nothing to build ahead."""
     xla.compilable(program_of(step, batch, carry).program)
     return carry, ()
 
 
 @lru_cache(maxsize=64)
-def _chosen_backend(backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple) -> str:
-    """`chosen_backend` by structure and shapes, on which alone it depends: the trace takes longer than many a study."""
+def _chosen_backend(
+    backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple
+) -> str:
+    """`chosen_backend` by structure and shapes, on which alone it depends: the trace takes longer
+    than many a study.
+    """
 
     def trace(leaves):
         scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)

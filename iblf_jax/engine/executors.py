@@ -1,4 +1,6 @@
-"""What steps a batch: loops of XLA over the step as it is (`scan`, `checkpointed`), or over its scalar program (`lowered_on`)."""
+"""What steps a batch: loops of XLA over the step as it is (`scan`, `checkpointed`), or over its
+scalar program (`lowered_on`).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from iblf_jax.kernels.packed import Lowered, Packed, Shapes, lowered, pack, unpa
 
 
 def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-    """All steps of all runs in `jax.lax.scan`: any scenario, any device, and differentiable in either mode."""
+    """All steps of all runs in `jax.lax.scan`: any scenario, any device, and differentiable in
+    either mode.
+    """
     shape = batch.shape
     form = Form(shape.rolled, machine_function) if shape.function == "parts" else Form(shape.rolled)
 
@@ -29,28 +33,41 @@ def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> 
 
 
 def _scanned(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-    """One run's steps; the step is compiled once, so what is not to be kept is made and thrown away."""
+    """One run's steps; the step is compiled once, so what is not to be kept is made and thrown
+    away.
+    """
     if every is None:
-        return jax.lax.scan(lambda carry, index: (step(carry, index)[0], None), carry, jnp.arange(steps))
+        return jax.lax.scan(
+            lambda carry, index: (step(carry, index)[0], None), carry, jnp.arange(steps)
+        )
     if every == 1:
         return jax.lax.scan(step, carry, jnp.arange(steps))
     every = min(every, steps)
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, carry, jnp.int32(0))[1])
+    blank = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, carry, jnp.int32(0))[1]
+    )
 
     def one(carried, index):
         before, record = carried
         after, new = step(before, index)
-        return (keep_if(index < steps, after, before), keep_if(index % every == 0, new, record)), None
+        return (
+            keep_if(index < steps, after, before),
+            keep_if(index % every == 0, new, record),
+        ), None
 
     def block(carried, first):
         carried, _ = jax.lax.scan(one, carried, first + jnp.arange(every))
         return carried, carried[1]
 
-    (carry, _), records = jax.lax.scan(block, (carry, blank), every * jnp.arange(-(-steps // every)))
+    (carry, _), records = jax.lax.scan(
+        block, (carry, blank), every * jnp.arange(-(-steps // every))
+    )
     return carry, records
 
 
-def checkpointed(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+def checkpointed(
+    step: Any, batch: Batch, carry: Any, steps: int, every: int | None
+) -> tuple[Any, Any]:
     """As `scan` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
 
     Only every T^(2/3)-th state is kept; the others are computed again, in three nested loops.
@@ -62,7 +79,12 @@ def checkpointed(step: Any, batch: Batch, carry: Any, steps: int, every: int | N
     def one(inputs, carry):
         @jax.checkpoint
         def single(carry, index):
-            return keep_if(index < steps, step(inputs, carry, index, Form(batch.shape.rolled))[0], carry), None
+            return (
+                keep_if(
+                    index < steps, step(inputs, carry, index, Form(batch.shape.rolled))[0], carry
+                ),
+                None,
+            )
 
         @jax.checkpoint
         def few(carry, first):
@@ -79,11 +101,15 @@ def checkpointed(step: Any, batch: Batch, carry: Any, steps: int, every: int | N
 
 @lru_cache(maxsize=64)
 def _on_leaves(step: Any, treedef, is_lane: tuple[bool, ...], carry_treedef) -> Callable:
-    """A step as a function of lists of leaves, for `lowered`; the same object for the same structure."""
+    """A step as a function of lists of leaves, for `lowered`; the same object for the same
+    structure.
+    """
 
     def on_leaves(shared, lane, carry, index):
         inputs = Leaves(treedef, is_lane, [], []).together(shared, lane)
-        after, records = step(inputs, jax.tree.unflatten(carry_treedef, carry), index, Form(scalar=True))
+        after, records = step(
+            inputs, jax.tree.unflatten(carry_treedef, carry), index, Form(scalar=True)
+        )
         return jax.tree.leaves(after), records
 
     return on_leaves
@@ -104,16 +130,28 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
     return lowered(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
 
 
-def lowered_on(run_program: Callable[..., tuple[Packed, list[jax.Array]]], pack: Callable = pack, unpack: Callable = unpack) -> Executor:
-    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`, `xla.run`), between `pack` and `unpack`."""
+def lowered_on(
+    run_program: Callable[..., tuple[Packed, list[jax.Array]]],
+    pack: Callable = pack,
+    unpack: Callable = unpack,
+) -> Executor:
+    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`,
+    `xla.run`), between `pack` and `unpack`.
+    """
 
-    def executor(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    def executor(
+        step: Any, batch: Batch, carry: Any, steps: int, every: int | None
+    ) -> tuple[Any, Any]:
         found, runs, dtype = program_of(step, batch, carry), batch.runs or 1, batch.dtype
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
-        shared = pack([x[None] for x in batch.leaves.shared], Shapes.of(batch.leaves.shared), dtype, 1).floats[:, 0]
+        shared = pack(
+            [x[None] for x in batch.leaves.shared], Shapes.of(batch.leaves.shared), dtype, 1
+        ).floats[:, 0]
         lane = pack(batch.leaves.lane, Shapes.of(batch.leaves.lane, 1), dtype, runs).floats
-        after, arrays = run_program(found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every)
+        after, arrays = run_program(
+            found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every
+        )
         records = unpacked_records(found.records, arrays) if every else ()
         return jax.tree.unflatten(treedef, unpack(after, shapes, runs)), records
 

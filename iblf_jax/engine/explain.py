@@ -28,7 +28,12 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 
 LIBRARY_CALL = 40
 """Vector instructions that a function of the C library takes for a run, roughly."""
-NAMES = {SHARED: "once", SHARED | TIME: "a step, shared", LANE: "a run", LANE | TIME: "a step and run"}
+NAMES = {
+    SHARED: "once",
+    SHARED | TIME: "a step, shared",
+    LANE: "a run",
+    LANE | TIME: "a step and run",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,15 +43,19 @@ class Explanation:
     counts: dict[str, Counter]
     """How often -> operation -> number."""
     slots: float
-    """Vector instructions for a step of a register full of runs, a product and the sum that it goes into counted as one."""
+    """Vector instructions for a step of a register full of runs, a product and the sum that it goes
+    into counted as one."""
     width: int
     """Runs in a register of 64 bytes."""
     limit: float
-    """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on every core."""
+    """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on
+    every core."""
     backend: str = ""
-    """What a batch runs on here when nobody says otherwise, and why that is not compiled code if it is not."""
+    """What a batch runs on here when nobody says otherwise, and why that is not compiled code if it
+    is not."""
     derivatives: str = ""
-    """What makes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and why that is not compiled code if it is not."""
+    """What makes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and why
+    that is not compiled code if it is not."""
 
     def __repr__(self) -> str:
         lines = ["operations done        number  which"]
@@ -61,8 +70,11 @@ class Explanation:
 
 
 @notices.each_warning_once
-def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk4", metrics=None) -> Explanation:
-    """What one step of a scenario costs on a compiled backend; where the law is sampled, a step in which it runs and a command arrives.
+def explain(
+    scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk4", metrics=None
+) -> Explanation:
+    """What one step of a scenario costs on a compiled backend; where the law is sampled, a step in
+    which it runs and a command arrives.
 
     Args:
       scenario: what runs; its floating-point type decides the width of a register of runs.
@@ -83,25 +95,44 @@ def explain(scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk
     tableau(method)
     if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
-    leaves = {path: jnp.asarray(get(scenario, path))[None] for path in {"initial.q", "initial.dq", *varied}}
+    leaves = {
+        path: jnp.asarray(get(scenario, path))[None]
+        for path in {"initial.q", "initial.dq", *varied}
+    }
     noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
-    one = Batch.of(inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), Run(1), None), leaves | noise, mechanism=known_of(scenario))
+    one = Batch.of(
+        inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), Run(1), None),
+        leaves | noise,
+        mechanism=known_of(scenario),
+    )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = automatic()
     backend = f"{name}: {reason}" if reason else name
-    columns = f"by numbers of the scenario on {name}, one run a number, first and second ones; others by plain JAX"
+    columns = (
+        f"by numbers of the scenario on {name}, one run a number, first and second ones; others by"
+        " plain JAX"
+    )
     derivatives = f"by plain JAX: {reason}" if reason else columns
-    return Explanation(counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives)
+    return Explanation(
+        counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives
+    )
 
 
 def instructions(program: Program, width: int) -> float:
     """Vector instructions of a step for a register of runs (class LANE | TIME)."""
     classes, uses = program.classes(), Counter(a for node in program.nodes for a in node.args)
     fused = {
-        next((a for a in node.args if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == LANE | TIME), None)
+        next(
+            (
+                a
+                for a in node.args
+                if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == LANE | TIME
+            ),
+            None,
+        )
         for node in program.nodes
         if node.op in ("add", "sub")
     }
@@ -116,6 +147,8 @@ def instructions(program: Program, width: int) -> float:
 def _clock() -> float:
     """Cycles a second: the highest of the first core where it is known, else 3e9."""
     try:
-        return 1e3 * float(Path("/sys/devices/system/cpu/cpu0/cpufreq/cpuinfo_max_freq").read_text())
+        return 1e3 * float(
+            Path("/sys/devices/system/cpu/cpu0/cpufreq/cpuinfo_max_freq").read_text()
+        )
     except (OSError, ValueError):
         return 3e9

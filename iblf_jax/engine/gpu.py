@@ -1,12 +1,14 @@
 """The gpu executor: a whole rollout in one CUDA kernel, one run a thread, its numbers in registers.
 
-The kernel is the C that `native` has, from the same emitter, in which a name stands for one run's number rather than for a vector of
-runs.  NVRTC compiles it for the GPU at hand; the system's C++ compiler builds the few lines that launch it from within jit
-(`c/launch.h`), so neither nvcc nor CUDA's headers are needed.  Long rollouts are launched in stretches of steps, whose signals of
-time another kernel tabulates first.
+The kernel is the C that `native` has, from the same emitter, in which a name stands for one run's
+number rather than for a vector of runs.  NVRTC compiles it for the GPU at hand; the system's C++
+compiler builds the few lines that launch it from within jit (`c/launch.h`), so neither nvcc nor
+CUDA's headers are needed.  Long rollouts are launched in stretches of steps, whose signals of time
+another kernel tabulates first.
 
-The tests run on a GPU where there is one; elsewhere the same source and the same launcher run on a CPU, against a driver that loops over
-the threads, and are compiled for GPUs where NVRTC is installed.
+The tests run on a GPU where there is one; elsewhere the same source and the same launcher run on a
+CPU, against a driver that loops over the threads, and are compiled for GPUs where NVRTC is
+installed.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ _registered: set[str] = set()
 
 
 def architecture() -> str:
-    """What NVRTC calls this process's GPUs, as in "sm_90"; ToolchainError if they are none that it can compile for."""
+    """What NVRTC calls this process's GPUs, as in "sm_90"; ToolchainError if they are none that it
+    can compile for.
+    """
     places = devices.default()
     found = {str(getattr(device, "compute_capability", "")) for device in places}
     if len(found) > 1:
@@ -68,7 +72,8 @@ def launcher(program: Program, shared: int, lane: int, image: bytes) -> str:
 
 @lru_cache(maxsize=64)
 def kernel(program: Program, shared: int, lane: int, target: str) -> str:
-    """The name under which the launcher of a program's kernel is registered; builds both if need be.
+    """The name under which the launcher of a program's kernel is registered; builds both if need
+    be.
 
     Args:
       program: what a step does.
@@ -83,27 +88,62 @@ def kernel(program: Program, shared: int, lane: int, target: str) -> str:
     library, key = built(launcher(program, shared, lane, image))
     name = f"iblf_jax_{key}"
     if name not in _registered:
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel), platform="CUDA")
+        jax.ffi.register_ffi_target(
+            name,
+            jax.ffi.pycapsule(loaded(library, "iblf_jax_kernel").iblf_jax_kernel),
+            platform="CUDA",
+        )
         _registered.add(name)
     return name
 
 
-def call(name: str, program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None, threads: int):
+def call(
+    name: str,
+    program: Program,
+    shared: jax.Array,
+    lane: jax.Array,
+    carry: Packed,
+    steps: int,
+    every: int | None,
+    threads: int,
+):
     """`run` by the launcher of a name, with so many threads in a block."""
     layout = Layout.of(program)
     runs = carry.floats.shape[1]
     room = [(1, len(layout.constants)), (max(min(steps, plan.GPU_STRETCH), 1), len(layout.columns))]
-    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + [jax.ShapeDtypeStruct(shape, program.dtype) for shape in room]
+    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + [
+        jax.ShapeDtypeStruct(shape, program.dtype) for shape in room
+    ]
     outputs += record_shapes(program, runs, steps, every)
-    attributes = {"steps": np.int64(steps), "every": np.int64(every or 0), "threads": np.int64(threads)}
-    floats, ints, _, _, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, **attributes)
+    attributes = {
+        "steps": np.int64(steps),
+        "every": np.int64(every or 0),
+        "threads": np.int64(threads),
+    }
+    floats, ints, _, _, *records = jax.ffi.ffi_call(name, outputs)(
+        shared.reshape(1, -1), lane, *carry, **attributes
+    )
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]
 
 
 def run(
-    program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None
+    program: Program,
+    shared: jax.Array,
+    lane: jax.Array,
+    carry: Packed,
+    steps: int,
+    every: int | None,
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs; arguments and results as `native.run`."""
     name = kernel(program, shared.size, lane.shape[0], architecture())
     processors = getattr(devices.default()[0], "core_count", plan.GPU_PROCESSORS)
-    return call(name, program, shared, lane, carry, steps, every, plan.gpu_threads(carry.floats.shape[1], processors))
+    return call(
+        name,
+        program,
+        shared,
+        lane,
+        carry,
+        steps,
+        every,
+        plan.gpu_threads(carry.floats.shape[1], processors),
+    )

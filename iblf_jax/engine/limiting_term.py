@@ -1,11 +1,16 @@
-"""Which term of a loop limits how slowly it may be sampled, or how large a step may be: found by scaling each term and looking.
+"""Which term of a loop limits how slowly it may be sampled, or how large a step may be: found by
+scaling each term and looking.
 
-The contribution of a term is a leaf of the scenario: a gain of law or observer, the weight of the barrier, the delay, or the time
-constant of a filter or a drive.  Each is scaled by s = 2^(-1/2), 2^-1, ... at the same instants, the others as they are, until
+The contribution of a term is a leaf of the scenario: a gain of law or observer, the weight of the
+  barrier, the delay, or the time
+constant of a filter or a drive.  Each is scaled by s = 2^(-1/2), 2^-1, ... at the same instants,
+the others as they are, until
 
-    rho(s) < 1,   rho: the spectral radius of the map from one period to the next, or dt |lambda|_max over the integrator's range
+    rho(s) < 1,   rho: the spectral radius of the map from one period to the next, or dt
+    |lambda|_max over the integrator's range
 
-for one of them.  That one limits the loop: of all terms it has to change least.  A term whose scaling never helps, such as a gain K2 whose
+for one of them.  That one limits the loop: of all terms it has to change least.  A term whose
+  scaling never helps, such as a gain K2 whose
 damping the loop needs, is not named.
 """
 
@@ -33,7 +38,8 @@ LEVELS = 14
 INSTANTS = 4
 """States that are looked at together."""
 NEAREST = 0.98
-"""|xi| up to which a state of the run counts: beyond it the guard is near, and every slope is steep."""
+"""|xi| up to which a state of the run counts: beyond it the guard is near, and every slope is
+steep."""
 WORDS = {
     "weight": "the slope of the barrier",
     "delay": "the delay",
@@ -51,7 +57,8 @@ class Term(NamedTuple):
     words: str
     path: str
     is_inverse: bool = False
-    """Whether the leaf is divided where the term is scaled: a bandwidth, where the term is a lag."""
+    """Whether the leaf is divided where the term is scaled: a bandwidth, where the term is a
+    lag."""
 
 
 class Limit(NamedTuple):
@@ -65,7 +72,10 @@ class Limit(NamedTuple):
     def advice(self) -> str:
         """What to change, in words."""
         if self.term.is_inverse:
-            return f"raise {self.term.path} to {_two_digits(1.0 / self.scale, math.ceil):g} times its value"
+            return (
+                f"raise {self.term.path} to {_two_digits(1.0 / self.scale, math.ceil):g} times its"
+                " value"
+            )
         return f"lower {self.term.path} to {_two_digits(self.scale, math.floor):g} times its value"
 
 
@@ -88,7 +98,10 @@ def limiting_term(run: Any) -> Limit | None:
             continue
         for level in range(1, LEVELS + 1):
             scale = 2.0 ** (-level / 2)
-            found = {term: excess(_scaled(scenario, term, scale), times, states) for term in terms_of(scenario)}
+            found = {
+                term: excess(_scaled(scenario, term, scale), times, states)
+                for term in terms_of(scenario)
+            }
             least = min(found, key=found.__getitem__, default=None)
             if least is not None and found[least] < 1.0:
                 return Limit(least, scale)
@@ -121,11 +134,15 @@ def terms_of(scenario: Scenario) -> Iterator[Term]:
 
 def _scaled(scenario: Scenario, term: Term, scale: float) -> Scenario:
     value = get(scenario, term.path)
-    return with_parameters(scenario, {term.path: value / scale if term.is_inverse else value * scale})
+    return with_parameters(
+        scenario, {term.path: value / scale if term.is_inverse else value * scale}
+    )
 
 
 def _excess(scenario: Scenario, run: Any) -> Callable[[Scenario, jax.Array, LoopState], float]:
-    """How far a loop is from its limit at some instants, 1 at the limit: its spectral radius, or its modes times dt."""
+    """How far a loop is from its limit at some instants, 1 at the limit: its spectral radius, or
+    its modes times dt.
+    """
 
     def radius(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
         return _largest_eigenvalue(_period_maps(scenario, times, states))
@@ -162,9 +179,11 @@ def _jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.A
 
 
 def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopState]]:
-    """Times and states, one group after the other: the start and along the reference, and where the run was nearest to its bounds.
+    """Times and states, one group after the other: the start and along the reference, and where the
+    run was nearest to its bounds.
 
-    What is unstable in the first group is so whatever the run does; a run that comes near a bound after that has steep slopes besides.
+    What is unstable in the first group is so whatever the run does; a run that comes near a bound
+    after that has steep slopes besides.
     """
     dtype = scenario.initial.q.dtype
     recorded = np.asarray(run.t)
@@ -182,4 +201,6 @@ def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopSta
 @jax.jit
 def _states_at(scenario: Scenario, q: jax.Array, dq: jax.Array) -> LoopState:
     """States of a loop that starts at these positions and velocities, (INSTANTS, ...)."""
-    return jax.vmap(lambda q, dq: initial_state(dataclasses.replace(scenario, initial=Initial(q, dq))))(q, dq)
+    return jax.vmap(
+        lambda q, dq: initial_state(dataclasses.replace(scenario, initial=Initial(q, dq)))
+    )(q, dq)

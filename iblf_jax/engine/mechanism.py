@@ -1,9 +1,12 @@
-"""What is compiled in: which numbers of a robot's geometry are 0, 1 or -1, which are equal to others, and which factors of a law are 1.
+"""What is compiled in: which numbers of a robot's geometry are 0, 1 or -1, which are equal to
+others, and which factors of a law are 1.
 
-Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree.  A scalar program that knows it needs fewer
-operations.  Numbers themselves are never compiled in, nor anything of masses, gains and loads, so new ones compile nothing: a robot says
-which these are (`geometry_fields`).  A law has factors that are mostly 1, such as the weight of a barrier (`unit_factors`): one that is 1
-costs nothing.  What differs between runs is not shared, and nothing is known of it.
+Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree.  A
+scalar program that knows it needs fewer operations.  Numbers themselves are never compiled in, nor
+anything of masses, gains and loads, so new ones compile nothing: a robot says which these are
+(`geometry_fields`).  A law has factors that are mostly 1, such as the weight of a barrier
+(`unit_factors`): one that is 1 costs nothing.  What differs between runs is not shared, and nothing
+  is known of it.
 """
 
 from __future__ import annotations
@@ -24,12 +27,16 @@ QUATERNIONS = ("rotation", "tip_rotation")
 
 
 class Mechanism(NamedTuple):
-    """What is known of every number of a scenario, leaf after leaf, None where nothing is; hashable."""
+    """What is known of every number of a scenario, leaf after leaf, None where nothing is;
+    hashable.
+    """
 
     numbers: tuple[Known | None, ...]
 
     def of_shared(self, is_lane: Sequence[bool], sizes: Sequence[int]) -> tuple[Known | None, ...]:
-        """What is known of the numbers that are shared, for leaves of these sizes of which the scenario's come first."""
+        """What is known of the numbers that are shared, for leaves of these sizes of which the
+        scenario's come first.
+        """
         place: dict[int, int] = {}
         number = 0
         for lane, size in zip(is_lane, sizes, strict=True):
@@ -40,19 +47,29 @@ class Mechanism(NamedTuple):
         for i, known in enumerate(self.numbers):
             if known is not None and i in place:
                 same = known.same if known.same is None else place.get(known.same)
-                found[place[i]] = known._replace(same=same, sign=known.sign if same is not None else 1)
+                found[place[i]] = known._replace(
+                    same=same, sign=known.sign if same is not None else 1
+                )
         return tuple(found)
 
 
 def _declared(part: Any, attribute: str) -> tuple[str, ...]:
-    """The fields of which a class declares that they may be compiled in; none where users have a field of that name."""
+    """The fields of which a class declares that they may be compiled in; none where users have a
+    field of that name.
+    """
     names = getattr(type(part), attribute, ())
-    return names if isinstance(names, tuple) and all(isinstance(name, str) for name in names) else ()
+    return (
+        names if isinstance(names, tuple) and all(isinstance(name, str) for name in names) else ()
+    )
 
 
 def mechanism_of(scenario: Scenario) -> Mechanism | None:
-    """What is known of the numbers of a scenario's robots; None where they are tracers, or no robot has a geometry."""
-    robots = {name: _declared(getattr(scenario, name), "geometry_fields") for name in ("plant", "model")}
+    """What is known of the numbers of a scenario's robots; None where they are tracers, or no robot
+    has a geometry.
+    """
+    robots = {
+        name: _declared(getattr(scenario, name), "geometry_fields") for name in ("plant", "model")
+    }
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
     numbers: list[Known | None] = []
@@ -68,9 +85,19 @@ def mechanism_of(scenario: Scenario) -> Mechanism | None:
             for i, x in enumerate(flat):
                 known = _known(x, flat[i - i % row : i], len(numbers) - i % row)
                 first = numbers[known.same] if known and known.same is not None else None
-                # The model's numbers are the plant's, so what is equal to one of them is equal to that of the plant.
-                numbers.append(known._replace(same=first.same) if known and first and first.same is not None else known)
-                if twin and numbers[-1] == Known() and twin[1].shape == values.shape and twin[1].flat[i] == x:
+                # The model's numbers are the plant's, so what is equal to one of them is equal to
+                # that of the plant.
+                numbers.append(
+                    known._replace(same=first.same)
+                    if known and first and first.same is not None
+                    else known
+                )
+                if (
+                    twin
+                    and numbers[-1] == Known()
+                    and twin[1].shape == values.shape
+                    and twin[1].flat[i] == x
+                ):
                     numbers[-1] = Known(same=twin[0] + i)
         else:
             numbers += [None] * int(np.size(leaf))
@@ -100,7 +127,9 @@ def known_of(scenario: Scenario) -> Mechanism | None:
 
 
 def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
-    """The factors of a scenario's law that may be compiled in where they are 1, by where they are, but for tracers."""
+    """The factors of a scenario's law that may be compiled in where they are 1, by where they are,
+    but for tracers.
+    """
     path: tuple[str, ...] = ("controller",)
     found: dict[tuple[str, ...], Any] = {}
     for law in layers(scenario.controller):
@@ -111,7 +140,9 @@ def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
 
 
 def _known(x: float, before: np.ndarray, start: int) -> Known | None:
-    """What is known of a number, given those before it in its row, of which the first has the number `start`."""
+    """What is known of a number, given those before it in its row, of which the first has the
+    number `start`.
+    """
     if not np.isfinite(x):
         return None
     if x in (0.0, 1.0, -1.0):

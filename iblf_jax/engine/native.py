@@ -1,7 +1,7 @@
 """The native executor: a program's C, built by the system's compiler and called from within jit.
 
-A kernel is registered with XLA under a name that holds the hash of its content, so a program that JAX keeps in its persistent
-cache finds the same kernel in another process.
+A kernel is registered with XLA under a name that holds the hash of its content, so a program that
+JAX keeps in its persistent cache finds the same kernel in another process.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ def kernel(program: Program, shared: int, lane: int, narrow: bool) -> str:
 @lru_cache(maxsize=2)
 def _turner(name: str) -> str:
     """The name under which `iblf_jax_pack` or `iblf_jax_unpack` of `c/leaves.h` is registered."""
-    text = "\n".join(["#define RECORDED 0", "#define RECORDED_SIZES {0}", header("frame.h"), header("leaves.h")])
+    text = "\n".join(
+        ["#define RECORDED 0", "#define RECORDED_SIZES {0}", header("frame.h"), header("leaves.h")]
+    )
     library, key = built(text)
     return _register(f"iblf_jax_{name}_{key}", library, f"iblf_jax_{name}")
 
@@ -76,7 +78,9 @@ def _turner(name: str) -> str:
 def _register(target: str, library: Path, function: str) -> str:
     """Makes a function of a library known to XLA under a name, and gives the name."""
     if target not in _registered:
-        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(loaded(library, function), function)), platform="cpu")
+        jax.ffi.register_ffi_target(
+            target, jax.ffi.pycapsule(getattr(loaded(library, function), function)), platform="cpu"
+        )
         _registered.add(target)
     return target
 
@@ -85,7 +89,10 @@ def pack(leaves: Sequence[jax.Array], shapes: Shapes, dtype, runs: int) -> Packe
     """As `packed.pack`, in one call."""
     kinds = shapes.kinds()
     floats = kinds.count("f")
-    rows = [jax.ShapeDtypeStruct((floats, runs), dtype), jax.ShapeDtypeStruct((len(kinds) - floats, runs), jnp.int32)]
+    rows = [
+        jax.ShapeDtypeStruct((floats, runs), dtype),
+        jax.ShapeDtypeStruct((len(kinds) - floats, runs), jnp.int32),
+    ]
     return Packed(*jax.ffi.ffi_call(_turner("pack"), rows)(*leaves))
 
 
@@ -115,17 +122,23 @@ def run(
       steps: how many.
       every: sample every so-many-th step, or None.
       first: number of the first step, () int32, a multiple of `every`.
-      narrow: whether the kernel is the one for few runs of many steps; by the number of steps if not given.
+      narrow: whether the kernel is the one for few runs of many steps; by the number of steps if
+        not given.
 
     Returns:
-      The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every `every`-th step.
+      The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every
+      `every`-th step.
     """
     runs = carry.floats.shape[1]
     narrow = _is_narrow(program, runs, steps) if narrow is None else narrow
     name = kernel(program, shared.size, lane.shape[0], narrow)
-    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(program, runs, steps, every)
+    outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry] + record_shapes(
+        program, runs, steps, every
+    )
     settings = jnp.asarray(np.asarray([[0, steps, every or 0, threads()]], np.int32))
     if not isinstance(first, int) or first:
         settings = settings.at[0, 0].set(first)
-    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(shared.reshape(1, -1), lane, *carry, settings)
+    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(
+        shared.reshape(1, -1), lane, *carry, settings
+    )
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]

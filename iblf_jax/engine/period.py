@@ -1,7 +1,9 @@
-"""At which period a sampled loop gets too slow: where its map from one period to the next stops being a contraction.
+"""At which period a sampled loop gets too slow: where its map from one period to the next stops
+being a contraction.
 
-The map's derivative is looked at where the run starts and along the reference; its spectral radius, the largest of these, grows past 1 at
-some period.  A sample of that search is a number, so nothing is compiled again but where more commands are under way.
+The map's derivative is looked at where the run starts and along the reference; its spectral radius,
+the largest of these, grows past 1 at some period.  A sample of that search is a number, so nothing
+is compiled again but where more commands are under way.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ RADII, MARGINS = (1e-3, 10.0), (1.0, 1000.0)
 
 
 def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
-    """The largest spectral radius of the map from a period to the next, at the start and along the reference [1].
+    """The largest spectral radius of the map from a period to the next, at the start and along the
+    reference [1].
 
     Args:
       scenario: canonical, with a sampling.
@@ -44,8 +47,12 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     """
     sampling: Any = scenario.sampling
     dtype = scenario.initial.q.dtype
-    changed = dataclasses.replace(sampling, period=jnp.asarray(period, dtype), queue=under_way(float(sampling.delay), period))
-    maps = np.asarray(_maps(dataclasses.replace(scenario, sampling=changed), jnp.asarray(times, dtype)), float)
+    changed = dataclasses.replace(
+        sampling, period=jnp.asarray(period, dtype), queue=under_way(float(sampling.delay), period)
+    )
+    maps = np.asarray(
+        _maps(dataclasses.replace(scenario, sampling=changed), jnp.asarray(times, dtype)), float
+    )
     return float(np.max(np.abs(np.linalg.eigvals(maps)))) if np.all(np.isfinite(maps)) else np.inf
 
 
@@ -56,23 +63,31 @@ def _maps(scenario: Scenario, times: jax.Array) -> jax.Array:
 
     def at(t: jax.Array, state: LoopState) -> jax.Array:
         # The torque of the instant is the one that the law commands there.
-        state = sampled(scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype))
+        state = sampled(
+            scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype)
+        )
         return period_map(scenario, state, jacobian(scenario, t, state))
 
     return jax.vmap(at)(jnp.concatenate([zero[None], times]), start_and_along(scenario, times))
 
 
 @notices.each_warning_once
-def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0) -> float:
-    """A round period [s] that a law may run at: the loop would still be stable at `margin` times it.
+def recommended_period(
+    scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0
+) -> float:
+    """A round period [s] that a law may run at: the loop would still be stable at `margin` times
+    it.
 
-        rho( d x(t_(k+1)) / d x(t_k) ) < radius,   x: plant, sensor, law, observer, actuator, commands under way
+        rho( d x(t_(k+1)) / d x(t_k) ) < radius,   x: plant, sensor, law, observer, actuator,
+        commands under way
 
-    at the start and along the reference, for every period up to margin times the one that is returned.  That is necessary, not
-    sufficient: it says nothing of noise, nor of how far the bounds are.  Rounded down to 1, 2 or 5 times a power of ten.
+    at the start and along the reference, for every period up to margin times the one that is
+    returned.  That is necessary, not sufficient: it says nothing of noise, nor of how far the
+      bounds are.  Rounded down to 1, 2 or 5 times a power of ten.
 
     Args:
-      scenario: what is to run; its own period does not matter, its delay [s], sensor and actuator do.
+      scenario: what is to run; its own period does not matter, its delay [s], sensor and actuator
+        do.
       duration: of the reference that is looked at [s].
       radius: spectral radius that counts as too slow [1], of every period up to the limit.
       margin: how much longer a period may be before the loop is that slow, >= 1 [1].
@@ -81,7 +96,8 @@ def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: fl
       The period [s].
 
     Raises:
-      ValueError: bad arguments, or a loop that is too slow at every period from 10 us on (its delay is too long, say).
+      ValueError: bad arguments, or a loop that is too slow at every period from 10 us on (its delay
+        is too long, say).
 
     Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapter 3.
     """
@@ -93,11 +109,18 @@ def recommended_period(scenario: Scenario, *, duration: float = 20.0, radius: fl
         scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))
     scenario = with_room(canonical(scenario))
     if not checks.is_concrete(scenario):
-        raise checks.fail("scenario", "traced values", "numbers", "Call it outside of jit, vmap and grad.")
+        raise checks.fail(
+            "scenario", "traced values", "numbers", "Call it outside of jit, vmap and grad."
+        )
     times = np.linspace(0.0, duration, LOOKS)
     limit = _limit(scenario, times, radius)
     if limit is None:
-        raise checks.fail("scenario", "a loop that is unstable at every period", "one that some period keeps stable", "Shorten its delay.")
+        raise checks.fail(
+            "scenario",
+            "a loop that is unstable at every period",
+            "one that some period keeps stable",
+            "Shorten its delay.",
+        )
     return round_down(limit / margin)
 
 

@@ -1,8 +1,10 @@
-"""How a run, a batch or its derivatives are executed: the one place that decides, from sizes, the number of runs and the platform.
+"""How a run, a batch or its derivatives are executed: the one place that decides, from sizes, the
+number of runs and the platform.
 
-Decided are the executor (scan, xla, native, gpu), how XLA is given a batch (`Shape`), what is lowered, how long a piece of code a compiler
-gets at a time, forward or reverse mode, and how many runs or steps go together.  Every threshold stands in the table below, with the
-measurement behind it where there is one.
+Decided are the executor (scan, xla, native, gpu), how XLA is given a batch (`Shape`), what is
+lowered, how long a piece of code a compiler gets at a time, forward or reverse mode, and how many
+runs or steps go together.  Every threshold stands in the table below, with the measurement behind
+it where there is one.
 """
 
 from __future__ import annotations
@@ -20,36 +22,46 @@ COMPILED = {"cpu": "native", "gpu": "gpu"}
 
 # One machine function (`machine_function`), on CPU: numbers of operations are those of a jaxpr.
 SMALL_BATCH = 64
-"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions there from 128 on."""
+"""Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions
+there from 128 on."""
 LARGEST_ARRAY = 1 << 13
-"""Entries of the largest array that is computed inside: XLA shares larger ones out over threads, which it cannot do there."""
+"""Entries of the largest array that is computed inside: XLA shares larger ones out over threads,
+which it cannot do there."""
 LARGEST_REDUCED = (1 << 12) - 1
-"""Entries of the largest array that is summed up or searched inside: from 4,096 on XLA refuses it there, in either type."""
+"""Entries of the largest array that is summed up or searched inside: from 4,096 on XLA refuses it
+there, in either type."""
 LONG_EVALUATION = 2500
-"""Operations of one evaluation of the closed loop from which it is a machine function of its own, called from a loop of XLA's: LLVM's
-time grows faster than a function.  Two joints take some 700, three 1,500, an arm of seven 10,000."""
+"""Operations of one evaluation of the closed loop from which it is a machine function of its own,
+called from a loop of XLA's: LLVM's time grows faster than a function.  Two joints take some 700,
+three 1,500, an arm of seven 10,000."""
 LONGEST_FUNCTION = 60_000
 """Operations over which LLVM takes minutes as one machine function."""
 
 # Scalar programs: numbers of operations are nodes of a step.
 LONGEST_ONE_RUN = {"native": 60_000, "gpu": 60_000, "xla": 2500}
-"""Nodes up to which one run is lowered unasked, by executor: a longer one gains less by it than it takes to compile.  A run of
-`presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 on scan; its first result takes 11 s of a busy processor there, 30 where
-the kernel has to be built, and 24 on scan.  On an H100 1000 steps of it take 0.13 s on gpu and 0.9 on scan, the first result 28 s and 13;
-20,000 steps of the paper's loop take 0.11 s and 3, the first result 5 s and 9."""
-LIMITS = LoweringLimits(choices=64, table=4096, tables=50_000, scan=64, written_out=1000, under_condition=64, power=64)
-"""What is lowered at all, on native, where a step of the paper's scenario takes 90 ns: a choice among 64 entries takes 9 ns, one among 256
-entries 70; twelve tables of 4096 numbers take 18 ns and 2 s to lower and build, 48 of them 100 ns and 7 s; a scan of 64 rounds with a sine
-in each takes 140 ns, and one of 256 takes 6 s to build.  To call the loop of three joints, 1,000 nodes, takes 4 % of a step's time; of
-four joints 2 %, and the step builds in two thirds of the time.  A call costs about as much as 30 nodes."""
+"""Nodes up to which one run is lowered unasked, by executor: a longer one gains less by it than it
+takes to compile.  A run of `presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 on scan;
+its first result takes 11 s of a busy processor there, 30 where the kernel has to be built, and 24
+on scan.  On an H100 1000 steps of it take 0.13 s on gpu and 0.9 on scan, the first result 28 s and
+13; 20,000 steps of the paper's loop take 0.11 s and 3, the first result 5 s and 9."""
+LIMITS = LoweringLimits(
+    choices=64, table=4096, tables=50_000, scan=64, written_out=1000, under_condition=64, power=64
+)
+"""What is lowered at all, on native, where a step of the paper's scenario takes 90 ns: a choice
+among 64 entries takes 9 ns, one among 256 entries 70; twelve tables of 4096 numbers take 18 ns and
+2 s to lower and build, 48 of them 100 ns and 7 s; a scan of 64 rounds with a sine in each takes 140
+ns, and one of 256 takes 6 s to build.  To call the loop of three joints, 1,000 nodes, takes 4 % of
+a step's time; of four joints 2 %, and the step builds in two thirds of the time.  A call costs
+about as much as 30 nodes."""
 XLA_DEAR, XLA_STORED = 8, 8
-"""What an operation costs on CPU where a cheap one costs 1, and the cost from which a number with several uses is stored: XLA would
-compute it again for each use."""
+"""What an operation costs on CPU where a cheap one costs 1, and the cost from which a number with
+several uses is stored: XLA would compute it again for each use."""
 XLA_BLOCK = 64
-"""Runs that go through a stretch of steps together on CPU: their numbers stay in the first-level cache (32 are half as fast, 128 the
-same)."""
+"""Runs that go through a stretch of steps together on CPU: their numbers stay in the first-level
+cache (32 are half as fast, 128 the same)."""
 XLA_BLOCK_ALWAYS = 10_000
-"""Nodes from which a block is always that wide: loops over fewer runs would be unrolled, and LLVM takes up to 20 GB over that."""
+"""Nodes from which a block is always that wide: loops over fewer runs would be unrolled, and LLVM
+takes up to 20 GB over that."""
 XLA_LONGEST = 20_000
 """Nodes above which XLA takes many minutes."""
 XLA_STRETCH = 4096
@@ -57,57 +69,72 @@ XLA_STRETCH = 4096
 XLA_SEGMENT = 2000
 """Nodes in one XLA computation on CPU: its passes take more than linear time."""
 NATIVE_LONG, NATIVE_SEGMENT = 4000, 500
-"""Nodes above which the C of a step is cut into functions, and of how many each.  A step of `presets.iiwa14`, 15,000 nodes, takes 12.2 us a
-block of runs and builds in 3.3 s; in one function 14.3 us and 6 s, in pieces of 125, 250, 1000 and 4000 3, 1, 5 and 12 % more.  Chains of
-three, five and six joints (4,600 to 7,800 nodes) gain 6, 1 and 17 %; the paper's loop (1,800) would lose 4 %, a chain of four (3,800)
-7 %."""
+"""Nodes above which the C of a step is cut into functions, and of how many each.  A step of
+`presets.iiwa14`, 15,000 nodes, takes 12.2 us a block of runs and builds in 3.3 s; in one function
+14.3 us and 6 s, in pieces of 125, 250, 1000 and 4000 3, 1, 5 and 12 % more.  Chains of three, five
+and six joints (4,600 to 7,800 nodes) gain 6, 1 and 17 %; the paper's loop (1,800) would lose 4 %, a
+chain of four (3,800) 7 %."""
 NATIVE_STRETCH, NATIVE_GROUP = 128, 32
-"""Steps and blocks of runs that a thread goes through together, so that states and the table of signals stay in its cache: 32 to
-512 steps and 8 to 128 blocks take the same time within 5 % (the paper's loop)."""
+"""Steps and blocks of runs that a thread goes through together, so that states and the table of
+signals stay in its cache: 32 to 512 steps and 8 to 128 blocks take the same time within 5 % (the
+  paper's loop)."""
 NATIVE_NARROW = 16
-"""Bytes of the runs of a batch up to which they are stepped in vectors of that length: a processor's longest would be mostly copies."""
+"""Bytes of the runs of a batch up to which they are stepped in vectors of that length: a
+processor's longest would be mostly copies."""
 NATIVE_UNSEEN = 4e8
-"""Nodes times steps of one run that a kernel makes before Python sees whether Ctrl-C was pressed: a tenth of a second, and two tenths of a
-per cent of time for the calls.  The paper's loop: 220,000 steps."""
+"""Nodes times steps of one run that a kernel makes before Python sees whether Ctrl-C was pressed: a
+tenth of a second, and two tenths of a per cent of time for the calls.  The paper's loop: 220,000
+steps."""
 NATIVE_FEW = 80
-"""Steps up to which they are not: so few take less time than a build of their own, and a `Probe` of a run serves a batch too."""
+"""Steps up to which they are not: so few take less time than a build of their own, and a `Probe` of
+a run serves a batch too."""
 GPU_STRETCH = 8192
-"""Steps of a launch, at most: bounds the table of signals, and how long a display may have to wait."""
+"""Steps of a launch, at most: bounds the table of signals, and how long a display may have to
+wait."""
 GPU_WARP, GPU_MOST_THREADS, GPU_PROCESSORS = 32, 128, 100
-"""Threads of a warp and of a block, at most (`c/kernels.h` promises the compiler no more); multiprocessors where JAX does not know."""
+"""Threads of a warp and of a block, at most (`c/kernels.h` promises the compiler no more);
+multiprocessors where JAX does not know."""
 JVP_LARGEST, JVP_LARGEST_IN_SEGMENTS = 60_000, 150_000
-"""Nodes of a step, times one and its tangents, up to which "auto" lowers its derivatives: compilers take minutes over longer ones, the
-native one, which cuts a step into segments, half a minute.  Equal numbers are computed once, so about a third is left of them."""
+"""Nodes of a step, times one and its tangents, up to which "auto" lowers its derivatives: compilers
+take minutes over longer ones, the native one, which cuts a step into segments, half a minute.
+Equal numbers are computed once, so about a third is left of them."""
 
 FORWARD_MOST = 32
 """Numbers that are differentiated by up to which forward mode is taken, above it reverse mode."""
 COLUMNS_ORDER, COLUMNS_KEPT = 2, 1 << 27
-"""Derivatives that are made column by column, and numbers of such a derivative of one run's records that are kept, 1 GiB: others are the
-scan's, in the mode that the caller takes."""
+"""Derivatives that are made column by column, and numbers of such a derivative of one run's records
+that are kept, 1 GiB: others are the scan's, in the mode that the caller takes."""
 
 # Studies: runs are made in blocks of one compiled shape.
 STUDY_BLOCK, STUDY_BLOCK_ELSEWHERE = {"cpu": 256}, 32_768
-"""Runs in a block of a study, by platform.  On an H100 100,000 runs of 20 s of the paper's loop take 0.48 s in float64, in blocks of 16,384
-0.70 s and of 65,536 0.52 s; 1,000 runs, which a block is filled up from, 0.16 s, 0.13 s and 0.28 s."""
+"""Runs in a block of a study, by platform.  On an H100 100,000 runs of 20 s of the paper's loop
+take 0.48 s in float64, in blocks of 16,384 0.70 s and of 65,536 0.52 s; 1,000 runs, which a block
+is filled up from, 0.16 s, 0.13 s and 0.28 s."""
 STUDY_MEMORY = 256 * 2**20
 """Bytes that runs in flight may take, unless the caller says otherwise."""
 STEP_SIZE_CHUNK = 1000
 """Steps between two looks at the pair of runs that tells a step size."""
 STUDY_IN_FLIGHT = 4
-"""Blocks that are made for a device at once, each by a thread: what surrounds a kernel goes beside another's."""
+"""Blocks that are made for a device at once, each by a thread: what surrounds a kernel goes beside
+another's."""
 SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
-"""Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that a sweep has at least, if it is large."""
+"""Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that
+a sweep has at least, if it is large."""
 TUNE_TOGETHER = 16
-"""Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a processor's vectors hold."""
+"""Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a
+processor's vectors hold."""
 TUNE_FRESH = 10_000_000
-"""Steps up to which fresh runs are made in the shape of a search's values: half a second of work for the paper's scenario, where XLA
-compiles a block of them in 1.5 s."""
+"""Steps up to which fresh runs are made in the shape of a search's values: half a second of work
+for the paper's scenario, where XLA compiles a block of them in 1.5 s."""
 CERTIFY_STRETCH = 1024
-"""Steps that a certificate looks at together: memory does not grow with the length of a run, and one program serves every length."""
+"""Steps that a certificate looks at together: memory does not grow with the length of a run, and
+one program serves every length."""
 CERTIFY_RECORDED = 20_000
-"""Steps that a certificate has recorded at most of the run that it makes; the others are made again."""
+"""Steps that a certificate has recorded at most of the run that it makes; the others are made
+again."""
 CERTIFY_TOGETHER = 512
-"""Positions whose mass matrices' eigenvalues a certificate works out together: bounds the memory."""
+"""Positions whose mass matrices' eigenvalues a certificate works out together: bounds the
+memory."""
 CERTIFY_KEPT = 100_000
 """Steps up to which a certificate keeps a run in memory between its two looks at it."""
 
@@ -118,14 +145,17 @@ class Shape(NamedTuple):
     runs: str
     """"together": in lock step, by vmap; "in turn": one after the other."""
     function: str
-    """"whole": all is one machine function; "parts": its parts are one each (closed loop, record and metrics, start, end); "none"."""
+    """"whole": all is one machine function; "parts": its parts are one each (closed loop, record
+    and metrics, start, end); "none"."""
     rolled: bool
-    """Whether the integrator's stages are a loop.  One run as a machine function takes half the time so, and a third to compile; 32 runs
-    take 2.3 times as long, and XLA's own loop over one run three times."""
+    """Whether the integrator's stages are a loop.  One run as a machine function takes half the
+    time so, and a third to compile; 32 runs take 2.3 times as long, and XLA's own loop over one run
+    three times."""
 
 
 STATES = Shape("together", "none", True)
-"""How one step is made from each of many states: it is made few times, so what counts is how long it compiles."""
+"""How one step is made from each of many states: it is made few times, so what counts is how long
+it compiles."""
 
 
 def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -> Shape:
@@ -135,7 +165,8 @@ def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -
       platform: as JAX names it.
       operations: of one evaluation of the closed loop.
       runs: in the batch; None for one run.
-      nested: whether a caller may batch, differentiate or loop over the result: XLA refuses machine functions there, or aborts.
+      nested: whether a caller may batch, differentiate or loop over the result: XLA refuses machine
+        functions there, or aborts.
     """
     if platform != "cpu" or nested:
         return Shape("together", "none", operations > LONG_EVALUATION)
@@ -145,17 +176,21 @@ def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -
 
 
 def lowered_shape(platform: str, operations: int, runs: int, nested: bool) -> Shape:
-    """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time; of 48 runs, and of arms of many joints,
-    XLA refuses a fusion.
+    """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time;
+    of 48 runs, and of arms of many joints, XLA refuses a fusion.
     """
     parts = platform == "cpu" and runs == 1 and operations <= LONG_EVALUATION and not nested
     return Shape("together", "parts" if parts else "none", False)
 
 
 def executors_for(backend: str, platform: str) -> tuple[str, ...]:
-    """The executors that lower a step, best first, for what the user asked for; after them comes scan."""
+    """The executors that lower a step, best first, for what the user asked for; after them comes
+    scan.
+    """
     compiled = COMPILED.get(platform)
-    wanted = {"native": ("native",), "gpu": ("gpu",), "auto": (compiled,) if compiled else ()}.get(backend, ())
+    wanted = {"native": ("native",), "gpu": ("gpu",), "auto": (compiled,) if compiled else ()}.get(
+        backend, ()
+    )
     return () if backend == "vmap" else (*wanted, "xla")
 
 
@@ -177,7 +212,9 @@ def lowers_one_run(executor: str, nodes: int) -> bool:
 
 def lowers_derivatives(executor: str, nodes: int, tangents: int) -> bool:
     """Whether derivatives are lowered unasked."""
-    return nodes * (1 + tangents) <= (JVP_LARGEST_IN_SEGMENTS if executor == "native" else JVP_LARGEST)
+    return nodes * (1 + tangents) <= (
+        JVP_LARGEST_IN_SEGMENTS if executor == "native" else JVP_LARGEST
+    )
 
 
 def xla_width(platform: str, nodes: int, runs: int) -> int:
@@ -187,7 +224,9 @@ def xla_width(platform: str, nodes: int, runs: int) -> int:
 
 
 def xla_stretch(steps: int, every: int) -> int:
-    """Steps of a stretch, a multiple of `every`: so that one length does for all where there is such a length, as each is compiled."""
+    """Steps of a stretch, a multiple of `every`: so that one length does for all where there is
+    such a length, as each is compiled.
+    """
     most = max(XLA_STRETCH // every, 1) * every
     if steps <= most:
         return steps
@@ -196,18 +235,25 @@ def xla_stretch(steps: int, every: int) -> int:
 
 
 def native_build(nodes: int, narrow: bool) -> tuple[int | None, tuple[str, ...]]:
-    """Nodes of a function of the generated C, None for one function, and how the compiler is told to take it.
+    """Nodes of a function of the generated C, None for one function, and how the compiler is told
+    to take it.
 
     Args:
       nodes: of the step.
       narrow: for so few runs, of many steps, that they fill a short vector.
     """
-    sizes = (f"-DSTRETCH={NATIVE_STRETCH}", f"-DGROUP={NATIVE_GROUP}", *((f"-DVECTOR_BYTES={NATIVE_NARROW}",) if narrow else ()))
+    sizes = (
+        f"-DSTRETCH={NATIVE_STRETCH}",
+        f"-DGROUP={NATIVE_GROUP}",
+        *((f"-DVECTOR_BYTES={NATIVE_NARROW}",) if narrow else ()),
+    )
     return NATIVE_SEGMENT if nodes > NATIVE_LONG else None, sizes
 
 
 def native_stretch(nodes: int, steps: int, every: int | None) -> int:
-    """Steps of one run that a kernel makes in one call, a multiple of `every` unless that is all steps."""
+    """Steps of one run that a kernel makes in one call, a multiple of `every` unless that is all
+    steps.
+    """
     unit = every or 1
     most = max(int(NATIVE_UNSEEN / max(nodes, 1)) // unit, 1) * unit
     return min(steps, max(most, NATIVE_FEW + 1))
@@ -219,12 +265,18 @@ def gpu_threads(runs: int, processors: int) -> int:
 
 
 def study_block(platform: str) -> int:
-    """Runs in a block of a study: results do not depend on it, but a kept study is laid out by it."""
+    """Runs in a block of a study: results do not depend on it, but a kept study is laid out by
+    it.
+    """
     return STUDY_BLOCK.get(platform, STUDY_BLOCK_ELSEWHERE)
 
 
-def blocks_in_flight(chunk: int | None, memory: float, block_bytes: int, block: int, devices: int) -> int:
-    """Blocks of a study that may be in flight: `chunk` runs if the caller says so, else what `memory` holds."""
+def blocks_in_flight(
+    chunk: int | None, memory: float, block_bytes: int, block: int, devices: int
+) -> int:
+    """Blocks of a study that may be in flight: `chunk` runs if the caller says so, else what
+    `memory` holds.
+    """
     allowed = memory // max(block_bytes, 1) if chunk is None else chunk // block
     return int(min(max(allowed, 1), STUDY_IN_FLIGHT * devices))
 
@@ -261,7 +313,8 @@ def fresh_together(platform: str, steps: int, compiled: int) -> int:
 
 
 def checkpoint_edge(steps: int) -> tuple[int, int]:
-    """Steps of an inner loop and blocks of the outer one, for reverse mode: inner^2 blocks >= steps, with few steps too many.
+    """Steps of an inner loop and blocks of the outer one, for reverse mode: inner^2 blocks >=
+    steps, with few steps too many.
 
     About 3 steps^(1/3) states are in memory at a time.
     """

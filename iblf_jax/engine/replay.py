@@ -1,11 +1,15 @@
-"""The plant under torques that were logged, many stretches of a log at once, and how its motion depends on the plant's numbers.
+"""The plant under torques that were logged, many stretches of a log at once, and how its motion
+depends on the plant's numbers.
 
-    q"(t) = acceleration(x; t, q, q', tau_k)   for t_k <= t < t_{k+1}                          tau_k: the mean torque of a step
-    e(x; t, q, q', q") = M q" + C q' + G - disturbance - friction                              what the joints have to be given
+    q"(t) = acceleration(x; t, q, q', tau_k)   for t_k <= t < t_{k+1}
+    tau_k: the mean torque of a step e(x; t, q, q', q") = M q" + C q' + G - disturbance - friction
+      what the joints have to be given
 
-x are the numbers of the leaves that are looked for.  The tangents of a stretch follow from those of e, one point a step: with q" held
-e = tau, so d(q")/dx = -M^-1 de/dx, and as e has n rows, n cotangents give them for any number of leaves.  A stretch goes point by point,
-one after another: what is in reach of the processor is faster than what is side by side (7 joints and 28 leaves: 0.08 ms a point, 1.4 ms
+x are the numbers of the leaves that are looked for.  The tangents of a stretch follow from those of
+e, one point a step: with q" held e = tau, so d(q")/dx = -M^-1 de/dx, and as e has n rows, n
+  cotangents give them for any number of leaves.  A stretch goes point by point,
+one after another: what is in reach of the processor is faster than what is side by side (7 joints
+  and 28 leaves: 0.08 ms a point, 1.4 ms
 with a tangent for each leaf side by side).
 """
 
@@ -65,12 +69,24 @@ class Slopes(NamedTuple):
 
 def leaves_of(places: tuple[Place, ...], x: Any) -> Mapping[str, Any]:
     """Path -> value, of x (p,)."""
-    return {place.path: x[place.start : place.start + place.size].reshape(place.shape) for place in places}
+    return {
+        place.path: x[place.start : place.start + place.size].reshape(place.shape)
+        for place in places
+    }
 
 
 @partial(jax.jit, static_argnames=("places", "substeps"))
-def replayed(scenario: Scenario, x: jax.Array, stretches: Stretches, *, places: tuple[Place, ...], substeps: int) -> tuple[jax.Array, ...]:
-    """Positions and velocities at the samples of all stretches, (W, K + 1, n) each, by `substeps` steps of RK4 from sample to sample."""
+def replayed(
+    scenario: Scenario,
+    x: jax.Array,
+    stretches: Stretches,
+    *,
+    places: tuple[Place, ...],
+    substeps: int,
+) -> tuple[jax.Array, ...]:
+    """Positions and velocities at the samples of all stretches, (W, K + 1, n) each, by `substeps`
+    steps of RK4 from sample to sample.
+    """
     scenario = with_parameters(scenario, leaves_of(places, x))
 
     def advanced(state, step):
@@ -95,14 +111,36 @@ def replayed(scenario: Scenario, x: jax.Array, stretches: Stretches, *, places: 
 
 
 @partial(jax.jit, static_argnames="places")
-def slopes(scenario: Scenario, x: jax.Array, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array, *, places) -> Slopes:
-    """What the joints need, e, and its derivatives where the motion is given, P points: t (P,), q, dq, ddq (P, n)."""
+def slopes(
+    scenario: Scenario,
+    x: jax.Array,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    ddq: jax.Array,
+    *,
+    places,
+) -> Slopes:
+    """What the joints need, e, and its derivatives where the motion is given, P points: t (P,), q,
+    dq, ddq (P, n).
+    """
     return jax.lax.map(lambda point: _slope(scenario, places, x, *point), (t, q, dq, ddq))
 
 
 @partial(jax.jit, static_argnames="places")
-def slopes_under(scenario: Scenario, x: jax.Array, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, *, places) -> Slopes:
-    """What the joints need, e, and its derivatives where the torque is given; its q" is the plant's."""
+def slopes_under(
+    scenario: Scenario,
+    x: jax.Array,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    tau: jax.Array,
+    *,
+    places,
+) -> Slopes:
+    """What the joints need, e, and its derivatives where the torque is given; its q" is the
+    plant's.
+    """
     moved = with_parameters(scenario, leaves_of(places, x))
 
     def one(point):
@@ -123,9 +161,11 @@ def _slope(scenario: Scenario, places: tuple[Place, ...], x, t, q, dq, ddq) -> S
 
 
 def tangents(stretches: Stretches, along: Slopes, by_input: np.ndarray) -> np.ndarray:
-    """How q of the samples depends on start, x and what moves the torque, by the implicit midpoint rule.
+    """How q of the samples depends on start, x and what moves the torque, by the implicit midpoint
+    rule.
 
-        X_{k+1} = (1 - h/2 F)^-1 ((1 + h/2 F) X_k + h G),     F = -M^-1 [de/dq de/dq'],  G = -M^-1 de/dx
+        X_{k+1} = (1 - h/2 F)^-1 ((1 + h/2 F) X_k + h G),     F = -M^-1 [de/dq de/dq'],  G = -M^-1
+        de/dx
 
     Args:
       stretches: W of K steps.
@@ -136,7 +176,9 @@ def tangents(stretches: Stretches, along: Slopes, by_input: np.ndarray) -> np.nd
       dq/d(q(0), q'(0), x, inputs), (W, K + 1, n, 2 n + p + m).
     """
     W, K, n, _ = by_input.shape
-    forces = np.concatenate([-along.by_q, -along.by_dq, -along.by_x, by_input.reshape(W * K, n, -1)], axis=-1)
+    forces = np.concatenate(
+        [-along.by_q, -along.by_dq, -along.by_x, by_input.reshape(W * K, n, -1)], axis=-1
+    )
     rates = np.linalg.solve(along.mass, forces).reshape(W, K, n, -1)
     half = 0.5 * np.diff(np.asarray(stretches.t))
     X = np.zeros((W, 2 * n, rates.shape[-1]))

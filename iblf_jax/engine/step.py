@@ -1,14 +1,17 @@
 """What a step of a run is: the one definition that every executor steps.
 
-At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first stage of the integrator.  Where its
-right-hand side or its signals jump, a step is integrated in pieces (`simulation.jumps`), and the metrics see the limits from both sides; a
-step without a jump costs no more than the comparison.  A state that runs away is frozen at its last good value and flagged, so that no NaN
-ever enters a batch or a gradient; the instant nearest to a bound is remembered, because the loop is stiffest there.  The step from the last
-instant is not made: its sample alone counts.
+At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first
+stage of the integrator.  Where its right-hand side or its signals jump, a step is integrated in
+pieces (`simulation.jumps`), and the metrics see the limits from both sides; a step without a jump
+costs no more than the comparison.  A state that runs away is frozen at its last good value and
+flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound is
+remembered, because the loop is stiffest there.  The step from the last instant is not made: its
+sample alone counts.
 
-A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps that are equal compile once.  Before
-the first and after the last step come `start` and `verdict`, which hold no evaluation of the closed loop; what they need of it, its
-Jacobian, is stepped for too (`Probe`).
+A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps
+that are equal compile once.  Before the first and after the last step come `start` and `verdict`,
+which hold no evaluation of the closed loop; what they need of it, its Jacobian, is stepped for too
+(`Probe`).
 """
 
 from __future__ import annotations
@@ -56,7 +59,9 @@ class Run(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a run is made from: its leaves are inputs of what is compiled, never constants (but see `engine.mechanism`)."""
+    """What a run is made from: its leaves are inputs of what is compiled, never constants (but see
+    `engine.mechanism`).
+    """
 
     scenario: Scenario
     folds: Any
@@ -118,12 +123,17 @@ def sample_status(sample: Sample) -> jax.Array:
     if not has(sample, "dq_lower"):
         return found
     found |= flag(jnp.any(~(speed_margin(sample, sample.dq) > 0)), Status.VELOCITY_VIOLATED)
-    return found | flag(jnp.any(~(speed_margin(sample, sample.alpha) > NARROWEST)), Status.ALPHA_INFEASIBLE)
+    return found | flag(
+        jnp.any(~(speed_margin(sample, sample.alpha) > NARROWEST)), Status.ALPHA_INFEASIBLE
+    )
 
 
 def is_sound(state: LoopState) -> jax.Array:
     """Whether a state is finite and slow enough to be a robot's, () bool."""
-    slow, others = jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT), jax.tree.leaves((state.q, moving(state)[2:]))
+    slow, others = (
+        jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT),
+        jax.tree.leaves((state.q, moving(state)[2:])),
+    )
     return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))
 
 
@@ -133,7 +143,8 @@ def keep_if(condition, new, old):
 
 
 def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
-    """The carry before the first step; accumulators that begin with something of the first sample are blank until then.
+    """The carry before the first step; accumulators that begin with something of the first sample
+    are blank until then.
 
     Args:
       inputs: of the run.
@@ -146,7 +157,13 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     if inputs.scenario.sampling is not None:
         jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), there, jacobian)
     estimate = accuracy.begin(method, jacobian, there)
-    return Carry(state, blank, jnp.int32(0), Nearest(-jnp.ones_like(zero), zero, surroundings(there)), estimate)
+    return Carry(
+        state,
+        blank,
+        jnp.int32(0),
+        Nearest(-jnp.ones_like(zero), zero, surroundings(there)),
+        estimate,
+    )
 
 
 def _blank_sample(inputs: Inputs, state: LoopState) -> Sample:
@@ -170,8 +187,16 @@ def _begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple)
     for equation in closed.jaxpr.eqns:
         if not depends.isdisjoint(x for x in equation.invars if isinstance(x, Var)):
             depends.update(equation.outvars)
-    chosen = jax.tree.unflatten(jax.tree.structure(shapes), [isinstance(x, Var) and x in depends for x in closed.jaxpr.outvars])
-    return jax.tree.map(lambda yes, new, old: jnp.where(index > 0, old, new) if yes else old, chosen, _begun(folds, sample), accumulators)
+    chosen = jax.tree.unflatten(
+        jax.tree.structure(shapes),
+        [isinstance(x, Var) and x in depends for x in closed.jaxpr.outvars],
+    )
+    return jax.tree.map(
+        lambda yes, new, old: jnp.where(index > 0, old, new) if yes else old,
+        chosen,
+        _begun(folds, sample),
+        accumulators,
+    )
 
 
 class Node(NamedTuple):
@@ -221,9 +246,11 @@ class _Moment(NamedTuple):
     span: jumps.Span
     division: jumps.Division
     behind: jax.Array
-    """How long before the instant the last piece of the step before begins, () [s]; 0 at the first instant."""
+    """How long before the instant the last piece of the step before begins, () [s]; 0 at the first
+    instant."""
     restarts: Any
-    """Whether a jump lies in this step, or among those whose rates tell of its error, () bool; None in scenarios without jump times."""
+    """Whether a jump lies in this step, or among those whose rates tell of its error, () bool; None
+    in scenarios without jump times."""
 
 
 class _Loop(NamedTuple):
@@ -234,7 +261,8 @@ class _Loop(NamedTuple):
     state: LoopState
     """At the instant, after what is due there."""
     torques: tuple
-    """Where the law is sampled, what arrives at the actuator: before a command arrives within the step, and after."""
+    """Where the law is sampled, what arrives at the actuator: before a command arrives within the
+    step, and after."""
 
     def at(self, piece: jumps.Piece, t: jax.Array, moved: LoopState) -> tuple[LoopState, Sample]:
         """Rate and sample within a piece of the step."""
@@ -243,7 +271,13 @@ class _Loop(NamedTuple):
             torque = (torque[int(piece.arrived)],)
         elif torque:
             torque = (jnp.where(piece.arrived, torque[1], torque[0]),)
-        return self.evaluate(self.inputs.scenario, jumps.stage_time(piece, t), still(self.state, moved), self.inputs.dt, *torque)
+        return self.evaluate(
+            self.inputs.scenario,
+            jumps.stage_time(piece, t),
+            still(self.state, moved),
+            self.inputs.dt,
+            *torque,
+        )
 
 
 def _moment(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | None) -> _Moment:
@@ -253,11 +287,14 @@ def _moment(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | Non
       inputs: of the run.
       index: number of the instant, () int.
       method: the integrator.
-      arrivals: when commands arrive in this step and in the one before, as `jumps.divided` takes them; None where none can.
+      arrivals: when commands arrive in this step and in the one before, as `jumps.divided` takes
+        them; None where none can.
     """
     times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
     start = number * dt
-    span = jumps.Span(start, (number + 1.0) * dt if times.size else start, dt, number < inputs.steps)
+    span = jumps.Span(
+        start, (number + 1.0) * dt if times.size else start, dt, number < inputs.steps
+    )
     here, last = (None, None) if arrivals is None else arrivals
     before = jumps.Span((number - 1.0) * dt, start, dt)
     behind = jnp.where(index > 0, jumps.since_last(times, before, last), jnp.zeros_like(dt))
@@ -278,7 +315,14 @@ def _updated(folds: Any, accumulators: tuple, sample: Sample) -> tuple:
     return tuple(fold.update(acc, sample) for fold, acc in zip(folds, accumulators, strict=True))
 
 
-def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: Form, loop: Callable = evaluate) -> Advanced:
+def advance(
+    inputs: Inputs,
+    carry: Carry,
+    index: jax.Array,
+    method: str,
+    form: Form,
+    loop: Callable = evaluate,
+) -> Advanced:
     """One step: observe, integrate piece by piece, freeze what runs away.
 
     Args:
@@ -320,7 +364,9 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
 
     begun, accumulators = form.piece(at_the_instant)(inputs, index, accumulators, sample)
     if scenario.sampling is None:
-        stepped, accumulators = _across_jumps(along, first, state, method, stepped, begun, accumulators)
+        stepped, accumulators = _across_jumps(
+            along, first, state, method, stepped, begun, accumulators
+        )
     later = _later_pieces(along, moment.division.pieces, stepped, accumulators, method, form)
     parts = [(first.length, stepped.slopes), *later.parts]
 
@@ -330,7 +376,9 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
         held = inputs.scenario.sampling is not None
         width = sample.upper - sample.lower
-        estimate = accuracy.observed(carry.accuracy, method, inputs.dt, index, parts, width, held, restarts, overfull)
+        estimate = accuracy.observed(
+            carry.accuracy, method, inputs.dt, index, parts, width, held, restarts, overfull
+        )
         moved, raised = later
         status = carry.status | sample_status(sample)
         status = status if raised is None else status | raised
@@ -340,16 +388,32 @@ def advance(inputs: Inputs, carry: Carry, index: jax.Array, method: str, form: F
 
     moved, division = still(state, later.moved), moment.division
     after, status, nearest, estimate = form.piece(at_the_end)(
-        inputs, carry, index, sample, parts, (moved, later.status), state, moment.span.counts, moment.restarts, division.overfull
+        inputs,
+        carry,
+        index,
+        sample,
+        parts,
+        (moved, later.status),
+        state,
+        moment.span.counts,
+        moment.restarts,
+        division.overfull,
     )
     nodes = (Node(begun, sample, True), *early, *later.nodes)
     return Advanced(Carry(after, later.accumulators, status, nearest, estimate), nodes, state)
 
 
 def _across_jumps(
-    along: _Loop, piece: jumps.Piece, before: LoopState, method: str, stepped: integrators.Stepped, begun: tuple, accumulators: tuple
+    along: _Loop,
+    piece: jumps.Piece,
+    before: LoopState,
+    method: str,
+    stepped: integrators.Stepped,
+    begun: tuple,
+    accumulators: tuple,
 ) -> tuple[integrators.Stepped, tuple]:
-    """A piece of a step and the accumulators, with their derivatives across jumps of the command; values stay as they are.
+    """A piece of a step and the accumulators, with their derivatives across jumps of the command;
+    values stay as they are.
 
     Args:
       along: the loop, whose law is not sampled.
@@ -360,7 +424,9 @@ def _across_jumps(
       begun, accumulators: of the folds, before and after the sample at its start.
     """
     inputs, dt = along.inputs, along.inputs.dt
-    counts = piece.begin < (inputs.steps - 0.5) * dt  # no metric counts what comes after the end of a run
+    counts = (
+        piece.begin < (inputs.steps - 0.5) * dt
+    )  # no metric counts what comes after the end of a run
 
     def rate(t, state):
         return evaluate(inputs.scenario, jumps.stage_time(piece, t), state, dt)
@@ -375,7 +441,9 @@ def _across_jumps(
 
     floats, replaced = _split_floats(accumulators)
     loop = Loop(inputs.scenario, rate, gains_of)
-    after, floats = with_hybrid_derivative(loop, method, piece.begin, before, piece.length, stepped, floats)
+    after, floats = with_hybrid_derivative(
+        loop, method, piece.begin, before, piece.length, stepped, floats
+    )
     return stepped._replace(state=after), replaced(floats)
 
 
@@ -393,12 +461,23 @@ def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
     return [leaves[i] for i in places], replaced
 
 
-def _integrated(along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, form: Form) -> integrators.Stepped:
+def _integrated(
+    along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, form: Form
+) -> integrators.Stepped:
     """One step of the integrator over a piece."""
-    return integrators.step(method, lambda t, x: along.at(piece, t, x), piece.begin, moved, piece.length, rolled=form.rolled)
+    return integrators.step(
+        method,
+        lambda t, x: along.at(piece, t, x),
+        piece.begin,
+        moved,
+        piece.length,
+        rolled=form.rolled,
+    )
 
 
-def _before_sample(along: _Loop, carry: Carry, due: jax.Array, moment: _Moment) -> tuple[tuple, tuple[Node, ...]]:
+def _before_sample(
+    along: _Loop, carry: Carry, due: jax.Array, moment: _Moment
+) -> tuple[tuple, tuple[Node, ...]]:
     """The accumulators after the sample just before the law runs, where it is due; and that sample.
 
     The law's signals, and without a delay the torque, jump there.
@@ -409,7 +488,11 @@ def _before_sample(along: _Loop, carry: Carry, due: jax.Array, moment: _Moment) 
     held = carry.state.held.commands
     torque = sampling.torque_before(scenario.sampling, dt, held, along.state.held.commands)  # type: ignore[arg-type]
     t, behind = moment.span.start, moment.behind
-    seen_at = t if moment.division.pieces[0].earliest is None else jumps.before_jumps(scenario.jump_times(), t)
+    seen_at = (
+        t
+        if moment.division.pieces[0].earliest is None
+        else jumps.before_jumps(scenario.jump_times(), t)
+    )
 
     def seen(accumulators):
         sample = along.evaluate(scenario, seen_at, carry.state, dt, torque)[1]
@@ -421,7 +504,9 @@ def _before_sample(along: _Loop, carry: Carry, due: jax.Array, moment: _Moment) 
 
 
 def _if(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
-    """`made(kept)`, new values and anything else, where a condition holds; else the values as they are, and zeros."""
+    """`made(kept)`, new values and anything else, where a condition holds; else the values as they
+    are, and zeros.
+    """
     shapes = jax.eval_shape(made, kept)[1]
 
     def otherwise(kept):
@@ -444,9 +529,16 @@ class _Later(NamedTuple):
 
 
 def _later_pieces(
-    along: _Loop, pieces: tuple[jumps.Piece, ...], stepped: integrators.Stepped, accumulators: tuple, method: str, form: Form
+    along: _Loop,
+    pieces: tuple[jumps.Piece, ...],
+    stepped: integrators.Stepped,
+    accumulators: tuple,
+    method: str,
+    form: Form,
 ) -> _Later:
-    """The pieces after the first, each with the samples before and after the jump at which it begins."""
+    """The pieces after the first, each with the samples before and after the jump at which it
+    begins.
+    """
     # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
     folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
     moved, parts, nodes = stepped.state, [], []
@@ -465,11 +557,20 @@ def _later_pieces(
             right = _weighed(made.first, piece.begin, 0.5 * piece.length, none)
             accumulators = _updated(folds, between, right) if folds else ()
             if along.inputs.scenario.sampling is None:
-                made, accumulators = _across_jumps(along, piece, moved, method, made, between, accumulators)
-            return (made.state, accumulators, status | sample_status(right)), (made.slopes, left, between, right)
+                made, accumulators = _across_jumps(
+                    along, piece, moved, method, made, between, accumulators
+                )
+            return (made.state, accumulators, status | sample_status(right)), (
+                made.slopes,
+                left,
+                between,
+                right,
+            )
 
         before = accumulators
-        (moved, accumulators, status), (slopes, left, between, right) = _if(piece.made, further, (moved, accumulators, status))
+        (moved, accumulators, status), (slopes, left, between, right) = _if(
+            piece.made, further, (moved, accumulators, status)
+        )
         parts.append((piece.length, slopes))
         if folds:
             nodes += [Node(before, left, piece.made), Node(between, right, piece.made)]
@@ -479,7 +580,12 @@ def _later_pieces(
 def recorded(folds: Any, found: Advanced):
     """What a run keeps of an instant: the sample, and the states of law and observer."""
     state = found.state
-    states = (state.controller, state.observer, state.actuator, state.held.measured if state.held else ())
+    states = (
+        state.controller,
+        state.observer,
+        state.actuator,
+        state.held.measured if state.held else (),
+    )
     return {name: getattr(found.sample, name) for name in SIGNALS}, *states
 
 
@@ -510,7 +616,9 @@ class TimeStep:
 
 
 class Probed(NamedTuple):
-    """A state whose surroundings are looked at; it stays as it is, so what it decides is computed once."""
+    """A state whose surroundings are looked at; it stays as it is, so what it decides is computed
+    once.
+    """
 
     time: jax.Array
     state: jax.Array
@@ -518,23 +626,30 @@ class Probed(NamedTuple):
     growth: stability.Growth
     """Of the power iteration."""
     jacobian: jax.Array
-    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s]; `stability.resolved` makes one of them."""
+    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
+    `stability.resolved` makes one of them."""
     unseen: accuracy.Unseen
-    """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass matrix."""
+    """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
+    matrix."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the units of the numbers that `accuracy` watches.  Where these are the whole state, the modes follow from
-    them; else more directions do, those of the power iteration.
+    The directions are at first the units of the numbers that `accuracy` watches.  Where these are
+    the whole state, the modes follow from them; else more directions do, those of the power
+    iteration.
     """
 
     def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
-        watched, whole, x = accuracy.places(start), ravel_pytree(surroundings(start))[1], carry.state
+        watched, whole, x = (
+            accuracy.places(start),
+            ravel_pytree(surroundings(start))[1],
+            carry.state,
+        )
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
         level = jax.lax.div(index, count)
@@ -545,17 +660,27 @@ class Probe:
         direction = jnp.where(iteration < 0, unit, carry.growth.direction)
 
         def rate_at(y):
-            return ravel_pytree(change(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece))[0]
+            return ravel_pytree(
+                change(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece)
+            )[0]
 
         around = whole(x)
         plant = around if inputs.scenario.sampling is None else around.plant
         rooms = stability.room_around(inputs.scenario, carry.time, plant, x.size)
-        room = jnp.where(iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype))
+        room = jnp.where(
+            iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype)
+        )
         sizes = stability.difference_sizes(x, direction, room)
         widest = level == 2
-        if len(watched) < x.size:  # a power iteration follows, across infinite slopes by the widest differences
-            widest |= (iteration >= 0) & jnp.any(stability.is_steep(carry.jacobian, inputs.scenario.sampling is not None))
-        size = jnp.where(widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0]))
+        if (
+            len(watched) < x.size
+        ):  # a power iteration follows, across infinite slopes by the widest differences
+            widest |= (iteration >= 0) & jnp.any(
+                stability.is_steep(carry.jacobian, inputs.scenario.sampling is not None)
+            )
+        size = jnp.where(
+            widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
+        )
         w, growth = stability.along(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
             growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
@@ -570,7 +695,9 @@ def probe_steps(scenario: Scenario) -> int:
     """Steps of a `Probe`."""
     state = initial_state(scenario)
     watched = accuracy.places(state).size
-    return 3 * watched + (0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS)
+    return 3 * watched + (
+        0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS
+    )
 
 
 def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
@@ -584,9 +711,15 @@ def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
 
 
 def probed(time: jax.Array, around: Any, watched: int, unseen: accuracy.Unseen) -> Probed:
-    """The carry of a `Probe` of what `surroundings` gave, of which `accuracy` watches so many numbers."""
+    """The carry of a `Probe` of what `surroundings` gave, of which `accuracy` watches so many
+    numbers.
+    """
     x = ravel_pytree(around)[0]
-    return jax.lax.stop_gradient(Probed(time, x, stability.growth_start(x), jnp.zeros((3, watched, watched), x.dtype), unseen))
+    return jax.lax.stop_gradient(
+        Probed(
+            time, x, stability.growth_start(x), jnp.zeros((3, watched, watched), x.dtype), unseen
+        )
+    )
 
 
 def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
@@ -600,10 +733,17 @@ def finished(folds: Any, accumulators: tuple) -> dict[str, jax.Array]:
 def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
     """The results of all folds over a run that is over, its samples with time first."""
     first = jax.tree.map(lambda x: x[0], samples)
-    return finished(folds, jax.lax.scan(lambda acc, sample: (_updated(folds, acc, sample), None), _begun(folds, first), samples)[0])
+    return finished(
+        folds,
+        jax.lax.scan(
+            lambda acc, sample: (_updated(folds, acc, sample), None), _begun(folds, first), samples
+        )[0],
+    )
 
 
-def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, instants: Probed) -> Outcome:
+def verdict(
+    inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, instants: Probed
+) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
 
     Args:
@@ -620,13 +760,17 @@ def verdict(inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, 
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
     # A column is at least as long as the mode that it alone would make.
     steepest = jnp.sum(jnp.abs(instants.jacobian[:, 0]), axis=-2)
-    steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (inputs.dt * steepest > limit)
+    steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (
+        inputs.dt * steepest > limit
+    )
     status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
     suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = accuracy.results(estimate)
     if inputs.scenario.sampling is not None:
-        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(stability.resolved(instants.jacobian, sampled=True))
+        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
+            stability.resolved(instants.jacobian, sampled=True)
+        )
         radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
         status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)

@@ -1,7 +1,9 @@
-"""Which time step will do: small enough for the modes of the loop and for the signals that drive it.
+"""Which time step will do: small enough for the modes of the loop and for the signals that drive
+it.
 
-The first guess is a step that follows the loop's fastest mode.  Then the run is made twice, side by side: in steps dt, and with each of
-them cut into three unequal ones, so that no signal goes through whole periods between the stages of both.  The step is made smaller
+The first guess is a step that follows the loop's fastest mode.  Then the run is made twice, side by
+side: in steps dt, and with each of them cut into three unequal ones, so that no signal goes through
+  whole periods between the stages of both.  The step is made smaller
 until the two agree, and until the run's own estimate of its error (`accuracy`) is content too.
 """
 
@@ -57,7 +59,8 @@ class Pair(NamedTuple):
 
 
 def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> Pair:
-    """A run in steps dt beside one in steps of about a third, until their end, or until they differ by more than a tube's width.
+    """A run in steps dt beside one in steps of about a third, until their end, or until they differ
+    by more than a tube's width.
 
     Args:
       scenario: canonical.
@@ -78,13 +81,19 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
     x = ravel_pytree(start)[0]
     watched = accuracy.places(start)
     estimate = accuracy.begin(method, jacobian(scenario, zero, start)[watched][:, watched], start)
-    estimate = accuracy.between_stages(estimate, accuracy.kicked(scenario, accuracy.unseen(scenario, method, dt, steps)))
+    estimate = accuracy.between_stages(
+        estimate, accuracy.kicked(scenario, accuracy.unseen(scenario, method, dt, steps))
+    )
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
 
 @partial(jax.jit, static_argnames="method")
-def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str) -> Pair:
-    """The pair up to so many steps later: one machine function, as XLA's own loops take longer to go round than a small arm to compute."""
+def _advanced(
+    scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str
+) -> Pair:
+    """The pair up to so many steps later: one machine function, as XLA's own loops take longer to
+    go round than a small arm to compute.
+    """
     whole = ravel_pytree(initial_state(scenario))[1]
     n = scenario.n
 
@@ -100,26 +109,50 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
                 whole_step, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
                 x = jnp.where(whole_step, coarse, fine)
 
-                span = jumps.Span(begin + cut[0] * dt, jnp.where(cut[1] == 1.0, after, begin + cut[1] * dt), h)
+                span = jumps.Span(
+                    begin + cut[0] * dt, jnp.where(cut[1] == 1.0, after, begin + cut[1] * dt), h
+                )
                 division = jumps.divided(times, span)
-                stepped = jumps.integrated(method, partial(evaluate, scenario), division, whole(x), rolled=True)
+                stepped = jumps.integrated(
+                    method, partial(evaluate, scenario), division, whole(x), rolled=True
+                )
                 new, sample = ravel_pytree(stepped.state)[0], stepped.first
                 seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.overfull)
                 return (jnp.where(whole_step, new, coarse), jnp.where(whole_step, fine, new)), seen
 
-            (coarse, fine), (parts, widths, xis, overfull) = jax.lax.scan(part, (pair.coarse, pair.fine), cuts)
+            (coarse, fine), (parts, widths, xis, overfull) = jax.lax.scan(
+                part, (pair.coarse, pair.fine), cuts
+            )
             width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], parts)
             reach = accuracy.steps_back(method)
             restarts = jumps.within(times, (number - reach) * dt, after) if times.size else None
             overfull = None if overfull is None else overfull[0]
-            estimate = accuracy.observed(pair.estimate, method, dt, pair.step, of_coarse, width, restarts=restarts, overfull=overfull)
+            estimate = accuracy.observed(
+                pair.estimate,
+                method,
+                dt,
+                pair.step,
+                of_coarse,
+                width,
+                restarts=restarts,
+                overfull=overfull,
+            )
             near = jnp.max(jnp.abs(xis[1]))
-            nearest = jax.tree.map(partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest)
+            nearest = jax.tree.map(
+                partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
+            )
             off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
             going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
-            difference = jnp.where(going, jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf)), pair.difference)
+            difference = jnp.where(
+                going,
+                jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf)),
+                pair.difference,
+            )
             after = Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
-            return jax.tree.map(partial(jnp.where, pair.going & (pair.step < steps)), after, pair), None
+            return (
+                jax.tree.map(partial(jnp.where, pair.going & (pair.step < steps)), after, pair),
+                None,
+            )
 
         return jax.lax.scan(one, pair, None, STEP_SIZE_CHUNK)[0]
 
@@ -128,19 +161,28 @@ def _advanced(scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *
 
 @jax.jit
 def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
-    """The state at the start, and those of a loop that follows its reference exactly; time axis first, (1 + T, ...)."""
+    """The state at the start, and those of a loop that follows its reference exactly; time axis
+    first, (1 + T, ...).
+    """
 
     def at(t):
         tube = scenario.setting.tube(t)
         return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
 
-    return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), jax.vmap(at)(times))
+    return jax.tree.map(
+        lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), jax.vmap(at)(times)
+    )
 
 
 def fastest_along(scenario: Scenario, times: np.ndarray) -> float:
-    """The fastest mode at the start and along the reference at some times [1/s]; infinite where the loop has no finite derivative."""
+    """The fastest mode at the start and along the reference at some times [1/s]; infinite where the
+    loop has no finite derivative.
+    """
     states = start_and_along(scenario, jnp.asarray(times, scenario.initial.q.dtype))
-    return max(_mode(scenario, t, jax.tree.map(lambda x, i=i: x[i], states)) for i, t in enumerate([0.0, *times]))
+    return max(
+        _mode(scenario, t, jax.tree.map(lambda x, i=i: x[i], states))
+        for i, t in enumerate([0.0, *times])
+    )
 
 
 def _mode(scenario: Scenario, t: float | jax.Array, state: LoopState) -> float:
@@ -162,7 +204,9 @@ def comfortable_dt(mode: float) -> float:
 
 
 def smaller(dt: float, excess: float, order: int) -> float:
-    """The round step to try after dt, whose error is `excess` times what it may be: one to ten times smaller."""
+    """The round step to try after dt, whose error is `excess` times what it may be: one to ten
+    times smaller.
+    """
     wanted = dt / max(min(excess, 1e9), 1.0) ** (1.0 / order)
     return round_down(min(max(wanted, dt / 10.0), 0.7 * dt))
 
@@ -176,13 +220,19 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         return _find_part(scenario, duration, method)
     mode = fastest_along(scenario, np.linspace(0.0, duration, LOOKS))
     if not np.isfinite(mode):
-        raise checks.fail("scenario", "a Jacobian that is not finite", "a closed loop with finite derivatives along its reference")
+        raise checks.fail(
+            "scenario",
+            "a Jacobian that is not finite",
+            "a closed loop with finite derivatives along its reference",
+        )
     dt = for_modes = min(comfortable_dt(mode), round_down(duration))
     _can_be_tried(duration, dt)
     whole = ravel_pytree(initial_state(scenario))[1]
     while duration / dt <= MOST_TRIED:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
-        excess = max(float(pair.difference) / GOAL, float(pair.estimate.relative) / accuracy.TOLERANCE)
+        excess = max(
+            float(pair.difference) / GOAL, float(pair.estimate.relative) / accuracy.TOLERANCE
+        )
         if not excess > 1.0:
             limit = comfortable_dt(_mode(scenario, pair.nearest[1], whole(pair.nearest[2])))
             if dt <= limit:
@@ -191,14 +241,17 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         else:
             dt = smaller(dt, excess if np.isfinite(excess) else np.inf, order)
     notices.warn(
-        f"No step down to {duration / MOST_TRIED:.1g} s makes this run accurate: the loop may magnify every error, or a signal may be "
-        f"faster than that. {for_modes:g} s is what the loop's modes allow."
+        f"No step down to {duration / MOST_TRIED:.1g} s makes this run accurate: the loop may"
+        f" magnify every error, or a signal may be faster than that. {for_modes:g} s is what the"
+        " loop's modes allow."
     )
     return for_modes
 
 
 def _find_part(scenario: Scenario, duration: float, method: str) -> float:
-    """As `find_dt` where the law is sampled: the largest part of a period, 1, 2 or 5 times a power of ten of them, that will do."""
+    """As `find_dt` where the law is sampled: the largest part of a period, 1, 2 or 5 times a power
+    of ten of them, that will do.
+    """
     sampling: Any = scenario.sampling
     period, noise = float(sampling.period), jnp.zeros((4,))
     _can_be_tried(duration, period)
@@ -209,7 +262,11 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
         found = run_one(scenario, (), dt, Run(periods * parts, method, parts), noise=noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
-        if before is not None and not poor_before and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL:
+        if (
+            before is not None
+            and not poor_before
+            and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL
+        ):
             return coarser
         before, poor_before, coarser, parts = q, poor, float(dt), _next_round(parts)
     problem = "makes this run accurate: the loop may magnify every error."
@@ -221,7 +278,9 @@ def _can_be_tried(duration: float, dt: float) -> None:
     """Raises ValueError where a run is too long for a step to be tried on it."""
     if duration / dt > MOST_TRIED:
         expected = f"at most {MOST_TRIED * dt:g} s, which are {MOST_TRIED} steps of {dt:g} s"
-        remedy = "Longer runs are not tried: give a time after which the motion repeats or has settled."
+        remedy = (
+            "Longer runs are not tried: give a time after which the motion repeats or has settled."
+        )
         raise checks.fail("duration", duration, expected, remedy)
 
 

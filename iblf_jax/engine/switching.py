@@ -1,27 +1,33 @@
 """Derivatives of a closed loop whose command jumps at surfaces in the state.
 
-A law may declare functions g_i(t, q, q') at whose zeros its command jumps (`controllers.Controller`, method `switching`).  The closed
-loop is then a hybrid system.  Where its state crosses g_i = 0 at a time t*, with the rate f- before and f+ after the jump, a perturbation
-of the state jumps as well, and an integral of a signal L that jumps with the command gains a term:
+A law may declare functions g_i(t, q, q') at whose zeros its command jumps
+(`controllers.Controller`, method `switching`).  The closed loop is then a hybrid system.  Where its
+state crosses g_i = 0 at a time t*, with the rate f- before and f+ after the jump, a perturbation of
+the state jumps as well, and an integral of a signal L that jumps with the command gains a term:
 
-    dx+ = dx- + (f- - f+) dt*,      dt* = -(grad g_i . dx- + partial derivatives of g_i by parameters) / g_i'-,                  (J.1)
-    d(integral of L) = (integral of dL) + (L- - L+) dt*.
+    dx+ = dx- + (f- - f+) dt*,      dt* = -(grad g_i . dx- + partial derivatives of g_i by
+    parameters) / g_i'-,                  (J.1) d(integral of L) = (integral of dL) + (L- - L+) dt*.
 
-The derivative of a fixed step across the jump has no such terms.  So a step that reaches a surface keeps its value, and its derivative is
-that of the same step in pieces: from its start to the first crossing, on to the next one, and to its end.  Each piece is a step of the
-midpoint rule with the rate of its own side of every surface, and it ends where the next g_i vanishes,
+The derivative of a fixed step across the jump has no such terms.  So a step that reaches a surface
+keeps its value, and its derivative is that of the same step in pieces: from its start to the first
+crossing, on to the next one, and to its end.  Each piece is a step of the midpoint rule with the
+rate of its own side of every surface, and it ends where the next g_i vanishes,
 
-    h = -g/g',   x* = x + h f(t + h/2, x + h f/2),   then one step of Newton's method on g(x*) = 0.                               (J.2)
+    h = -g/g',   x* = x + h f(t + h/2, x + h f/2),   then one step of Newton's method on g(x*) = 0.
+    (J.2)
 
-Where the rates of both sides point towards a surface, the state slides along it.  From the crossing on, the rate is then the combination
-of both that keeps g_i' = 0 (Filippov),
+Where the rates of both sides point towards a surface, the state slides along it.  From the crossing
+on, the rate is then the combination of both that keeps g_i' = 0 (Filippov),
 
-    f = f+ + a (f- - f+),   a = g_i'+ / (g_i'+ - g_i'-).                                                                          (J.3)
+    f = f+ + a (f- - f+),   a = g_i'+ / (g_i'+ - g_i'-).
+    (J.3)
 
-The derivative is of second order in the time step at crossings and of first order where the state slides, in forward and in reverse mode.
-None exists where a state only touches a surface without crossing it.
+The derivative is of second order in the time step at crossings and of first order where the state
+slides, in forward and in reverse mode. None exists where a state only touches a surface without
+crossing it.
 
-Source: (J.1) M. A. Aizerman, F. R. Gantmacher, Quart. J. Mech. Appl. Math. 11 (1958) 225-241; (J.3) A. F. Filippov, Differential
+Source: (J.1) M. A. Aizerman, F. R. Gantmacher, Quart. J. Mech. Appl. Math. 11 (1958) 225-241; (J.3)
+  A. F. Filippov, Differential
 Equations with Discontinuous Righthand Sides, 1988; the scheme (J.2): design of this package.
 """
 
@@ -39,7 +45,8 @@ from iblf_jax.simulation.integrators import Stepped, stage_states, tableau
 from iblf_jax.simulation.scenario import Scenario
 
 CLEARANCE = 1e-4
-"""How far from a surface a rate is evaluated at least, relative to how far the step moves the state across it."""
+"""How far from a surface a rate is evaluated at least, relative to how far the step moves the state
+across it."""
 LONGEST = 2.0
 """Steps.  A crossing that is predicted further away does not belong to the step."""
 
@@ -52,7 +59,8 @@ class Loop(NamedTuple):
     evaluate: Callable
     """Function (t, state) -> (rate of the state, sample)."""
     gains_of: Callable
-    """Function of a sample: what the accumulators of the run gain from it per second, a list of arrays."""
+    """Function of a sample: what the accumulators of the run gain from it per second, a list of
+    arrays."""
 
 
 class Signs(NamedTuple):
@@ -98,7 +106,9 @@ class Crossings(NamedTuple):
         return self.above ^ (self.crossed & (self.rank < number))
 
     def numbered(self, number: jax.Array) -> jax.Array:
-        """Which surface is reached after so many others, (m,) bool; none where there are not so many."""
+        """Which surface is reached after so many others, (m,) bool; none where there are not so
+        many.
+        """
         return self.crossed & (self.rank == number)
 
 
@@ -123,7 +133,9 @@ class Progress(NamedTuple):
 
 
 def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | None:
-    """The switching functions of the scenario's law at a state, (m,), or None if its command does not jump."""
+    """The switching functions of the scenario's law at a state, (m,), or None if its command does
+    not jump.
+    """
     law, setting = scenario.controller, scenario.setting
     return switching_functions(law, t, state.q, state.dq, setting, state.controller)
 
@@ -137,7 +149,8 @@ def with_hybrid_derivative(
     stepped: Stepped,
     sums: list[jax.Array],
 ) -> tuple[LoopState, list[jax.Array]]:
-    """The state after a step and the accumulators, unchanged in value, with the derivatives of the hybrid flow.
+    """The state after a step and the accumulators, unchanged in value, with the derivatives of the
+    hybrid flow.
 
     Args:
       loop: the closed loop, and how metrics weigh its samples.
@@ -173,7 +186,9 @@ def _touched(
     stepped: Stepped,
     above: jax.Array,
 ) -> jax.Array:
-    """Whether a stage of the integrator lies on the other side of each surface than the start of the step, (m,) bool."""
+    """Whether a stage of the integrator lies on the other side of each surface than the start of
+    the step, (m,) bool.
+    """
     touched = jnp.zeros_like(above)
     stages = stage_states(method, before, dt, stepped.slopes)
     for c, state in zip(tableau(method).c[1:], stages, strict=True):
@@ -202,15 +217,25 @@ def _in_pieces(
     gains: list[jax.Array],
     signs: Signs,
 ) -> tuple[LoopState, list[jax.Array]]:
-    """The end of the step by (J.2), piece by piece; `after` where it reaches no surface or a crossing was not found.
+    """The end of the step by (J.2), piece by piece; `after` where it reaches no surface or a
+    crossing was not found.
 
-    The accumulators get what they gain in the pieces in place of what the trapezoidal rule gives for the whole step, `gains` per second
-    at its start.
+    The accumulators get what they gain in the pieces in place of what the trapezoidal rule gives
+    for the whole step, `gains` per second at its start.
     """
     crossings = _crossings(signs, signs.changed | _slides(loop, t, before, slope, signs))
     none = jax.tree.map(jnp.zeros_like, before)
     nothing = [jnp.zeros_like(x) for x in after[1]]
-    start = Progress(before, jnp.zeros_like(dt), none, none, nothing, nothing, nothing, jnp.any(crossings.crossed))
+    start = Progress(
+        before,
+        jnp.zeros_like(dt),
+        none,
+        none,
+        nothing,
+        nothing,
+        nothing,
+        jnp.any(crossings.crossed),
+    )
 
     def piece(progress, number):
         return _piece(loop, t, dt, crossings, number, progress), None
@@ -218,18 +243,29 @@ def _in_pieces(
     numbers = jnp.arange(signs.start.size + 1, dtype=crossings.rank.dtype)
     done, _ = jax.lax.scan(piece, start, numbers)
     end = loop.evaluate(t + dt, _with_derivative_of(after[0], done.state))[1]
-    whole = [0.5 * dt * (first + last) for first, last in zip(gains, loop.gains_of(end), strict=True)]
-    found = done.state, [x + more - less for x, more, less in zip(after[1], done.gained, whole, strict=True)]
+    whole = [
+        0.5 * dt * (first + last) for first, last in zip(gains, loop.gains_of(end), strict=True)
+    ]
+    found = (
+        done.state,
+        [x + more - less for x, more, less in zip(after[1], done.gained, whole, strict=True)],
+    )
     return jax.tree.map(lambda new, old: jnp.where(done.usable, new, old), found, after)
 
 
-def _slides(loop: Loop, t: jax.Array, state: LoopState, slope: LoopState, signs: Signs) -> jax.Array:
-    """Along which surfaces that a stage has touched the state slides, (m,) bool: both rates point towards them.
+def _slides(
+    loop: Loop, t: jax.Array, state: LoopState, slope: LoopState, signs: Signs
+) -> jax.Array:
+    """Along which surfaces that a stage has touched the state slides, (m,) bool: both rates point
+    towards them.
 
-    An integrator holds a sliding state near its surface by stages on either side, and may never end a step on the other one.
+    An integrator holds a sliding state near its surface by stages on either side, and may never end
+    a step on the other one.
     """
     above = signs.above ^ signs.touched
-    other = loop.evaluate(t, _on_its_side(loop.scenario, t, state, above, CLEARANCE * signs.size))[0]
+    other = loop.evaluate(t, _on_its_side(loop.scenario, t, state, above, CLEARANCE * signs.size))[
+        0
+    ]
     here, beyond = (_along(loop.scenario, t, state, rate)[1] for rate in (slope, other))
     towards_from_above = (here < 0) & (beyond > 0)
     towards_from_below = (here > 0) & (beyond < 0)
@@ -246,7 +282,14 @@ def _crossings(signs: Signs, crossed: jax.Array) -> Crossings:
     return Crossings(signs.above, crossed, rank, CLEARANCE * signs.size)
 
 
-def _piece(loop: Loop, t: jax.Array, dt: jax.Array, crossings: Crossings, number: jax.Array, before: Progress) -> Progress:
+def _piece(
+    loop: Loop,
+    t: jax.Array,
+    dt: jax.Array,
+    crossings: Crossings,
+    number: jax.Array,
+    before: Progress,
+) -> Progress:
     """One piece of a step: to the crossing with this number, or to the end of the step."""
     scenario, state, since = loop.scenario, before.state, before.since
     above, target = crossings.after(number), crossings.numbered(number)
@@ -284,11 +327,21 @@ def _piece(loop: Loop, t: jax.Array, dt: jax.Array, crossings: Crossings, number
     gains, sliding_gains = _sum(gains, more), _sum(before.sliding_gains, more)
     gained = [x + gain * length for x, gain in zip(before.gained, gains, strict=True)]
     usable = before.usable & ((early & late) | ~aims)
-    return Progress(_moved(reached, correction, last), since + length, last, sliding, gains, sliding_gains, gained, usable)
+    return Progress(
+        _moved(reached, correction, last),
+        since + length,
+        last,
+        sliding,
+        gains,
+        sliding_gains,
+        gained,
+        usable,
+    )
 
 
 def _share(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
-    """The share a of (J.3) that the rate before a surface has beyond it, () [1]: 0 where the state moves on.
+    """The share a of (J.3) that the rate before a surface has beyond it, () [1]: 0 where the state
+    moves on.
 
     Args:
       arriving, leaving: rates of the switching function before and beyond the surface, ().
@@ -298,11 +351,15 @@ def _share(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
 
 
 def _mixed(share: jax.Array, old: Any, new: Any) -> Any:
-    """What (J.3) adds beyond a surface to a rate, or to a signal that is integrated, from those before and beyond it."""
+    """What (J.3) adds beyond a surface to a rate, or to a signal that is integrated, from those
+    before and beyond it.
+    """
     return jax.tree.map(lambda a, b: share * (a - b), old, new)
 
 
-def _along(scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState) -> tuple[jax.Array, jax.Array]:
+def _along(
+    scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState
+) -> tuple[jax.Array, jax.Array]:
     """The switching functions, and their rates along a rate of the state, (m,) each."""
 
     def at(h):
@@ -312,7 +369,9 @@ def _along(scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState) 
 
 
 def _time_to(g: jax.Array, dg: jax.Array, dt: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Time until g vanishes at the rate dg, () [s], 0 where it is far longer than the step; and whether it is not, () bool."""
+    """Time until g vanishes at the rate dg, () [s], 0 where it is far longer than the step; and
+    whether it is not, () bool.
+    """
     usable = (dg != 0) & (jnp.abs(g) <= LONGEST * dt * jnp.abs(dg))
     return -jnp.where(usable, g, 0.0) / jnp.where(usable, dg, 1.0), usable
 
@@ -326,8 +385,12 @@ def _sum(one: Any, other: Any) -> Any:
     return jax.tree.map(jnp.add, one, other)
 
 
-def _on_its_side(scenario: Scenario, t: jax.Array, state: LoopState, above: jax.Array, clearance: jax.Array) -> LoopState:
-    """The state, moved across every surface on whose other side it is by the little that is missing."""
+def _on_its_side(
+    scenario: Scenario, t: jax.Array, state: LoopState, above: jax.Array, clearance: jax.Array
+) -> LoopState:
+    """The state, moved across every surface on whose other side it is by the little that is
+    missing.
+    """
     fixed: Any = jax.lax.stop_gradient((scenario, t, state))
 
     def functions(q, dq):

@@ -1,11 +1,13 @@
-"""One run that a user transforms: differentiated, batched, or compiled as a part of something larger.
+"""One run that a user transforms: differentiated, batched, or compiled as a part of something
+larger.
 
 The run itself is plain JAX (`scan`).  Its first derivatives are a kernel's, where there is one,
 
     out' = J leaves',       J = d (records, metrics) / d leaves,
 
-each column of J a run with one tangent (`columns`).  JAX transposes the product, so both modes have it.  J's own derivative is made in the
-same way.  Third derivatives are the scan's, and those by the step, by a metric's parameters, or of more records than are kept.
+each column of J a run with one tangent (`columns`).  JAX transposes the product, so both modes have
+it.  J's own derivative is made in the same way.  Third derivatives are the scan's, and those by the
+step, by a metric's parameters, or of more records than are kept.
 """
 
 from __future__ import annotations
@@ -46,21 +48,41 @@ class Runs(NamedTuple):
 
     def batch(self, leaves: tuple) -> Batch:
         """Of all runs."""
-        shared, lane = ([x for x, yes in zip(leaves, self.is_lane, strict=True) if yes is which] for which in (False, True))
-        return Batch(Leaves(self.treedef, self.is_lane, shared, lane), self.runs, mechanism=self.run.mechanism)
+        shared, lane = (
+            [x for x, yes in zip(leaves, self.is_lane, strict=True) if yes is which]
+            for which in (False, True)
+        )
+        return Batch(
+            Leaves(self.treedef, self.is_lane, shared, lane),
+            self.runs,
+            mechanism=self.run.mechanism,
+        )
 
 
-def run_transformable(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, *, backend: str = "auto", noise: Any = None) -> Outcome:
+def run_transformable(
+    scenario: Scenario,
+    folds: Any,
+    dt: jax.Array,
+    run: Run,
+    *,
+    backend: str = "auto",
+    noise: Any = None,
+) -> Outcome:
     """One run that may be batched and differentiated from outside.
 
     Args:
       scenario, folds, dt, run, noise: as `execute.run_one`.
-      backend: what its derivatives are computed on: "xla" for plain JAX, else kernels where they can be built.
+      backend: what its derivatives are computed on: "xla" for plain JAX, else kernels where they
+        can be built.
     """
     leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run, noise))
     name, reason = execute.automatic()
     runs = Runs(treedef, run._replace(mechanism=known_of(scenario)), name, (False,) * len(leaves))
-    return _differentiable(runs)(*leaves) if backend != "xla" and reason is None else _plain(runs, *leaves)
+    return (
+        _differentiable(runs)(*leaves)
+        if backend != "xla" and reason is None
+        else _plain(runs, *leaves)
+    )
 
 
 @partial(jax.jit, static_argnums=0)
@@ -73,7 +95,9 @@ def _plain(runs: Runs, *leaves: jax.Array) -> Outcome:
 
 @lru_cache(maxsize=64)
 def _differentiable(runs: Runs, is_asked: bool = False) -> Callable:
-    """`_plain` with the kernel's derivatives; `is_asked`: the value beside a derivative is the kernel's too."""
+    """`_plain` with the kernel's derivatives; `is_asked`: the value beside a derivative is the
+    kernel's too.
+    """
     whole = jax.custom_jvp(partial(_value if is_asked else _plain, runs))
 
     def rule(leaves, tangents):
@@ -85,7 +109,11 @@ def _differentiable(runs: Runs, is_asked: bool = False) -> Callable:
                 return found, _in_form_of(found, *_times(by_kernel, moves, 0))
             except (UnsupportedError, ToolchainError):
                 pass
-        return jax.jvp(lambda *moved: _plain(runs, *_put(leaves, places, moved)), [leaves[i] for i in places], moves)
+        return jax.jvp(
+            lambda *moved: _plain(runs, *_put(leaves, places, moved)),
+            [leaves[i] for i in places],
+            moves,
+        )
 
     whole.defjvp(rule, symbolic_zeros=True)
     return whole
@@ -119,17 +147,27 @@ def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
 
 
 def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
-    """A derivative of records and metrics by the kernel, differentiable; None where there is none."""
+    """A derivative of records and metrics by the kernel, differentiable; None where there is
+    none.
+    """
     scenario = len(jax.tree.leaves(jax.tree.unflatten(runs.treedef, runs.is_lane).scenario))
-    if not all(i < scenario for level in places for i in level) or not plan.keeps_columns(len(places), _size(runs, places, leaves)):
+    if not all(i < scenario for level in places for i in level) or not plan.keeps_columns(
+        len(places), _size(runs, places, leaves)
+    ):
         return None
-    kernel = jax.custom_jvp(lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves)))
+    kernel = jax.custom_jvp(
+        lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves))
+    )
 
     def rule(leaves, tangents):
         more, moves = _moves(tangents)
         second = _by_kernel(runs, (*places, more), leaves)
         if second is None:
-            return jax.jvp(lambda *moved: _by_scan(runs, places, _put(leaves, more, moved)), [leaves[i] for i in more], moves)
+            return jax.jvp(
+                lambda *moved: _by_scan(runs, places, _put(leaves, more, moved)),
+                [leaves[i] for i in more],
+                moves,
+            )
         return kernel(*leaves), _times(second, moves, len(places))
 
     kernel.defjvp(rule, symbolic_zeros=True)
@@ -144,15 +182,25 @@ def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
     if not places:
         found = _plain(runs, *leaves)
         folded = {name: x for name, x in found.metrics.items() if name not in ACCURACY}
-        return floats_of(found.records), {name: x for name, x in folded.items() if jnp.issubdtype(x.dtype, jnp.floating)}
+        return floats_of(found.records), {
+            name: x for name, x in folded.items() if jnp.issubdtype(x.dtype, jnp.floating)
+        }
     level, shapes = places[-1], [jnp.shape(leaves[i]) for i in places[-1]]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
 
     def along(unit):
-        parts = [x.reshape(shape) for x, shape in zip(jnp.split(unit, ends[:-1]), shapes, strict=True)]
-        return jax.jvp(lambda *moved: _by_scan(runs, places[:-1], _put(leaves, level, moved)), [leaves[i] for i in level], parts)[1]
+        parts = [
+            x.reshape(shape) for x, shape in zip(jnp.split(unit, ends[:-1]), shapes, strict=True)
+        ]
+        return jax.jvp(
+            lambda *moved: _by_scan(runs, places[:-1], _put(leaves, level, moved)),
+            [leaves[i] for i in level],
+            parts,
+        )[1]
 
-    return jax.vmap(along, out_axes=len(places) - 1)(jnp.eye(ends[-1], dtype=leaves[level[0]].dtype))
+    return jax.vmap(along, out_axes=len(places) - 1)(
+        jnp.eye(ends[-1], dtype=leaves[level[0]].dtype)
+    )
 
 
 def _size(runs: Runs, places: Places, leaves: tuple) -> int:
@@ -163,7 +211,9 @@ def _size(runs: Runs, places: Places, leaves: tuple) -> int:
 
 
 def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
-    """function(runs, *static, leaves) for many runs at once where JAX batches it: more runs of one call."""
+    """function(runs, *static, leaves) for many runs at once where JAX batches it: more runs of one
+    call.
+    """
     batched = custom_vmap(lambda *leaves: function(runs, *static, leaves))
 
     @batched.def_vmap
@@ -176,7 +226,9 @@ def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
 
         lane = tuple(map(bool.__or__, is_batched, runs.is_lane))
         wide = [widened(*each) for each in zip(leaves, is_batched, runs.is_lane, strict=True)]
-        found = _over_runs(function, runs._replace(is_lane=lane, runs=size * runs.runs), *static)(*wide)
+        found = _over_runs(function, runs._replace(is_lane=lane, runs=size * runs.runs), *static)(
+            *wide
+        )
         found = jax.tree.map(lambda x: x.reshape(size, runs.runs, *x.shape[1:]), found)
         return found, jax.tree.map(lambda _: True, found)
 
@@ -197,8 +249,14 @@ def _in_form_of(found: Outcome, records: list[jax.Array], metrics: dict[str, jax
     """Tangents in the form of an outcome."""
     each = iter(records)
     return Outcome(
-        jax.tree.map(lambda x: next(each) if jnp.issubdtype(x.dtype, jnp.floating) else _no_tangent(x), found.records),
-        {name: metrics[name] if name in metrics else _no_tangent(x) for name, x in found.metrics.items()},
+        jax.tree.map(
+            lambda x: next(each) if jnp.issubdtype(x.dtype, jnp.floating) else _no_tangent(x),
+            found.records,
+        ),
+        {
+            name: metrics[name] if name in metrics else _no_tangent(x)
+            for name, x in found.metrics.items()
+        },
         _no_tangent(found.status),
         _no_tangent(found.fastest_mode),
     )
@@ -206,4 +264,8 @@ def _in_form_of(found: Outcome, records: list[jax.Array], metrics: dict[str, jax
 
 def _no_tangent(x: jax.Array) -> Any:
     """The tangent of what does not depend on any leaf, or cannot."""
-    return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(jnp.shape(x), jax.dtypes.float0)
+    return (
+        jnp.zeros_like(x)
+        if jnp.issubdtype(x.dtype, jnp.floating)
+        else np.zeros(jnp.shape(x), jax.dtypes.float0)
+    )

@@ -1,8 +1,9 @@
 """sin and cos as polynomials, for XLA on CPU, whose own are scalar calls there.
 
-Range reduction after W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980: pi/2 in parts so short that their
-products with the quadrant are exact.  Coefficients: S. Moshier, Cephes.  Errors, measured by the tests: below 2 ulp, or 1e-7
-(float32) and 1e-16 (float64) absolute, for |x| up to LIMIT; a run whose argument is beyond it has XLA's own value.
+Range reduction after W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980: pi/2
+in parts so short that their products with the quadrant are exact.  Coefficients: S. Moshier,
+Cephes.  Errors, measured by the tests: below 2 ulp, or 1e-7 (float32) and 1e-16 (float64) absolute,
+  for |x| up to LIMIT; a run whose argument is beyond it has XLA's own value.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ from jax import lax
 LIMIT = {np.dtype(np.float32): 1e5, np.dtype(np.float64): 1.6e6}
 """|x| up to which the polynomials hold."""
 _PARTS = {
-    np.dtype(np.float32): (1.5703125, 0.0004825592041015625, 1.2665987014770508e-06, 9.920935184482005e-10),
+    np.dtype(np.float32): (
+        1.5703125,
+        0.0004825592041015625,
+        1.2665987014770508e-06,
+        9.920935184482005e-10,
+    ),
     np.dtype(np.float64): (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21),
 }
 _SIN = {
@@ -85,6 +91,16 @@ def sines(ops: Sequence[str], xs: Sequence[jax.Array]) -> Sequence[jax.Array]:
     far = reduce(lax.bitwise_or, is_far)
 
     def beyond(xs, is_far, near):
-        return [lax.select(far, XLA_OWN[op](x), y) for op, x, far, y in zip(ops, xs, is_far, near, strict=True)]
+        return [
+            lax.select(far, XLA_OWN[op](x), y)
+            for op, x, far, y in zip(ops, xs, is_far, near, strict=True)
+        ]
 
-    return lax.cond(lax.reduce_or(far, tuple(range(far.ndim))), beyond, lambda xs, is_far, near: near, list(xs), is_far, near)
+    return lax.cond(
+        lax.reduce_or(far, tuple(range(far.ndim))),
+        beyond,
+        lambda xs, is_far, near: near,
+        list(xs),
+        is_far,
+        near,
+    )

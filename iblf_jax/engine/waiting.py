@@ -14,8 +14,8 @@ SHARE, LONGEST = 0.02, 0.02
 def wait_until_ready(outputs: Any) -> None:
     """Waits for arrays that XLA computes in threads of its own.
 
-    JAX's own waiting sees Ctrl-C only when the arrays are there.  Here KeyboardInterrupt is raised at once; XLA goes on
-    meanwhile, which does no harm (`core.process_end`).
+    JAX's own waiting sees Ctrl-C only when the arrays are there.  Here KeyboardInterrupt is raised
+    at once; XLA goes on meanwhile, which does no harm (`core.process_end`).
     """
     begin = time.monotonic()
     for array in jax.tree.leaves(outputs):

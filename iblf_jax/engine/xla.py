@@ -1,7 +1,9 @@
-"""The xla executor: a scalar program with one array of runs a number, in `lax.scan`.  Needs nothing but jax and runs on any device.
+"""The xla executor: a scalar program with one array of runs a number, in `lax.scan`.  Needs nothing
+but jax and runs on any device.
 
-What time decides is tabulated for a stretch of steps at once.  On CPU a block of runs goes through a stretch of steps as one machine
-function (`machine_function`), its numbers in the first-level cache.
+What time decides is tabulated for a stretch of steps at once.  On CPU a block of runs goes through
+a stretch of steps as one machine function (`machine_function`), its numbers in the first-level
+cache.
 """
 
 from __future__ import annotations
@@ -26,9 +28,15 @@ from iblf_jax.kernels.program import LANE, SHARED, TIME, Program, UnsupportedErr
 
 
 def run(
-    program: Program, shared: jax.Array, lane: jax.Array, carry: Packed, steps: int, every: int | None
+    program: Program,
+    shared: jax.Array,
+    lane: jax.Array,
+    carry: Packed,
+    steps: int,
+    every: int | None,
 ) -> tuple[Packed, list[jax.Array]]:
-    """All steps of all runs; arguments and results as `native.run`.  The last block repeats the last run.
+    """All steps of all runs; arguments and results as `native.run`.  The last block repeats the
+    last run.
 
     Raises:
       UnsupportedError: the step is too long for XLA.
@@ -46,7 +54,9 @@ def run(
         rows = jnp.moveaxis(parts, 0, -2)
         return rows.reshape(*rows.shape[:-2], blocks * width)[..., :runs]
 
-    done, samples = _in_blocks(program, shared, apart(lane), jax.tree.map(apart, carry), steps, every)
+    done, samples = _in_blocks(
+        program, shared, apart(lane), jax.tree.map(apart, carry), steps, every
+    )
     return jax.tree.map(together, done), jax.tree.map(together, samples)
 
 
@@ -58,12 +68,19 @@ def compilable(program: Program) -> Program:
     """
     program = written_out(program)
     if len(program.nodes) > plan.XLA_LONGEST:
-        raise UnsupportedError(f"its step has {len(program.nodes)} operations, over which XLA compiles for many minutes")
+        raise UnsupportedError(
+            f"its step has {len(program.nodes)} operations, over which XLA compiles for many"
+            " minutes"
+        )
     return program
 
 
-def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every: int | None) -> tuple[Packed, list[jax.Array]]:
-    """All steps of some blocks: (blocks, rows, width) in, and out; recorded arrays (blocks, samples, numbers, width)."""
+def _in_blocks(
+    program: Program, shared, lane, carry: Packed, steps: int, every: int | None
+) -> tuple[Packed, list[jax.Array]]:
+    """All steps of some blocks: (blocks, rows, width) in, and out; recorded arrays (blocks,
+    samples, numbers, width).
+    """
     classes = program.classes()
     once = {i: shared[n.value] for i, n in enumerate(program.nodes) if n.op == "shared"}
     Evaluator(program, ()).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
@@ -84,7 +101,12 @@ def _in_blocks(program: Program, shared, lane, carry: Packed, steps: int, every:
     if whole:
         starts = length * jnp.arange(whole, dtype=jnp.int32)
         carry, arrays = lax.scan(partial(stretch, count=length), carry, starts)
-        parts.append([jnp.moveaxis(x, 0, 1).reshape(x.shape[1], whole * x.shape[2], *x.shape[3:]) for x in arrays])
+        parts.append(
+            [
+                jnp.moveaxis(x, 0, 1).reshape(x.shape[1], whole * x.shape[2], *x.shape[3:])
+                for x in arrays
+            ]
+        )
     if rest:
         carry, arrays = stretch(carry, jnp.int32(whole * length), rest)
         parts.append(arrays)
@@ -112,22 +134,34 @@ def _block(
         state, records = state
         row, place = now
         known = fixed | _entries(program, columns, row)
-        known |= {program.carry[c][0]: x for c, x in zip(moving, state, strict=True) if program.carry[c][0] >= 0}
+        known |= {
+            program.carry[c][0]: x
+            for c, x in zip(moving, state, strict=True)
+            if program.carry[c][0] >= 0
+        }
         evaluator.compute(known, [*outputs, *wanted], row)
-        found = [x.read(row) if isinstance(x, Entry) else x for x in (known[i] for i in [*outputs, *wanted])]
+        found = [
+            x.read(row) if isinstance(x, Entry) else x
+            for x in (known[i] for i in [*outputs, *wanted])
+        ]
         filled = [jnp.broadcast_to(x, (width,)) for x in found]
         if every:
-            records = lax.dynamic_update_slice(records, jnp.stack(filled[len(outputs) :])[None], (place, np.int32(0), np.int32(0)))
+            records = lax.dynamic_update_slice(
+                records, jnp.stack(filled[len(outputs) :])[None], (place, np.int32(0), np.int32(0))
+            )
         return (filled[: len(outputs)], records), None
 
-    # Every step writes its sample, to the row of the next step that is recorded, which so writes last: one copy of the step to compile.
+    # Every step writes its sample, to the row of the next step that is recorded, which so writes
+    # last: one copy of the step to compile.
     places = (np.arange(count, dtype=np.int32) + (every or 1) - 1) // (every or 1)
     records = jnp.zeros((rows + 1 if every else 0, len(wanted), width), program.dtype)
     (state, records), _ = lax.scan(step, ([values[c] for c in moving], records), (table, places))
     for c, x in zip(moving, state, strict=True):
         values[c] = x
     ends = accumulate(program.recorded if every else ())
-    return _joined(program, values, width), [records[:rows, end - size : end] for end, size in zip(ends, program.recorded, strict=False)]
+    return _joined(program, values, width), [
+        records[:rows, end - size : end] for end, size in zip(ends, program.recorded, strict=False)
+    ]
 
 
 def _entries(program: Program, columns: list[int], row: Table) -> dict[int, Any]:
@@ -143,14 +177,24 @@ def _entries(program: Program, columns: list[int], row: Table) -> dict[int, Any]
     return result
 
 
-def _table(program: Program, once: dict[int, Any], columns: list[int], first: jax.Array, count: int) -> Table:
+def _table(
+    program: Program, once: dict[int, Any], columns: list[int], first: jax.Array, count: int
+) -> Table:
     """What time decides, for `count` steps from `first` on."""
     known = dict(once)
-    known |= {i: first + jnp.arange(count, dtype=jnp.int32) for i, n in enumerate(program.nodes) if n.op == "index"}
+    known |= {
+        i: first + jnp.arange(count, dtype=jnp.int32)
+        for i, n in enumerate(program.nodes)
+        if n.op == "index"
+    }
     Evaluator(program, (count,)).compute(known, columns)
 
     def stacked(kinds, dtype):
-        some = [jnp.broadcast_to(known[c], (count,)).astype(dtype) for c in columns if program.nodes[c].kind in kinds]
+        some = [
+            jnp.broadcast_to(known[c], (count,)).astype(dtype)
+            for c in columns
+            if program.nodes[c].kind in kinds
+        ]
         return jnp.stack(some, axis=1) if some else jnp.zeros((count, 0), dtype)
 
     return Table(stacked("f", program.dtype), stacked("ib", jnp.int32))
@@ -158,12 +202,19 @@ def _table(program: Program, once: dict[int, Any], columns: list[int], first: ja
 
 def _separate(program: Program, carry: Packed) -> list[jax.Array]:
     floats, ints = iter(carry.floats), iter(carry.ints)
-    return [next(floats) if k == "f" else next(ints) if k == "i" else next(ints) != 0 for k in program.kinds]
+    return [
+        next(floats) if k == "f" else next(ints) if k == "i" else next(ints) != 0
+        for k in program.kinds
+    ]
 
 
 def _joined(program: Program, values: list[jax.Array], runs: int) -> Packed:
     def rows(kinds: str, dtype) -> jax.Array:
-        some = [jnp.broadcast_to(x, (runs,)).astype(dtype) for x, k in zip(values, program.kinds, strict=True) if k in kinds]
+        some = [
+            jnp.broadcast_to(x, (runs,)).astype(dtype)
+            for x, k in zip(values, program.kinds, strict=True)
+            if k in kinds
+        ]
         return jnp.stack(some) if some else jnp.zeros((0, runs), dtype)
 
     return Packed(rows("f", program.dtype), rows("ib", jnp.int32))

@@ -1,10 +1,13 @@
-"""Components as plain tables (dicts, lists, numbers, strings) and back: what scenario files are made of.
+"""Components as plain tables (dicts, lists, numbers, strings) and back: what scenario files are
+made of.
 
-Nothing here knows a robot or a law by name.  A component's table has one key a field, and `kind = "<name>"` where the field may
-hold any member of a family; the family is read from the field's annotation (`barrier: Barrier`), its members from the family's
-MEMBERS.  So a new member, or a law that holds another law, needs no change here.
+Nothing here knows a robot or a law by name.  A component's table has one key a field, and `kind =
+"<name>"` where the field may hold any member of a family; the family is read from the field's
+annotation (`barrier: Barrier`), its members from the family's MEMBERS.  So a new member, or a law
+  that holds another law, needs no change here.
 
-Every refusal is a ValueError that names the dotted key, what came, what was expected, and the remedy.
+Every refusal is a ValueError that names the dotted key, what came, what was expected, and the
+remedy.
 """
 
 from __future__ import annotations
@@ -59,7 +62,9 @@ def field_hints(cls: Any) -> dict[str, Any]:
 
 
 def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
-    """The family that an annotation names; for any other annotation all members whose names are unique."""
+    """The family that an annotation names; for any other annotation all members whose names are
+    unique.
+    """
     if hint in FAMILIES:
         return FAMILIES[hint]
     seen: dict[str, list[Any]] = {}
@@ -89,7 +94,12 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     if isinstance(part, tuple | list):
         return [encode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(part)]
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        raise checks.fail(path, part, "a component, an array or a tuple of these", "A scenario file cannot hold it.")
+        raise checks.fail(
+            path,
+            part,
+            "a component, an array or a tuple of these",
+            "A scenario file cannot hold it.",
+        )
     if type(part) is hint:
         return encode_fields(part, path)
     family, members = members_of(hint)
@@ -100,7 +110,8 @@ def encode(part: Any, hint: Any, path: str) -> Any:
             path,
             Words(f"an object of class {type(part).__name__}"),
             f"a member of {family} that a file can name ({', '.join(members)})",
-            f'Name your class before saving and loading: iblf_jax.{where}.MEMBERS["my_name"] = {type(part).__name__}.',
+            f'Name your class before saving and loading: iblf_jax.{where}.MEMBERS["my_name"] ='
+            f" {type(part).__name__}.",
         )
     return {"kind": name, **encode_fields(part, path)}
 
@@ -141,7 +152,9 @@ def decode(value: Any, hint: Any, path: str) -> Any:
         return decode_fields(hint, value, path)
     if isinstance(value, list) and hint not in FAMILIES:
         if typing.get_origin(hint) is tuple or any(isinstance(x, dict) for x in value):
-            return tuple(decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
+            return tuple(
+                decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value)
+            )
         return checks.as_floats(path, numbers(value, path))
     if typing.get_origin(hint) is tuple:
         raise checks.fail(path, value, "a list")
@@ -161,7 +174,9 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
             f'Write kind = "{next(iter(members))}".',
         )
     if not isinstance(kind, str) or kind not in members:
-        raise checks.fail(f"{path}.kind", kind, f"the name of one of the {family}", did_you_mean(kind, members))
+        raise checks.fail(
+            f"{path}.kind", kind, f"the name of one of the {family}", did_you_mean(kind, members)
+        )
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
 
 
@@ -176,7 +191,12 @@ def decode_fields(cls: Any, table: Any, path: str) -> Any:
         if name in table:
             values[name] = _decode_field(table[name], field, hints.get(name, Any), key)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise checks.fail(key, Words("nothing"), _expectation(field), f"Add {name} to [{path}]; {cls.__name__} has no default for it.")
+            raise checks.fail(
+                key,
+                Words("nothing"),
+                _expectation(field),
+                f"Add {name} to [{path}]; {cls.__name__} has no default for it.",
+            )
     return construct(cls, values, path)
 
 
@@ -190,13 +210,17 @@ def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> 
 
 def _expectation(field: dataclasses.Field) -> str:
     if is_leaf_field(field):
-        many = {"joint": ", or one a joint", "any": " or a list of numbers", "scalar": ""}[field.metadata["shape"]]
+        many = {"joint": ", or one a joint", "any": " or a list of numbers", "scalar": ""}[
+            field.metadata["shape"]
+        ]
         return f"a number{many} [{field.metadata['unit']}]"
     return "a value" if field.metadata.get("static") else "a table with a kind"
 
 
 def construct(make: Any, values: dict[str, Any], path: str) -> Any:
-    """`make(**values)`; what it refuses becomes a ValueError that names the key in the file in place of the class."""
+    """`make(**values)`; what it refuses becomes a ValueError that names the key in the file in
+    place of the class.
+    """
     try:
         return make(**values)
     except Exception as error:

@@ -1,9 +1,11 @@
-"""Digests of Datasets: netCDF 3 has no checksum, so a file stores one of what its reader must give back.
+"""Digests of Datasets: netCDF 3 has no checksum, so a file stores one of what its reader must give
+back.
 
     digest(variable) = SHA-256(name, dimensions, shape, kind of number, attributes, data)
 
-The digest is that of the values after decoding, so padding and the layout of a file do not count, and whatever would
-load as other data does.  It is stored per variable, so an error can name the variables that are damaged.
+The digest is that of the values after decoding, so padding and the layout of a file do not count,
+and whatever would load as other data does.  It is stored per variable, so an error can name the
+variables that are damaged.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ def dataset_digests(data: xarray.Dataset) -> dict[str, str]:
     found = {}
     for name, variable in data.variables.items():
         found[f"variable {name}"] = _variable_digest(str(name), variable)
-    found[ATTRIBUTES] = _hexadecimal([_plain(data.attrs), sorted(str(name) for name in data.coords)])
+    found[ATTRIBUTES] = _hexadecimal(
+        [_plain(data.attrs), sorted(str(name) for name in data.coords)]
+    )
     return found
 
 
@@ -45,7 +49,9 @@ def encoded(digests: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def stored_in(attributes: Mapping[str, Any], name: str) -> str | None:
-    """The text with the digests among a file's attributes, even if damage has changed its name; None in older files."""
+    """The text with the digests among a file's attributes, even if damage has changed its name;
+    None in older files.
+    """
     if name in attributes:
         return str(attributes[name])
     for value in attributes.values():
@@ -82,7 +88,13 @@ def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
 
 def _variable_digest(name: str, variable: Any) -> str:
     values = np.asarray(variable.values)
-    head = [name, list(map(str, variable.dims)), list(values.shape), _kind(values), _plain(variable.attrs)]
+    head = [
+        name,
+        list(map(str, variable.dims)),
+        list(values.shape),
+        _kind(values),
+        _plain(variable.attrs),
+    ]
     return _hexadecimal(head, _bytes(values))
 
 
@@ -99,7 +111,9 @@ def _kind(values: np.ndarray) -> str:
 
 
 def _bytes(values: np.ndarray) -> bytes:
-    """The data in an order and a width that do not depend on the machine or on the file's format."""
+    """The data in an order and a width that do not depend on the machine or on the file's
+    format.
+    """
     if values.dtype.kind in "OUS":
         return json.dumps([_text(x) for x in values.ravel().tolist()]).encode()
     if values.dtype.kind == "f":

@@ -2,14 +2,15 @@
 
 An identification file is a scenario file (`files.scenario`) with up to three more tables:
 
-    preset = "zhang_yan_2024"                                  # or the scenario written out: where the search starts
-    [identify]                                                 # the arguments of `identify`: held_out, window, torque, delay, loss, ...
-    log = "log.csv"                                            # beside this file; or a list of files
+    preset = "zhang_yan_2024"                                  # or the scenario written out: where
+    the search starts [identify]                                                 # the arguments of
+    `identify`: held_out, window, torque, delay, loss, ... log = "log.csv"
+      # beside this file; or a list of files
     parameters = ["robot.mass", "disturbance.viscous"]
     [limits]                                                   # path -> [low, high]
     "robot.mass" = [0.1, 5.0]
-    [priors]                                                   # path -> [mean, standard deviation]; of a vector, two lists
-    "robot.mass" = [[2.0, 0.8], 0.1]
+    [priors]                                                   # path -> [mean, standard deviation];
+    of a vector, two lists "robot.mass" = [[2.0, 0.8], 0.1]
 
 Everything is checked; each refusal is a ValueError that names the dotted key.
 """
@@ -37,7 +38,8 @@ def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
       path: a file in the format at the head of this module.
 
     Raises:
-      ValueError: the file is not TOML or does not describe an identification; the message names file, key and remedy.
+      ValueError: the file is not TOML or does not describe an identification; the message names
+        file, key and remedy.
       OSError: the file cannot be read.
     """
     data, source, folder = read_toml(path), os.fspath(path), Path(path).parent
@@ -46,11 +48,19 @@ def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
         table = as_table(data.get("identify", {}), "identify")
         known_keys(table, "identify", ("log", "parameters", "held_out", *ARGUMENTS))
         if not isinstance(table.get("parameters"), list):
-            raise checks.fail("identify.parameters", table.get("parameters", Words("nothing")), 'a list of paths, such as ["robot.mass"]')
+            raise checks.fail(
+                "identify.parameters",
+                table.get("parameters", Words("nothing")),
+                'a list of paths, such as ["robot.mass"]',
+            )
         options: dict[str, Any] = {key: table[key] for key in ARGUMENTS if key in table}
         if "held_out" in table:
             share = isinstance(table["held_out"], int | float)
-            options["held_out"] = table["held_out"] if share else _logs(table["held_out"], "identify.held_out", folder)
+            options["held_out"] = (
+                table["held_out"]
+                if share
+                else _logs(table["held_out"], "identify.held_out", folder)
+            )
         for name in ("limits", "priors"):
             given = by_path(as_table(data.get(name, {}), name), name)
             options[name] = {key: _pair(x, f"{name}.{key}") for key, x in given.items()}
@@ -69,7 +79,13 @@ def _pair(value: Any, key: str) -> tuple[Any, ...]:
 def _logs(given: Any, key: str, folder: Path) -> list[Path]:
     """The files of one log or of several, beside the file that names them."""
     names = given if isinstance(given, list) and given else [given]
-    return [folder / checks.word(key, None if isinstance(name, Words) else name, "the path of a .csv or .nc file") for name in names]
+    return [
+        folder
+        / checks.word(
+            key, None if isinstance(name, Words) else name, "the path of a .csv or .nc file"
+        )
+        for name in names
+    ]
 
 
 def identify_file(path: str | os.PathLike, **options: Any) -> Identification:

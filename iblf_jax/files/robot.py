@@ -11,8 +11,9 @@
     [reference]                     # and whatever else is to differ from
     ...                             # `iblf_jax.presets.arm_scenario`: bounds, controller, observer, initial
 
-A law that is written out is kept within the file's largest torques, unless it is `kind = "saturated"` itself.  The scenario that is made
-holds the arm's numbers: saved again, it needs neither the file nor the package that reads it.
+A law that is written out is kept within the file's largest torques, unless it is `kind =
+"saturated"` itself.  The scenario that is made holds the arm's numbers: saved again, it needs
+neither the file nor the package that reads it.
 """
 
 from __future__ import annotations
@@ -46,25 +47,39 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
       folder: of the scenario file; paths of robots' files are relative to it.
 
     Raises:
-      ValueError: a robot's file that cannot be read, or tables that do not fit; the message names the dotted key.
+      ValueError: a robot's file that cannot be read, or tables that do not fit; the message names
+        the dotted key.
     """
     robots = {name: _robot(tables[name], name, folder) for name in ROBOTS if name in tables}
     plant = robots.get("robot", robots.get("plant"))
     if plant is None:
-        raise checks.fail("plant", Words("nothing"), "a table [plant] beside [model]", "Or call it [robot], for both.")
+        raise checks.fail(
+            "plant",
+            Words("nothing"),
+            "a table [plant] beside [model]",
+            "Or call it [robot], for both.",
+        )
     given = {name: table for name, table in tables.items() if name not in ROBOTS}
     if "reference" not in given:
-        raise checks.fail("reference", Words("nothing"), "a table [reference]", "Say what the arm should do.")
+        raise checks.fail(
+            "reference", Words("nothing"), "a table [reference]", "Say what the arm should do."
+        )
     parts: dict[str, Any] = {"reference": decode(given["reference"], Reference, "reference")}
     if "disturbance" in given:
         parts["disturbance"] = decode(given["disturbance"], Disturbance, "disturbance")
-    usual = construct(arm_scenario, {"robot": plant, "model": robots.get("model"), **parts}, "robot")
+    usual = construct(
+        arm_scenario, {"robot": plant, "model": robots.get("model"), **parts}, "robot"
+    )
     if "controller" in given:
         law = within_effort(decode(given["controller"], Controller, "controller"), plant)
         if as_table(given["controller"], "controller").get("kind") != "saturated":
             given["controller"] = encode(law, Controller, "controller")
     own = {name: encode(robot, Robot, name) for name, robot in robots.items()}
-    filled = {name: table for name, table in encode_fields(usual, "").items() if name not in ("plant", "model")}
+    filled = {
+        name: table
+        for name, table in encode_fields(usual, "").items()
+        if name not in ("plant", "model")
+    }
     return {**own, **filled, **given}
 
 
@@ -82,7 +97,9 @@ def _robot(table: Any, name: str, folder: str | os.PathLike) -> Robot:
     options: dict[str, Any] = {key: table[key] for key in ("base", "tip", "repair") if key in table}
     if "locked" in table:
         locked = as_table(table["locked"], f"{name}.locked")
-        options["locked"] = {joint: numbers(at, f"{name}.locked.{joint}", "rad") for joint, at in locked.items()}
+        options["locked"] = {
+            joint: numbers(at, f"{name}.locked.{joint}", "rad") for joint, at in locked.items()
+        }
     if "gravity" in table:
         options["gravity"] = numbers(table["gravity"], f"{name}.gravity", "m/s^2")
     try:

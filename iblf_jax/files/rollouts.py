@@ -1,11 +1,13 @@
 """Runs as labelled data: `xarray.Dataset`s in memory, netCDF or npz on disk.
 
-A Dataset has the dimensions `time` and `joint` (and `run`, before them, for a batch), a unit and a description on every variable, the
-metrics beside the trajectories, and in its attributes what is needed to do the run again: the scenario as TOML where a file can
-hold it, its parameters as JSON, the versions.  In a batch, a parameter that differs between runs is a variable named by its path.
+A Dataset has the dimensions `time` and `joint` (and `run`, before them, for a batch), a unit and a
+description on every variable, the metrics beside the trajectories, and in its attributes what is
+needed to do the run again: the scenario as TOML where a file can hold it, its parameters as JSON,
+  the versions.  In a batch, a parameter that differs between runs is a variable named by its path.
 
-On disk, several runs by name share one file.  They may differ in length, joints and states, so nothing is stacked: every variable
-and dimension is stored as `<name>.<variable>`, and `load_rollouts` gives one Dataset a name back.  netCDF is version 3, written by SciPy.
+On disk, several runs by name share one file.  They may differ in length, joints and states, so
+nothing is stacked: every variable and dimension is stored as `<name>.<variable>`, and
+  `load_rollouts` gives one Dataset a name back.  netCDF is version 3, written by SciPy.
 
 netCDF 3 has no checksum, so the file's attribute `digest` holds one of each variable
 (`files.digest`), and `load_rollouts` compares it with what it reads.  The attribute belongs to the
@@ -60,8 +62,9 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
       run: one run, arrays (T, ...), or a batch, (B, T, ...).
 
     Returns:
-      Dimensions time (T), joint (n), region where there are some, and run (B) first for a batch; variables as the Rollout's fields and
-      metrics, each with `units` and `description`.  A metric whose name is taken is called `metric_<name>`.
+      Dimensions time (T), joint (n), region where there are some, and run (B) first for a batch;
+      variables as the Rollout's fields and metrics, each with `units` and `description`.  A metric
+      whose name is taken is called `metric_<name>`.
 
     Raises:
       ValueError: not a Rollout, or one that is being traced.
@@ -71,19 +74,31 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
     if not isinstance(run, Rollout):
         raise checks.fail("run", run, "a Rollout", "ij.simulate returns one.")
     if not checks.is_concrete(run):
-        raise checks.fail("run", run, "a Rollout that holds numbers", "Call this outside of jit, vmap and grad.")
+        raise checks.fail(
+            "run", run, "a Rollout that holds numbers", "Call this outside of jit, vmap and grad."
+        )
     batch = _batch_dims(run)
     variables = _trajectories(run, batch)
     variables |= _states(run, batch)
     for name, value in run.metrics.items():
         dims = (*batch, *own_dims(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
-        variables[label] = (dims, np.asarray(value), _attrs(run.metrics.units.get(name, "1"), f"metric {name.replace('_', ' ')}"))
+        variables[label] = (
+            dims,
+            np.asarray(value),
+            _attrs(run.metrics.units.get(name, "1"), f"metric {name.replace('_', ' ')}"),
+        )
     variables |= _verdict(run, batch)
     varying, attributes = _parameters(run, batch)
-    coordinates: dict[str, Any] = {"joint": ("joint", np.arange(run.n, dtype=np.int32), _attrs("1", "joint, from 0"))}
+    coordinates: dict[str, Any] = {
+        "joint": ("joint", np.arange(run.n, dtype=np.int32), _attrs("1", "joint, from 0"))
+    }
     if len(batch) == 1:
-        coordinates["run"] = ("run", np.arange(len(run), dtype=np.int32), _attrs("1", "run, from 0"))
+        coordinates["run"] = (
+            "run",
+            np.arange(len(run), dtype=np.int32),
+            _attrs("1", "run, from 0"),
+        )
     coordinates["time"], more = _time(run, batch)
     return xarray.Dataset(variables | varying | more, coordinates, attributes)
 
@@ -92,7 +107,8 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
     """Writes runs to one file.
 
     Args:
-      runs: runs by name (letters, digits, "_", "-" and blanks), or one Rollout, which is then called "run".
+      runs: runs by name (letters, digits, "_", "-" and blanks), or one Rollout, which is then
+        called "run".
       path: the file; its ending decides, ".nc" for netCDF or ".npz" for NumPy.
 
     Raises:
@@ -100,14 +116,25 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
       OSError: the file cannot be written.
     """
     if isinstance(path, Mapping | Rollout):
-        raise checks.fail("path", Words(type(path).__name__), "a path, after the runs", "The order is save_rollouts(runs, path).")
+        raise checks.fail(
+            "path",
+            Words(type(path).__name__),
+            "a path, after the runs",
+            "The order is save_rollouts(runs, path).",
+        )
     ending = _ending(checks.file_to_write("path", path, "a file that ends in .nc or .npz"))
     runs = {"run": runs} if isinstance(runs, Rollout) else runs
     if not isinstance(runs, Mapping) or not runs:
         raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
     for name in runs:
-        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII) or name == _ATTRIBUTES:
-            raise checks.fail("name of a run", name, 'letters, digits, "_", "-" and blanks', "Choose another key.")
+        if (
+            not isinstance(name, str)
+            or not re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII)
+            or name == _ATTRIBUTES
+        ):
+            raise checks.fail(
+                "name of a run", name, 'letters, digits, "_", "-" and blanks', "Choose another key."
+            )
     data = {name: rollout_to_xarray(run) for name, run in runs.items()}
     (_write_netcdf if ending == ".nc" else _write_npz)(path, data)
 
@@ -119,19 +146,24 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
       path: a ".nc" or ".npz" file.
 
     Raises:
-      ValueError: another ending, a file that `save_rollouts` did not write, or one that was damaged or changed since.
+      ValueError: another ending, a file that `save_rollouts` did not write, or one that was damaged
+        or changed since.
       OSError: the file cannot be read.
     """
     place = checks.file_path("path", path, "a file that ends in .nc or .npz")
     read = _read_netcdf if _ending(place) == ".nc" else _read_npz
-    with open(checks.file_to_read("path", place), "rb"):  # a locked file is an OSError, whatever the reader would make of it
+    with open(
+        checks.file_to_read("path", place), "rb"
+    ):  # a locked file is an OSError, whatever the reader would make of it
         pass
     try:
         return read(place)
     except DamagedFileError:
         raise
     except Exception as error:
-        raise checks.fail(str(place), type(error).__name__, "a file written by save_rollouts", str(error)) from error
+        raise checks.fail(
+            str(place), type(error).__name__, "a file written by save_rollouts", str(error)
+        ) from error
 
 
 class DamagedFileError(ValueError):
@@ -182,20 +214,32 @@ def _verdict(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     words = {value: describe(value) for value in np.unique(status).tolist()}
     return {
         "status": (batch, status.astype(np.int32), attributes),
-        "status_words": (batch, np.vectorize(words.get, otypes=[str])(status), _attrs("1", "status in words")),
-        "fastest_mode": (batch, np.asarray(run.fastest_mode), _attrs("1/s", "largest measured mode of the closed loop")),
+        "status_words": (
+            batch,
+            np.vectorize(words.get, otypes=[str])(status),
+            _attrs("1", "status in words"),
+        ),
+        "fastest_mode": (
+            batch,
+            np.asarray(run.fastest_mode),
+            _attrs("1/s", "largest measured mode of the closed loop"),
+        ),
         "dt": (batch, np.asarray(run.dt), _attrs("s", "time step")),
     }
 
 
 def _time(run: Rollout, batch: tuple[str, ...]) -> tuple[Any, dict[str, Any]]:
-    """The time coordinate; if the runs of a batch differ in it, sample numbers, and a variable `t` (run, time)."""
+    """The time coordinate; if the runs of a batch differ in it, sample numbers, and a variable `t`
+    (run, time).
+    """
     t = np.asarray(run.t)
     first = t.reshape(-1, t.shape[-1])[0]
     if np.all(t == first):
         return ("time", first, _attrs("s", "time")), {}
     numbers = np.arange(t.shape[-1], dtype=np.int32)
-    return ("time", numbers, _attrs("1", "sample, from 0; the time is t")), {"t": ((*batch, "time"), t, _attrs("s", "time"))}
+    return ("time", numbers, _attrs("1", "sample, from 0; the time is t")), {
+        "t": ((*batch, "time"), t, _attrs("s", "time"))
+    }
 
 
 def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -209,7 +253,11 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         if batched:
             one = value[(0,) * len(batch)]
             if not np.all(value == one):
-                varying[p.path] = ((*batch, *own_dims(p.path, one.shape, run.n)), value, _attrs(p.unit or "1", f"parameter {p.path}"))
+                varying[p.path] = (
+                    (*batch, *own_dims(p.path, one.shape, run.n)),
+                    value,
+                    _attrs(p.unit or "1", f"parameter {p.path}"),
+                )
                 continue
             value = one
         fixed[p.path] = value.tolist()
@@ -248,7 +296,9 @@ def _write_netcdf(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> N
     for name, one in data.items():
         attributes |= {f"{name}.{key}": value for key, value in one.attrs.items()}
         labels = {*one.variables, *one.dims}
-        renamed.append(one.drop_attrs(deep=False).rename({label: f"{name}.{label}" for label in labels}))
+        renamed.append(
+            one.drop_attrs(deep=False).rename({label: f"{name}.{label}" for label in labels})
+        )
     merged = xarray.merge(renamed).assign_attrs(attributes)
     merged.to_netcdf(path, engine="scipy")
 
@@ -263,7 +313,11 @@ def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
         mine = merged[[v for v in merged.variables if str(v).startswith(start)]]
         labels = {x for x in (*mine.variables, *mine.dims) if str(x).startswith(start)}
         mine = mine.rename({x: str(x).removeprefix(start) for x in labels})
-        mine.attrs = {key.removeprefix(start): value for key, value in merged.attrs.items() if key.startswith(start)}
+        mine.attrs = {
+            key.removeprefix(start): value
+            for key, value in merged.attrs.items()
+            if key.startswith(start)
+        }
         found[name] = mine
     _verify(path, merged.attrs, found)
     return found
@@ -294,7 +348,10 @@ def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
     if len(different) > MOST_NAMED:
         shown += f" and {len(different) - MOST_NAMED} more"
     came = Words(f"content that differs from its digest: {shown}")
-    remedy = f"The file is damaged: restore it or run again. If it was edited on purpose, delete its attribute {DIGEST!r} before saving."
+    remedy = (
+        "The file is damaged: restore it or run again. If it was edited on purpose, delete its"
+        f" attribute {DIGEST!r} before saving."
+    )
     return checks.fail(str(path), came, "what save_rollouts wrote", remedy)
 
 
@@ -302,13 +359,25 @@ def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None
     arrays: dict[str, np.ndarray] = {}
     described: dict[str, Any] = {}
     for name, one in data.items():
-        arrays |= {f"{name}.{label}": np.asarray(variable.values) for label, variable in one.variables.items()}
+        arrays |= {
+            f"{name}.{label}": np.asarray(variable.values)
+            for label, variable in one.variables.items()
+        }
         variables = {}
         for label, variable in one.variables.items():
-            variables[str(label)] = [list(variable.dims), {key: np.asarray(x).tolist() for key, x in variable.attrs.items()}]
-        described[name] = {"variables": variables, "coords": [str(c) for c in one.coords], "attrs": dict(one.attrs)}
+            variables[str(label)] = [
+                list(variable.dims),
+                {key: np.asarray(x).tolist() for key, x in variable.attrs.items()},
+            ]
+        described[name] = {
+            "variables": variables,
+            "coords": [str(c) for c in one.coords],
+            "attrs": dict(one.attrs),
+        }
     with open(path, "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **{_ATTRIBUTES: np.array(json.dumps(described))}, **arrays)
+        np.savez_compressed(
+            file, allow_pickle=False, **{_ATTRIBUTES: np.array(json.dumps(described))}, **arrays
+        )
 
 
 def _read_npz(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
@@ -317,7 +386,10 @@ def _read_npz(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
     found = {}
     with np.load(path, allow_pickle=False) as arrays:
         for name, described in json.loads(str(arrays[_ATTRIBUTES])).items():
-            variables = {label: (dims, arrays[f"{name}.{label}"], attrs) for label, (dims, attrs) in described["variables"].items()}
+            variables = {
+                label: (dims, arrays[f"{name}.{label}"], attrs)
+                for label, (dims, attrs) in described["variables"].items()
+            }
             coords = {label: variables.pop(label) for label in described["coords"]}
             found[name] = xarray.Dataset(variables, coords, described["attrs"])
     return found

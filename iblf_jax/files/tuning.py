@@ -1,36 +1,39 @@
-"""Tuning files: what to tune, as typed, validated TOML; and saved results, from which the report can be made again.
+"""Tuning files: what to tune, as typed, validated TOML; and saved results, from which the report
+can be made again.
 
-A tuning file is a scenario file (`files.scenario`) with four more tables, of which [perturbations] is that of a study file
-(`files.study`):
+A tuning file is a scenario file (`files.scenario`) with four more tables, of which [perturbations]
+is that of a study file (`files.study`):
 
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # the arguments of `tune`: runs, seed, risk, level, starts, iterations, report_runs, ...
-    parameters = ["controller.k1", { path = "controller.K2", low = 0.6, high = 40.0, tied = true }]
-    [[objective]]                           # functions of iblf_jax.objectives with their arguments, and a weight
-    kind = "tracking"
+    [tune]                                  # the arguments of `tune`: runs, seed, risk, level,
+    starts, iterations, report_runs, ... parameters = ["controller.k1", { path = "controller.K2",
+    low = 0.6, high = 40.0, tied = true }] [[objective]]                           # functions of
+    iblf_jax.objectives with their arguments, and a weight kind = "tracking"
     [[objective]]
     kind = "effort"
     weight = 0.5
-    [[objective]]                           # any metric by its name; `fold` only for one with thresholds of one's own
-    kind = "metric"
+    [[objective]]                           # any metric by its name; `fold` only for one with
+    thresholds of one's own kind = "metric"
     name = "iae"
     [[requirement]]
     kind = "margin_above"
     limit = 0.05
-    [[requirement]]                         # of some joints, by index, name or slice; a limit for each, or one for all
-    kind = "peak_torque_below"
+    [[requirement]]                         # of some joints, by index, name or slice; a limit for
+    each, or one for all kind = "peak_torque_below"
     joints = ["shoulder", "elbow"]          # or [0, 1], or "0:2"
     limit = [140.0, 27.0]
     [perturbations]
     "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02, shared = true }
 
-In files of earlier versions `joints` was a list of weights, which is now `weights`.  Floating-point numbers are still read so, and
-so are whole numbers that are no selection of joints; both with a DeprecationWarning.
+In files of earlier versions `joints` was a list of weights, which is now `weights`.  Floating-point
+numbers are still read so, and so are whole numbers that are no selection of joints; both with a
+DeprecationWarning.
 
-Everything is checked; each refusal is a ValueError that names the dotted key.  A saved result is JSON with all its numbers in full.
+Everything is checked; each refusal is a ValueError that names the dotted key.  A saved result is
+JSON with all its numbers in full.
 """
 
 from __future__ import annotations
@@ -70,7 +73,17 @@ components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.ME
 components.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
 components.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
 
-OBJECTIVES = ("tracking", "effort", "torque_rate", "settle", "peak_torque", "margin", "velocity_margin", "region_margin", "metric")
+OBJECTIVES = (
+    "tracking",
+    "effort",
+    "torque_rate",
+    "settle",
+    "peak_torque",
+    "margin",
+    "velocity_margin",
+    "region_margin",
+    "metric",
+)
 REQUIREMENTS = (
     "error_below",
     "peak_torque_below",
@@ -80,13 +93,26 @@ REQUIREMENTS = (
     "violation_probability_below",
 )
 TABLES = ("tune", "objective", "requirement", "perturbations")
-HISTORY = dict.fromkeys(("loss", "objective", "terms", "excess", "margin", "gradient_norm", "z", "x"), "f") | {
+HISTORY = dict.fromkeys(
+    ("loss", "objective", "terms", "excess", "margin", "gradient_norm", "z", "x"), "f"
+) | {
     "valid": "b",
     "evaluations": "iu",
 }
 """What a result's history holds, and the kinds of its numbers."""
 ARGUMENTS = (
-    *("runs", "seed", "resample", "optimiser", "mode", "starts", "sharpenings", "iterations", "tolerance", "patience"),
+    *(
+        "runs",
+        "seed",
+        "resample",
+        "optimiser",
+        "mode",
+        "starts",
+        "sharpenings",
+        "iterations",
+        "tolerance",
+        "patience",
+    ),
     *("learning_rate", "backend", "report_runs", "report_seed", "confidence"),
 )
 """What [tune] may hold besides `parameters`, `risk` and `level`."""
@@ -99,19 +125,32 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
       path: a file in the format at the head of this module.
 
     Raises:
-      ValueError: the file is not TOML or does not describe a tuning; the message names file, key and remedy.
+      ValueError: the file is not TOML or does not describe a tuning; the message names file, key
+        and remedy.
       OSError: the file cannot be read.
     """
     data, source = read_toml(path), os.fspath(path)
     file = from_dict(data, source=source, other_tables=TABLES, folder=Path(path).parent)
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
-        goal = _objective(data.get("objective", []), data.get("requirement", []), joint_names(file.scenario.plant, file.scenario.n))
+        goal = _objective(
+            data.get("objective", []),
+            data.get("requirement", []),
+            joint_names(file.scenario.plant, file.scenario.n),
+        )
         drawn = perturbations_of(data)
     except ValueError as error:
         raise checks.inside(source, error) from error
-    timing = {"duration": 5.0} | {key: x for key, x in dict(file.run or {}).items() if key in ("duration", "dt", "method")}
-    return {"scenario": file.scenario, "objective": goal, "perturbations": drawn, **options, **timing}
+    timing = {"duration": 5.0} | {
+        key: x for key, x in dict(file.run or {}).items() if key in ("duration", "dt", "method")
+    }
+    return {
+        "scenario": file.scenario,
+        "objective": goal,
+        "perturbations": drawn,
+        **options,
+        **timing,
+    }
 
 
 def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
@@ -126,7 +165,11 @@ def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
 def _options(table: dict[str, Any]) -> dict[str, Any]:
     known_keys(table, "tune", ("parameters", "risk", "level", *ARGUMENTS))
     if not isinstance(table.get("parameters"), list):
-        raise checks.fail("tune.parameters", table.get("parameters", Words("nothing")), 'a list of paths, such as ["controller.K2"]')
+        raise checks.fail(
+            "tune.parameters",
+            table.get("parameters", Words("nothing")),
+            'a list of paths, such as ["controller.K2"]',
+        )
     parameters = [_parameter(x, f"tune.parameters[{i}]") for i, x in enumerate(table["parameters"])]
     options = {"parameters": parameters, **{key: table[key] for key in ARGUMENTS if key in table}}
     if "risk" in table:
@@ -143,11 +186,20 @@ def _parameter(entry: Any, key: str) -> Any:
     table = dict(as_table(entry, key))
     known_keys(table, key, ("path", "low", "high", "tied", "scale"))
     path = checks.word(f"{key}.path", table.pop("path", Words("nothing")), "the path of a leaf")
-    limits: dict[str, Any] = {name: numbers(table[name], f"{key}.{name}") for name in ("low", "high") if name in table}
+    limits: dict[str, Any] = {
+        name: numbers(table[name], f"{key}.{name}") for name in ("low", "high") if name in table
+    }
     return components.construct(tunable, {"path": path, **table, **limits}, key)
 
 
-def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, names: tuple[str, ...], besides: tuple[str, ...] = ()) -> Any:
+def _called(
+    module: Any,
+    allowed: tuple[str, ...],
+    entry: Any,
+    key: str,
+    names: tuple[str, ...],
+    besides: tuple[str, ...] = (),
+) -> Any:
     """What a function of objectives makes of a table; `names` are those of the robot's joints."""
     table = _with_weights(as_table(entry, key), key, names)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
@@ -158,8 +210,16 @@ def _called(module: Any, allowed: tuple[str, ...], entry: Any, key: str, names: 
     known_keys(table, key, ("kind", *besides, *taken))
     for name, parameter in taken.items():
         if parameter.default is parameter.empty and name not in table:
-            raise checks.fail(f"{key}.{name}", Words("nothing"), f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it")
-    return components.construct(function, {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table}, key)
+            raise checks.fail(
+                f"{key}.{name}",
+                Words("nothing"),
+                f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it",
+            )
+    return components.construct(
+        function,
+        {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table},
+        key,
+    )
 
 
 _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
@@ -173,13 +233,21 @@ def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> di
     if not (holds_weights(given) or whole):
         return table
     n = len(names)
-    if whole and len(given) != n:  # earlier versions took one weight a joint, so this is a selection
+    if (
+        whole and len(given) != n
+    ):  # earlier versions took one weight a joint, so this is a selection
         return table
     if whole and {x % n for x in given if -n <= x < n} == set(range(n)):
-        text = f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write weights = {given} if you mean these."
+        text = (
+            f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write"
+            f" weights = {given} if you mean these."
+        )
         notices.warn(text)
         return table
-    text = f"{key}.joints selects joints now; {given} is read as weights, as in earlier versions: write weights = {given}."
+    text = (
+        f"{key}.joints selects joints now; {given} is read as weights, as in earlier versions:"
+        f" write weights = {given}."
+    )
     notices.warn(text, DeprecationWarning)
     return {name: value for name, value in table.items() if name != "joints"} | {"weights": given}
 
@@ -188,13 +256,19 @@ def _argument(name: str, value: Any, key: str) -> Any:
     if name == "joints":
         return value  # the function checks it
     if name == "fold":
-        return components.decode({"kind": value} if isinstance(value, str) else value, metrics.Fold, key)
-    return checks.word(key, value, _NO_NUMBERS[name]) if name in _NO_NUMBERS else numbers(value, key)
+        return components.decode(
+            {"kind": value} if isinstance(value, str) else value, metrics.Fold, key
+        )
+    return (
+        checks.word(key, value, _NO_NUMBERS[name]) if name in _NO_NUMBERS else numbers(value, key)
+    )
 
 
 def _fold_of(result: Any, key: str) -> str:
     """The metric that returns a result."""
-    owners = {name: kind for kind, fold in metrics.MEMBERS.items() for name in getattr(fold, "units", ())}
+    owners = {
+        name: kind for kind, fold in metrics.MEMBERS.items() for name in getattr(fold, "units", ())
+    }
     if not isinstance(result, str) or result not in owners:
         raise checks.fail(key, result, "the name of a metric", did_you_mean(result, owners))
     return owners[result]
@@ -202,7 +276,12 @@ def _fold_of(result: Any, key: str) -> str:
 
 def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objective:
     if not isinstance(terms, list) or not terms:
-        raise checks.fail("objective", terms or Words("nothing"), "at least one [[objective]] table", 'Such as kind = "tracking".')
+        raise checks.fail(
+            "objective",
+            terms or Words("nothing"),
+            "at least one [[objective]] table",
+            'Such as kind = "tracking".',
+        )
     total = Objective()
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
@@ -210,7 +289,9 @@ def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objecti
         weight = numbers(entry.get("weight", 1.0), f"{key}.weight")
         total += components.construct(term.__mul__, {"weight": weight}, key)
     if not isinstance(requirements, list):
-        raise checks.fail("requirement", requirements, "[[requirement]] tables", 'Such as kind = "margin_above".')
+        raise checks.fail(
+            "requirement", requirements, "[[requirement]] tables", 'Such as kind = "margin_above".'
+        )
     for i, entry in enumerate(requirements):
         total += _called(objectives, REQUIREMENTS, entry, f"requirement[{i}]", names)
     return total
@@ -219,15 +300,40 @@ def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objecti
 # ------------------------------------------------------------------------------------------------------------- saved results
 
 
-RESULT = ("names", "best_start", "stopped", "optimiser", "mode", "seconds", "multipliers", "residuals", "probes")
+RESULT = (
+    "names",
+    "best_start",
+    "stopped",
+    "optimiser",
+    "mode",
+    "seconds",
+    "multipliers",
+    "residuals",
+    "probes",
+)
 """Fields of a result that are words and numbers."""
 
 
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
     target, setup = checks.file_to_write("path", path), result.setup
-    history = {name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()} for name, x in result.history.items()}
-    plain = ("runs", "seed", "duration", "dt", "method", "backend", "report_runs", "report_seed", "confidence", "limits", "reasons")
+    history = {
+        name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()}
+        for name, x in result.history.items()
+    }
+    plain = (
+        "runs",
+        "seed",
+        "duration",
+        "dt",
+        "method",
+        "backend",
+        "report_runs",
+        "report_seed",
+        "confidence",
+        "limits",
+        "reasons",
+    )
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
@@ -236,7 +342,9 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "setup": {name: getattr(setup, name) for name in plain},
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
-        "perturbations": {key: components.encode_fields(x, key) for key, x in setup.perturbations.items()},
+        "perturbations": {
+            key: components.encode_fields(x, key) for key, x in setup.perturbations.items()
+        },
         **{name: getattr(result, name) for name in RESULT},
         "report": result.report.to_dict(),
     }
@@ -265,7 +373,9 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
     try:
         return _decoded(data)
     except Exception as error:  # whatever is missing in it, or of another kind
-        raise checks.fail("path", str(place), expected, f"{type(error).__name__}: {error}") from error
+        raise checks.fail(
+            "path", str(place), expected, f"{type(error).__name__}: {error}"
+        ) from error
 
 
 def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
@@ -275,7 +385,9 @@ def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
 
 
 def _with_new_names(table: Any) -> Any:
-    """The table of an objective in which the weights of a quantity, in earlier versions called `joints`, have their name."""
+    """The table of an objective in which the weights of a quantity, in earlier versions called
+    `joints`, have their name.
+    """
     if isinstance(table, list):
         return [_with_new_names(x) for x in table]
     if not isinstance(table, dict):
@@ -291,13 +403,22 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     start = from_dict(data["start"]).scenario
     values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
     setup = TuneSetup(
-        objective=checked(components.decode_fields(Objective, _with_new_names(data["objective"]), "objective")),
-        perturbations={key: components.decode_fields(Perturbation, x, key) for key, x in data["perturbations"].items()},
+        objective=checked(
+            components.decode_fields(Objective, _with_new_names(data["objective"]), "objective")
+        ),
+        perturbations={
+            key: components.decode_fields(Perturbation, x, key)
+            for key, x in data["perturbations"].items()
+        },
         risk=as_risk(Risk(*data["risk"])),
         **data["setup"]
         | {
-            "limits": tuple((float(low), float(high)) for low, high in data["setup"].get("limits", ())),
-            "reasons": tuple((str(low), str(high)) for low, high in data["setup"].get("reasons", ())),
+            "limits": tuple(
+                (float(low), float(high)) for low, high in data["setup"].get("limits", ())
+            ),
+            "reasons": tuple(
+                (str(low), str(high)) for low, high in data["setup"].get("reasons", ())
+            ),
         },
     )
     tableau(setup.method)
@@ -309,13 +430,24 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     for name in ("seed", "report_seed"):
         checks.seed(getattr(setup, name))
     targets_of(start, setup.perturbations)
-    words = {name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")}
+    words = {
+        name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")
+    }
     names = tuple(checks.word("names", name, "a string") for name in data["names"])
     history = {name: _array(data["history"][name], kinds) for name, kinds in HISTORY.items()}
     steps, starts, size = history["x"].shape
     shapes = {name: x.shape[:2] for name, x in history.items() if name != "evaluations"}
-    if size != len(names) or not steps or set(shapes.values()) != {(steps, starts)} or history["evaluations"].shape != (steps,):
-        raise checks.fail("history", Words("arrays that do not fit each other"), f"(steps, starts, ...) of {len(names)} numbers")
+    if (
+        size != len(names)
+        or not steps
+        or set(shapes.values()) != {(steps, starts)}
+        or history["evaluations"].shape != (steps,)
+    ):
+        raise checks.fail(
+            "history",
+            Words("arrays that do not fit each other"),
+            f"(steps, starts, ...) of {len(names)} numbers",
+        )
     best = checks.positive_integer("best_start", data["best_start"], least=0, most=starts - 1)
     seconds = checks.positive_number("seconds", data["seconds"], "s", zero=True)
     ends = [tuple(float(x) for x in data[name]) for name in ("multipliers", "residuals")]

@@ -1,6 +1,8 @@
-"""What a text file can hold, checked: tables, numbers, strings, lists, each against what was expected of it.
+"""What a text file can hold, checked: tables, numbers, strings, lists, each against what was
+expected of it.
 
-Every refusal is a ValueError that names the dotted key, what came, what was expected, and the remedy.
+Every refusal is a ValueError that names the dotted key, what came, what was expected, and the
+remedy.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from iblf_jax.core import checks
 from iblf_jax.core.checks import Words, did_you_mean
 
 NONE = "none"
-"""What a file says for a structural field that is None though its default is something else; TOML has no null."""
+"""What a file says for a structural field that is None though its default is something else; TOML
+has no null."""
 
 
 def toml_tables(text: str) -> dict[str, Any]:
@@ -40,7 +43,9 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def inline_table(table: dict[str, Any]) -> str:
-    """A table of numbers, strings, booleans and lists of these as one writes it in a file, { factor = "uniform", low = 0.7 }."""
+    """A table of numbers, strings, booleans and lists of these as one writes it in a file, { factor
+    = "uniform", low = 0.7 }.
+    """
 
     def written(value: Any) -> str:
         if isinstance(value, list):
@@ -82,7 +87,9 @@ def numbers(value: Any, path: str, unit: str = "") -> Any:
 
 
 def without_none(hint: Any) -> tuple[Any, bool]:
-    """An annotation without its `| None`, and whether it had one.  A union of several others becomes Any."""
+    """An annotation without its `| None`, and whether it had one.  A union of several others
+    becomes Any.
+    """
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return hint, False
     rest = [option for option in typing.get_args(hint) if option is not type(None)]
@@ -109,16 +116,25 @@ def plain_numbers(array: Any) -> Any:
 
 
 def plain_static(value: Any, path: str) -> Any:
-    """A structural value as a file holds it: tuples become lists; ValueError for what a file cannot hold."""
+    """A structural value as a file holds it: tuples become lists; ValueError for what a file cannot
+    hold.
+    """
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, tuple):
         return [plain_static(x, f"{path}[{i}]") for i, x in enumerate(value)]
     if isinstance(value, str) and any("\ud800" <= x <= "\udfff" for x in value):
-        raise checks.fail(path, value, "text without halves of surrogate pairs", "A scenario file cannot hold it.")
+        raise checks.fail(
+            path, value, "text without halves of surrogate pairs", "A scenario file cannot hold it."
+        )
     if isinstance(value, bool | str | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    raise checks.fail(path, value, "a finite number, a string, a bool or a tuple of these", "A scenario file cannot hold it.")
+    raise checks.fail(
+        path,
+        value,
+        "a finite number, a string, a bool or a tuple of these",
+        "A scenario file cannot hold it.",
+    )
 
 
 def decode_static(value: Any, hint: Any, path: str) -> Any:
@@ -129,7 +145,9 @@ def decode_static(value: Any, hint: Any, path: str) -> Any:
     if isinstance(value, list):
         if hint not in (Any, tuple) and typing.get_origin(hint) is not tuple:
             raise checks.fail(path, value, f"{_WORDS.get(hint, 'one value')}, not a list")
-        return tuple(decode_static(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
+        return tuple(
+            decode_static(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value)
+        )
     if hint is tuple or typing.get_origin(hint) is tuple:
         raise checks.fail(path, value, "a list")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
@@ -140,4 +158,9 @@ def decode_static(value: Any, hint: Any, path: str) -> Any:
     return value
 
 
-_WORDS: dict[Any, str] = {str: "a string", int: "a whole number", float: "a finite number", bool: "true or false"}
+_WORDS: dict[Any, str] = {
+    str: "a string",
+    int: "a whole number",
+    float: "a finite number",
+    bool: "true or false",
+}

@@ -2,9 +2,10 @@
 
     t [s], q (N, n) [rad], tau (N, n) [N m], and, where it was logged, q' (N, n) [rad/s]
 
-A log is a Dataset or a mapping with these names (what `Rollout.to_xarray` gives), a Rollout, a CSV file whose heading is
-t, q[0], ..., dq[0], ..., tau[0], ..., or a netCDF file.  Time stamps may be irregular; where one is missing for long, the log has a gap,
-and is two stretches.  Velocities of a log are filtered differences of its positions, most often: they are compared with these, no more.
+A log is a Dataset or a mapping with these names (what `Rollout.to_xarray` gives), a Rollout, a CSV
+file whose heading is t, q[0], ..., dq[0], ..., tau[0], ..., or a netCDF file.  Time stamps may be
+irregular; where one is missing for long, the log has a gap, and is two stretches.  Velocities of a
+log are filtered differences of its positions, most often: they are compared with these, no more.
 """
 
 from __future__ import annotations
@@ -26,7 +27,12 @@ GAP, MOST = 3.0, 0.95
 """A time between samples that is so many times what this share of them is below is a gap."""
 FEWEST = 50
 """Samples that a log must have."""
-UNITS = {"q": ("rad", "m", "1"), "dq": ("rad/s", "m/s", "1/s"), "tau": ("N m", "N", "Nm", "N*m", "N.m"), "t": ("s",)}
+UNITS = {
+    "q": ("rad", "m", "1"),
+    "dq": ("rad/s", "m/s", "1/s"),
+    "tau": ("N m", "N", "Nm", "N*m", "N.m"),
+    "t": ("s",),
+}
 """What a Dataset may say of its units."""
 
 
@@ -63,7 +69,9 @@ class Log(NamedTuple):
     def stretches(self) -> list[slice]:
         """The samples between gaps."""
         ends = np.flatnonzero(np.diff(self.t) > self.gap) + 1
-        return [slice(int(a), int(b)) for a, b in zip([0, *ends], [*ends, len(self.t)], strict=True)]
+        return [
+            slice(int(a), int(b)) for a, b in zip([0, *ends], [*ends, len(self.t)], strict=True)
+        ]
 
 
 def read(log: Any, n: int, what: str = "log") -> list[Log]:
@@ -75,8 +83,8 @@ def read(log: Any, n: int, what: str = "log") -> list[Log]:
       what: the user's word for it.
 
     Raises:
-      ValueError: something that is no log, or one with missing columns, rows without numbers, times that do not increase, another number
-        of joints, too few samples, or units that are not SI.
+      ValueError: something that is no log, or one with missing columns, rows without numbers, times
+        that do not increase, another number of joints, too few samples, or units that are not SI.
       OSError: a file cannot be read.
     """
     if isinstance(log, list | tuple):
@@ -90,7 +98,9 @@ def read(log: Any, n: int, what: str = "log") -> list[Log]:
         return [_checked(_of_rollout(log, what), n, what)]
     if isinstance(log, Mapping) or hasattr(log, "data_vars"):
         return [_checked(_of_mapping(log, what), n, what)]
-    raise checks.fail(what, log, "a Dataset, a Rollout, the path of a .csv or .nc file, or a list of these")
+    raise checks.fail(
+        what, log, "a Dataset, a Rollout, the path of a .csv or .nc file, or a list of these"
+    )
 
 
 def _of_file(path: Path) -> dict[str, np.ndarray]:
@@ -100,12 +110,16 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
         try:
             data = xarray.load_dataset(path)
         except Exception as error:  # whatever its reader makes of it
-            raise checks.fail(str(path), type(error).__name__, "a netCDF file", str(error)) from error
+            raise checks.fail(
+                str(path), type(error).__name__, "a netCDF file", str(error)
+            ) from error
         return _of_mapping(data, str(path))
     if path.suffix.lower() != ".csv":
         raise checks.fail("log", str(path), "a file that ends in .csv or .nc")
     with open(path, newline="", encoding="utf-8-sig") as file:
-        heading = [word.strip().removeprefix("# ") for word in next(csv.reader(file), [])]  # numpy.savetxt's begins with "# "
+        heading = [
+            word.strip().removeprefix("# ") for word in next(csv.reader(file), [])
+        ]  # numpy.savetxt's begins with "# "
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # no rows at all: told below
             try:
@@ -116,19 +130,36 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
                     raise checks.fail(str(path), Said(str(error)), "rows of numbers") from error
                 came = Said(f"{short[2]} columns in row {int(short[1]) - 1}")
                 raise checks.fail(
-                    str(path), came, f"{short[3]}, as in the rows before", "Leave this row out: a gap is understood."
+                    str(path),
+                    came,
+                    f"{short[3]}, as in the rows before",
+                    "Leave this row out: a gap is understood.",
                 ) from error
     if "t" not in heading or rows.shape[1] != len(heading):
-        came = Said(f"the heading {', '.join(heading) or 'of an empty file'} and rows of {rows.shape[1]} columns")
-        raise checks.fail(str(path), came, "a column t, and one column for each word of the heading", "It begins t, q[0], q[1], ...")
+        came = Said(
+            f"the heading {', '.join(heading) or 'of an empty file'} and rows of {rows.shape[1]}"
+            " columns"
+        )
+        raise checks.fail(
+            str(path),
+            came,
+            "a column t, and one column for each word of the heading",
+            "It begins t, q[0], q[1], ...",
+        )
     if len(set(heading)) < len(heading):
         raise checks.fail(str(path), Said(", ".join(heading)), "columns of different names")
     found = {"t": rows[:, heading.index("t")]}
     for name in ("q", "dq", "tau"):
-        own = {int(m[1]): i for i, word in enumerate(heading) if (m := re.fullmatch(rf"{name}\[(\d+)\]", word))}
+        own = {
+            int(m[1]): i
+            for i, word in enumerate(heading)
+            if (m := re.fullmatch(rf"{name}\[(\d+)\]", word))
+        }
         missing = set(range(max(own, default=0) + 1)) - set(own)
         if own and missing:
-            raise checks.fail(str(path), Said(", ".join(heading)), f"a column {name}[{min(missing)}]")
+            raise checks.fail(
+                str(path), Said(", ".join(heading)), f"a column {name}[{min(missing)}]"
+            )
         if own:
             found[name] = rows[:, [own[i] for i in range(len(own))]]
     return found
@@ -143,7 +174,9 @@ def _of_mapping(data: Any, what: str) -> dict[str, np.ndarray]:
         x = data[key]
         unit = getattr(x, "attrs", {}).get("units")
         if unit is not None and unit not in UNITS[name]:
-            raise checks.fail(f"{what}: units of {name}", unit, UNITS[name][0], "Convert the log to SI units.")
+            raise checks.fail(
+                f"{what}: units of {name}", unit, UNITS[name][0], "Convert the log to SI units."
+            )
         if "time" in getattr(x, "dims", ()):
             x = x.transpose("time", ...)
         try:
@@ -155,13 +188,22 @@ def _of_mapping(data: Any, what: str) -> dict[str, np.ndarray]:
 
 def _of_rollout(run: Rollout, what: str) -> dict[str, np.ndarray]:
     if np.ndim(run.t) != 1:
-        raise checks.fail(what, Said("a batch of runs"), "one run", "Give a list: [runs[0], runs[1]].")
+        raise checks.fail(
+            what, Said("a batch of runs"), "one run", "Give a list: [runs[0], runs[1]]."
+        )
     if isinstance(run.measured, tuple) and not hasattr(run.measured, "q"):
-        return {"t": np.asarray(run.t, float), "q": np.asarray(run.q, float), "tau": np.asarray(run.tau, float)}
+        return {
+            "t": np.asarray(run.t, float),
+            "q": np.asarray(run.q, float),
+            "tau": np.asarray(run.tau, float),
+        }
     # A sampled loop knows what it measured, at the start of each period.
     t, period = np.asarray(run.t, float), float(run.scenario.sampling.period)  # type: ignore[union-attr]
     taken = np.flatnonzero(np.abs(t / period - np.round(t / period)) < 1e-6)
-    return {name: np.asarray(x, float)[taken] for name, x in (("t", t), ("q", run.measured.q), ("tau", run.tau))}
+    return {
+        name: np.asarray(x, float)[taken]
+        for name, x in (("t", t), ("q", run.measured.q), ("tau", run.tau))
+    }
 
 
 def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
@@ -169,20 +211,31 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
         if name not in found:
             columns = name if name == "t" else f"{name}[0] ... {name}[{n - 1}]"
             raise checks.fail(
-                what, Said(f"no {name}"), f"t, q and tau: {columns} is missing", "Of a CSV file the heading names the columns."
+                what,
+                Said(f"no {name}"),
+                f"t, q and tau: {columns} is missing",
+                "Of a CSV file the heading names the columns.",
             )
     t = found["t"]
     if t.ndim != 1:
         raise checks.fail(f"{what}: t", t, "one time a sample, (N,) [s]")
     for name in set(found) - {"t"}:
         if found[name].ndim != 2 or found[name].shape[1] != n:
-            came = Said(f"{found[name].shape[1]} joints" if found[name].ndim == 2 else f"shape {found[name].shape}")
+            came = Said(
+                f"{found[name].shape[1]} joints"
+                if found[name].ndim == 2
+                else f"shape {found[name].shape}"
+            )
             raise checks.fail(f"{what}: {name}", came, f"(N, {n}), as the scenario has {n} joints")
         if len(found[name]) != len(t):
-            raise checks.fail(f"{what}: {name}", Said(f"{len(found[name])} samples"), f"{len(t)}, as t has")
+            raise checks.fail(
+                f"{what}: {name}", Said(f"{len(found[name])} samples"), f"{len(t)}, as t has"
+            )
     if len(t) < FEWEST:
         raise checks.fail(what, Said(f"{len(t)} samples"), f"at least {FEWEST}", "Log for longer.")
-    broken = ~np.all([np.isfinite(x).reshape(len(t), -1).all(axis=1) for x in found.values()], axis=0)
+    broken = ~np.all(
+        [np.isfinite(x).reshape(len(t), -1).all(axis=1) for x in found.values()], axis=0
+    )
     if np.any(broken):
         first = int(np.argmax(broken))
         names = ", ".join(name for name, x in found.items() if not np.isfinite(x[first]).all())

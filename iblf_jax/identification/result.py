@@ -26,15 +26,18 @@ from iblf_jax.studies.distributions import Perturbation, joint_normal, value
 from iblf_jax.world.robots import joint_names
 
 WHITE, SLIGHT = 1e-3, 0.05
-"""Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is above the second."""
+"""Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is
+above the second."""
 LACKS, FINEST = 1.5, 1e-5
-"""Times the positions' noise from which what is left is not noise, and the least noise that counts [rad]."""
+"""Times the positions' noise from which what is left is not noise, and the least noise that counts
+[rad]."""
 MORE_THAN_NOISE = 1.05
 """Times the positions' noise from which terms are looked for that the fit lacks."""
 CLEARLY = 1.1
 """Times that standard errors are widened from which it is told."""
 SEEN = 1e-8
-"""Part of the best known combination's information from which one counts in what the log would do without limits."""
+"""Part of the best known combination's information from which one counts in what the log would do
+without limits."""
 AT_END = 1e-6
 """Distance from a limit, in scales, within which a number is at it."""
 
@@ -50,8 +53,9 @@ class Number(NamedTuple):
     error: float | None
     """Standard error."""
     verdict: str
-    """"told", "cannot be told", "at its limit", "left free": the width of a friction that is not of this law, or "biased": a term that
-    was left out of the fit moves it by more than its standard error, or by more than 5 % of it."""
+    """"told", "cannot be told", "at its limit", "left free": the width of a friction that is not of
+    this law, or "biased": a term that was left out of the fit moves it by more than its standard
+    error, or by more than 5 % of it."""
     bias: float | None = None
     """What the terms that were left out add to it, where it is biased."""
 
@@ -64,7 +68,9 @@ class Number(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What is left of one joint's positions, root of the mean square over windows, each from the start that fits it best."""
+    """What is left of one joint's positions, root of the mean square over windows, each from the
+    start that fits it best.
+    """
 
     joint: str
     before: float
@@ -88,7 +94,9 @@ class Fit(NamedTuple):
 
     @property
     def has_structure(self) -> bool:
-        """Whether what is left may follow something: it is more than the positions' noise, or coloured and no rounding."""
+        """Whether what is left may follow something: it is more than the positions' noise, or
+        coloured and no rounding.
+        """
         return self.lacking > MORE_THAN_NOISE or (not self.is_white and self.after > FINEST)
 
     @property
@@ -102,8 +110,8 @@ class Identification:
     """Parameters from a log: values, how well they are known, and what the log cannot tell."""
 
     scenario: Scenario
-    """With the new numbers, in plant and model alike where the paths were the robot's or the plant's; what the log cannot tell is left
-    where it agrees with what it can."""
+    """With the new numbers, in plant and model alike where the paths were the robot's or the
+    plant's; what the log cannot tell is left where it agrees with what it can."""
     start: Scenario
     paths: tuple[str, ...]
     """As asked for, and after them the widths of friction that were looked for with it."""
@@ -117,7 +125,8 @@ class Identification:
     delay_error: float | None
     """Its standard error, infinite if it cannot be told; None if it was given."""
     singular_values: np.ndarray
-    """How well each combination is known, from the best on: their inverse is its standard error, in the numbers' scales, (p,)."""
+    """How well each combination is known, from the best on: their inverse is its standard error, in
+    the numbers' scales, (p,)."""
     combinations: tuple[str, ...]
     """The combinations, each number in its scale, by their paths."""
     untold: tuple[str, ...]
@@ -146,17 +155,26 @@ class Identification:
     @property
     def wanted(self) -> tuple[Number, ...]:
         """The numbers that were asked for."""
-        return self.numbers[: sum(math.prod(np.shape(paths.get(self.start, path))) for path in self.paths[: self.asked])]
+        return self.numbers[
+            : sum(
+                math.prod(np.shape(paths.get(self.start, path)))
+                for path in self.paths[: self.asked]
+            )
+        ]
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
         """Path -> value in the leaf's unit, NaN where the log cannot tell it."""
-        return self._by_path([math.nan if number.value is None else number.value for number in self.numbers])
+        return self._by_path(
+            [math.nan if number.value is None else number.value for number in self.numbers]
+        )
 
     @cached_property
     def standard_errors(self) -> dict[str, np.ndarray]:
         """Path -> standard error in the leaf's unit, infinite where the log cannot tell it."""
-        return self._by_path([math.inf if number.error is None else number.error for number in self.numbers])
+        return self._by_path(
+            [math.inf if number.error is None else number.error for number in self.numbers]
+        )
 
     @property
     def correlation(self) -> np.ndarray:
@@ -176,11 +194,16 @@ class Identification:
 
     @cached_property
     def perturbations(self) -> dict[str, Perturbation]:
-        """What the log leaves open, for `monte_carlo`, `sweep` and `tune`: the told numbers of the plant, jointly normal.
+        """What the log leaves open, for `monte_carlo`, `sweep` and `tune`: the told numbers of the
+        plant, jointly normal.
 
         x = value + L w,   L L^T = covariance,   w standard normal, the same for all paths
         """
-        told = [i for i, number in enumerate(self.wanted) if number.error is not None and number.verdict == TOLD]
+        told = [
+            i
+            for i, number in enumerate(self.wanted)
+            if number.error is not None and number.verdict == TOLD
+        ]
         size, axes = np.linalg.eigh(self.covariance[np.ix_(told, told)])
         factor = np.zeros((len(self.numbers), len(told)))
         factor[told] = axes * np.sqrt(np.maximum(size, 0.0))
@@ -191,7 +214,9 @@ class Identification:
             first += len(these)
             if all(i in told for i in these):
                 mean = np.array([self.numbers[i].value for i in these]).reshape(shape)
-                found[own] = value(joint_normal(mean, factor[list(these)].reshape(*shape, -1), GROUP))
+                found[own] = value(
+                    joint_normal(mean, factor[list(these)].reshape(*shape, -1), GROUP)
+                )
                 continue
             for i in these:
                 if i in told:
@@ -201,7 +226,13 @@ class Identification:
 
     def __repr__(self) -> str:
         return "\n".join(
-            [self._heading(), *tables.as_text([HEADING, *self._rows()]), "", *tables.as_text([FIT, *self._fits()]), *self._lines()]
+            [
+                self._heading(),
+                *tables.as_text([HEADING, *self._rows()]),
+                "",
+                *tables.as_text([FIT, *self._fits()]),
+                *self._lines(),
+            ]
         )
 
     def _repr_html_(self) -> str:
@@ -216,7 +247,10 @@ class Identification:
     def tables_html(self) -> dict[str, str]:
         """Its tables as HTML, numbers that the log cannot tell, or that are biased, in bold."""
         bold = [i for i, number in enumerate(self.numbers) if number.verdict in (UNTOLD, BIASED)]
-        return {"Numbers": tables.as_html(HEADING, self._rows(), bold), "Fit": tables.as_html(FIT, self._fits())}
+        return {
+            "Numbers": tables.as_html(HEADING, self._rows(), bold),
+            "Fit": tables.as_html(FIT, self._fits()),
+        }
 
     def _heading(self) -> str:
         W, back = int(np.sum(self.kept)), int(np.sum(~self.kept))
@@ -224,12 +258,22 @@ class Identification:
         looked = [number for number in self.numbers if number.verdict != FREE]
         told = sum(number.value is not None for number in looked)
         windows = f"{W} windows of {length:.3g} s fitted, {back} held back"
-        return f"Identification: {told} of {len(looked)} numbers told; {windows}; {self.steps} steps, {self.seconds:.3g} s"
+        return (
+            f"Identification: {told} of {len(looked)} numbers told; {windows}; {self.steps} steps,"
+            f" {self.seconds:.3g} s"
+        )
 
     def _rows(self) -> list[tuple[str, ...]]:
         rows: list[tuple[str, ...]] = []
         for x in self.numbers:
-            found = (x.digits, *(("", "") if x.error is None or x.value is None else (f"{x.error:.2g}", _share(x.error, x.value))))
+            found = (
+                x.digits,
+                *(
+                    ("", "")
+                    if x.error is None or x.value is None
+                    else (f"{x.error:.2g}", _share(x.error, x.value))
+                ),
+            )
             rows.append((x.name, x.unit, f"{x.start:.5g}", *found, x.verdict))
         return rows
 
@@ -249,12 +293,17 @@ class Identification:
         lines = [f"  cannot be told: {words}" for words in self.untold]
         error = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
         early = self.delay < -3.0 * (self.delay_error or 0.0)
-        late = f"acts {1e3 * (-self.delay if early else self.delay):.3g} ms {'before its time' if early else 'late'} ({error})"
+        late = (
+            f"acts {1e3 * (-self.delay if early else self.delay):.3g} ms"
+            f" {'before its time' if early else 'late'} ({error})"
+        )
         late = late if self.delay_error != math.inf else "is late by what the log cannot tell"
         return [*lines, f"  the logged torque {late}", *(f"  {note}" for note in self.notes)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the residuals as plain numbers, strings and lists, for strict JSON (no NaN, no infinity)."""
+        """Everything but the residuals as plain numbers, strings and lists, for strict JSON (no
+        NaN, no infinity).
+        """
         return _for_json({
             "what": "iblf_jax identification",
             "logs": self.logs,
@@ -276,7 +325,8 @@ class Identification:
         })  # fmt: skip
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the report: numbers as JSON, or numbers and figure as one page of HTML; the ending, ".json" or ".html", decides.
+        """Writes the report: numbers as JSON, or numbers and figure as one page of HTML; the
+        ending, ".json" or ".html", decides.
 
         Raises:
           ValueError: another ending.
@@ -287,25 +337,43 @@ class Identification:
         if ending not in (".json", ".html"):
             raise checks.fail("path", str(target), "a file that ends in .json or .html")
         if ending == ".json":
-            target.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
+            target.write_text(
+                json.dumps(self.to_dict(), indent=1, allow_nan=False), encoding="utf-8"
+            )
             return
         from iblf_jax import reports
 
         reports.report(self, target)
 
     def plot(self, **options):
-        """Figure: values with their errors, what is known how well, and what is left.  Options as `plotting.identification`."""
+        """Figure: values with their errors, what is known how well, and what is left.  Options as
+        `plotting.identification`.
+        """
         from iblf_jax import plotting
 
         return plotting.identification(self, **options)
 
 
-TOLD, UNTOLD, LIMITED, FREE, BIASED = "told", "cannot be told", "at its limit", "left free", "biased"
+TOLD, UNTOLD, LIMITED, FREE, BIASED = (
+    "told",
+    "cannot be told",
+    "at its limit",
+    "left free",
+    "biased",
+)
 """Verdicts."""
 GROUP = "identified"
 """Name of the draws that all identified numbers share."""
 HEADING = ("number", "unit", "start", "value", "standard error", "relative", "verdict")
-FIT = ("joint", "rms before [rad]", "rms after [rad]", "rms held back [rad]", "autocorrelation", "what is left is", "torque explained")
+FIT = (
+    "joint",
+    "rms before [rad]",
+    "rms after [rad]",
+    "rms held back [rad]",
+    "autocorrelation",
+    "what is left is",
+    "torque explained",
+)
 
 
 def _share(error: float, of: float) -> str:
@@ -354,7 +422,8 @@ def judged(
       asked: how many of the paths the user wrote.
       ends: limits of z.
       delay_found: whether the delay was looked for.
-      worse: how many times as much the law of friction leaves as free torques about standstill; 0 without such.
+      worse: how many times as much the law of friction leaves as free torques about standstill; 0
+        without such.
       logs: their names.
       seconds: what it took.
       lacking_terms: z and which of its numbers were fitted -> the terms that the fit lacks.
@@ -373,11 +442,17 @@ def judged(
     white = [whiteness(end.told.residuals[w.kept][:, :, j]) for j in range(w.y.shape[-1])]
     fit = _fits(start, w, end, before, white, guess)
     lacking = max(one.lacking for one in fit)
-    found = known(information, scores, precision[both], scale[looked], lacking if lacking > LACKS else 1.0)
+    found = known(
+        information, scores, precision[both], scale[looked], lacking if lacking > LACKS else 1.0
+    )
     names = np.array([*c.names, "the torque's delay"])[looked]
     errors, covariance = np.full(p + 1, np.inf), np.zeros((p + 1, p + 1))
     errors[looked], covariance[both] = found.errors, found.covariance
-    asked_for = _without_limits(information, scores + (precision @ np.append(x - prior.mean, 0.0))[looked] / len(scores), scale[looked])
+    asked_for = _without_limits(
+        information,
+        scores + (precision @ np.append(x - prior.mean, 0.0))[looked] / len(scores),
+        scale[looked],
+    )
     beyond = np.zeros(p + 1)
     beyond[looked] = asked_for
     x = np.where(end.free.held, c.x, x)
@@ -385,13 +460,23 @@ def judged(
     if any(one.has_structure for one in fit):
         lacks = lacking_terms(end.z, looked & ~_at_limits(end, ends, scale))
     bias = biased(lacks, x, errors[:p])
-    numbers = tuple(_number(c, i, float(x[i]), float(errors[i]), beyond[i], end, ends, scale, float(bias[i])) for i in range(p))
+    numbers = tuple(
+        _number(c, i, float(x[i]), float(errors[i]), beyond[i], end, ends, scale, float(bias[i]))
+        for i in range(p)
+    )
     combinations = tuple(in_words(direction, tuple(names)) for direction in found.directions.T)
-    untold = tuple(words for words, size in zip(combinations, found.singular, strict=True) if not size > 1.0 / UNKNOWN)
+    untold = tuple(
+        words
+        for words, size in zip(combinations, found.singular, strict=True)
+        if not size > 1.0 / UNKNOWN
+    )
     delay_error = float(errors[p]) if delay_found else None
     scenario, notes = _with_numbers(start, c, x, end.z[-1])
     if c.delay and end.z[-1] < -3.0 * errors[p]:
-        notes.append("The logged torque acts before its time: it is not the command, and the scenario's delay is 0.")
+        notes.append(
+            "The logged torque acts before its time: it is not the command, and the scenario's"
+            " delay is 0."
+        )
     return Identification(
         scenario,
         start,
@@ -437,12 +522,21 @@ def _at_limits(end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray) ->
 def _left_out_in_words(start: Scenario, lacks: LeftOut, numbers: tuple[Number, ...]) -> list[str]:
     """What was left out, what to do, and which numbers make up for it."""
     joints = joint_names(start.plant, start.n)
-    available = [p.path for p in parameters(start, named=False) if p.path.startswith(("plant.", "disturbance."))]
+    available = [
+        p.path
+        for p in parameters(start, named=False)
+        if p.path.startswith(("plant.", "disturbance."))
+    ]
     names = tuple(number.name for number in numbers)
-    lines = [in_words_of(one, joints[one.joint], remedy_for(one, available, names)) for one in lacks.findings]
+    lines = [
+        in_words_of(one, joints[one.joint], remedy_for(one, available, names))
+        for one in lacks.findings
+    ]
     moved = [f"{x.name} by about {x.bias:+.2g} {x.unit}" for x in numbers if x.verdict == BIASED]
     if moved:
-        lines.append(f"These numbers make up for what was left out, and are biased: {', '.join(moved)}.")
+        lines.append(
+            f"These numbers make up for what was left out, and are biased: {', '.join(moved)}."
+        )
     return lines
 
 
@@ -464,18 +558,35 @@ def _number(
         return number(None, None, FREE)
     at_low, at_high = (abs(end.z[i] - side[i]) < AT_END * scale[i] for side in ends)
     if not np.isfinite(error):
-        pushed = (at_low and beyond < -AT_END * scale[i]) or (at_high and beyond > AT_END * scale[i])
+        pushed = (at_low and beyond < -AT_END * scale[i]) or (
+            at_high and beyond > AT_END * scale[i]
+        )
         return number(x, None, LIMITED) if pushed else number(None, None, UNTOLD)
     if bias and not (at_low or at_high):
         return number(x, error, BIASED)._replace(bias=bias)
     return number(x, error, LIMITED if at_low or at_high else TOLD)
 
 
-def _fits(start: Scenario, w: Windows, end: Refined, before: np.ndarray, white: list[Whiteness], guess: Start) -> tuple[Fit, ...]:
+def _fits(
+    start: Scenario,
+    w: Windows,
+    end: Refined,
+    before: np.ndarray,
+    white: list[Whiteness],
+    guess: Start,
+) -> tuple[Fit, ...]:
     def size(r, windows):
-        return np.sqrt(np.mean(r[windows] ** 2, axis=(0, 1))) if np.any(windows) else np.full(r.shape[-1], np.nan)
+        return (
+            np.sqrt(np.mean(r[windows] ** 2, axis=(0, 1)))
+            if np.any(windows)
+            else np.full(r.shape[-1], np.nan)
+        )
 
-    first, fitted, others = size(before, w.kept), size(end.told.residuals, w.kept), size(end.told.residuals, ~w.kept)
+    first, fitted, others = (
+        size(before, w.kept),
+        size(end.told.residuals, w.kept),
+        size(end.told.residuals, ~w.kept),
+    )
     return tuple(
         Fit(
             joint=name,
@@ -495,20 +606,33 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
     notes = []
     widest = float(np.max(found.widened))
     if not all(one.is_white for one in fit) and widest > CLEARLY:
-        notes.append(f"What is left is coloured: standard errors are up to {widest:.2g} times those of white noise.")
+        notes.append(
+            f"What is left is coloured: standard errors are up to {widest:.2g} times those of white"
+            " noise."
+        )
     worst = max(fit, key=lambda one: one.lacking)
     bound = any(number.verdict == LIMITED for number in numbers)
-    likely = f"{'what a limit excludes, ' if bound else ''}dry friction that is not looked for, play, a torque in between samples"
+    likely = (
+        f"{'what a limit excludes, ' if bound else ''}dry friction that is not looked for, play, a"
+        " torque in between samples"
+    )
     if worst.lacking > LACKS:
         notes.append(
-            f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its positions: the model lacks something "
-            f"({likely}), and all standard errors are that much larger for it"
-            + ("; a model that fits tells more." if any(number.value is None for number in numbers) else ".")
+            f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its"
+            f" positions: the model lacks something ({likely}), and all standard errors are that"
+            " much larger for it"
+            + (
+                "; a model that fits tells more."
+                if any(number.value is None for number in numbers)
+                else "."
+            )
         )
     return notes
 
 
-def _limited(c: Coordinates, numbers: tuple[Number, ...], beyond: np.ndarray, ends: tuple[np.ndarray, ...]) -> list[str]:
+def _limited(
+    c: Coordinates, numbers: tuple[Number, ...], beyond: np.ndarray, ends: tuple[np.ndarray, ...]
+) -> list[str]:
     """Which limits bind, and what the log asks for."""
     notes = []
     for place, path in zip(c.places, c.paths, strict=True):
@@ -517,8 +641,9 @@ def _limited(c: Coordinates, numbers: tuple[Number, ...], beyond: np.ndarray, en
             if x.verdict == LIMITED and x.value is not None:
                 side = "lower" if abs(x.value - ends[0][i]) < abs(x.value - ends[1][i]) else "upper"
                 notes.append(
-                    f"{x.name} is at its limit, {x.value:.4g} {x.unit}, and the log asks for about {x.value + beyond[i]:.4g}: its standard "
-                    f"error says nothing, and other numbers make up for it.  The {side} end of limits[{path!r}] moves it."
+                    f"{x.name} is at its limit, {x.value:.4g} {x.unit}, and the log asks for about"
+                    f" {x.value + beyond[i]:.4g}: its standard error says nothing, and other"
+                    f" numbers make up for it.  The {side} end of limits[{path!r}] moves it."
                 )
     return notes
 
@@ -528,22 +653,33 @@ def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
     share = end.free.share
     if not np.any(share):
         return []
-    names = [name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part]
+    names = [
+        name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part
+    ]
     whose = "all joints" if len(names) == start.n else ", ".join(names)
-    least, most = (f"{100 * part:.{0 if part > 0.1 else 1}f}" for part in (share[share > 0].min(), share.max()))
+    least, most = (
+        f"{100 * part:.{0 if part > 0.1 else 1}f}" for part in (share[share > 0].min(), share.max())
+    )
     parts = f"{least} %" if least == most else f"{least} to {most} %"
     return [
-        f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were free in place of the friction of "
-        f"{whose}: coulomb tanh(q' / width) leaves {worse:.2g} times as much.  The widths are the scenario's."
+        f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were"
+        f" free in place of the friction of {whose}: coulomb tanh(q' / width) leaves {worse:.2g}"
+        " times as much.  The widths are the scenario's."
     ]
 
 
-def _with_numbers(start: Scenario, c: Coordinates, x: np.ndarray, delay: float) -> tuple[Scenario, list[str]]:
+def _with_numbers(
+    start: Scenario, c: Coordinates, x: np.ndarray, delay: float
+) -> tuple[Scenario, list[str]]:
     """The scenario with the new numbers."""
     scenario, notes = start, []
     for path, place in zip(c.paths, c.places, strict=True):
         own = x[place.start : place.start + place.size].reshape(place.shape)
-        targets = ["plant" + path[5:], "model" + path[5:]] if path.startswith(("robot.", "plant.")) else [path]
+        targets = (
+            ["plant" + path[5:], "model" + path[5:]]
+            if path.startswith(("robot.", "plant."))
+            else [path]
+        )
         for target in targets:
             try:
                 scenario = with_parameters(scenario, {target: own})

@@ -1,6 +1,8 @@
-"""Position, velocity, acceleration and torque of a log at chosen times, by polynomials through the samples around them.
+"""Position, velocity, acceleration and torque of a log at chosen times, by polynomials through the
+samples around them.
 
-    q(t_c + s) ~ sum_i a_i s^i, i <= 3, least squares over |s| <= half, weight (1 - (s / half)^2)^2;    tau likewise, i <= 1
+    q(t_c + s) ~ sum_i a_i s^i, i <= 3, least squares over |s| <= half, weight (1 - (s / half)^2)^2;
+    tau likewise, i <= 1
 
 A torque that is held from t_k on stands for the middle of its step.  Times need not be regular.
 """
@@ -14,7 +16,8 @@ import numpy as np
 from iblf_jax.identification.log import Log
 
 HALF = 0.05
-"""[s]; at 500 Hz an acceleration is then known to 500 1/s^2 times the noise of a position, and a motion of 2 Hz to a hundredth."""
+"""[s]; at 500 Hz an acceleration is then known to 500 1/s^2 times the noise of a position, and a
+motion of 2 Hz to a hundredth."""
 LEAST = 7
 """Samples in a polynomial."""
 NODES = 1500
@@ -36,8 +39,12 @@ class Smoothed(NamedTuple):
     """q' as logged, (P, n); NaN where it was not."""
 
 
-def around(log: Log, stretch: slice, centre: float, held: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coefficients of the positions (4, n) and of the torques (2, n) at a time, and the residuals of the positions (m, n)."""
+def around(
+    log: Log, stretch: slice, centre: float, held: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coefficients of the positions (4, n) and of the torques (2, n) at a time, and the residuals
+    of the positions (m, n).
+    """
     t = log.t[stretch]
     half = max(HALF, 0.5 * LEAST * log.step)
     first, last = np.searchsorted(t, [centre - half, centre + half])

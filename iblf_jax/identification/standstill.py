@@ -1,12 +1,16 @@
 """Where nobody's law of friction need hold: about the standstill of a joint, where the log decides.
 
-    tau_j - coulomb_j sign(q_j')    while joint j moves,          tau_j + s_j u_a    about its standstill, on its piece a,    u_a ~ N(0, 1)
+    tau_j - coulomb_j sign(q_j')    while joint j moves,          tau_j + s_j u_a    about its
+    standstill, on its piece a,    u_a ~ N(0, 1)
 
-in place of tau_j - coulomb_j tanh(q_j' / width_j).  Dry friction is Coulomb's away from standstill alone: there a joint sticks, creeps,
-breaks away, or acts through a bristle.  So while a joint is slower than SLOW, and AROUND before and after, a torque that is constant over
-each PIECE is free in the place of its Coulomb friction, with s as large as the joint's torque; elsewhere the log says the direction of the
-friction.  The row of a joint that hardly moves then tells nothing, as its friction is not known; the rows of the other joints do.  And the
-replay has no jumps: it is found from any start.  The free torques are eliminated with the starts of the windows (`shooting`).
+in place of tau_j - coulomb_j tanh(q_j' / width_j).  Dry friction is Coulomb's away from standstill
+alone: there a joint sticks, creeps, breaks away, or acts through a bristle.  So while a joint is
+  slower than SLOW, and AROUND before and after, a torque that is constant over
+each PIECE is free in the place of its Coulomb friction, with s as large as the joint's torque;
+elsewhere the log says the direction of the friction.  The row of a joint that hardly moves then
+tells nothing, as its friction is not known; the rows of the other joints do.  And the replay has no
+jumps: it is found from any start.  The free torques are eliminated with the starts of the windows
+  (`shooting`).
 """
 
 from __future__ import annotations
@@ -26,9 +30,11 @@ SLOW, AROUND, PIECE = (0.05, 0.1, 0.2), 0.01, 0.01
 BETTER = 0.9
 """Part of what is left from which a larger SLOW is worth what it leaves open."""
 HALF = 0.02
-"""Half of the time over which a speed is looked at [s]: at 500 Hz it is then known to 20 1/s times the noise of a position."""
+"""Half of the time over which a speed is looked at [s]: at 500 Hz it is then known to 20 1/s times
+the noise of a position."""
 WORSE, HOPELESS = 1.02, 1.3
-"""Times what is left with free torques: the law of friction holds where it leaves no more than the first, and is given up at the second."""
+"""Times what is left with free torques: the law of friction holds where it leaves no more than the
+first, and is given up at the second."""
 NONE = 1e6
 """[rad/s]: Coulomb friction over this width is none."""
 
@@ -37,7 +43,8 @@ class Free(NamedTuple):
     """What takes the place of the law of friction in W windows of K steps."""
 
     by_x: np.ndarray
-    """Torque of each step and joint for one unit of each number, (W, K, n, p): the direction of the motion, for Coulomb friction."""
+    """Torque of each step and joint for one unit of each number, (W, K, n, p): the direction of the
+    motion, for Coulomb friction."""
     torque: np.ndarray
     """The same for each of the m free torques of a window, (W, K, n, m) [N m]."""
     pieces: np.ndarray
@@ -59,7 +66,9 @@ def by_the_law(shape: tuple[int, ...], p: int) -> Free:
     return Free(np.zeros((W, K, n, p)), np.zeros((W, K, n, 0)), np.zeros((W, n)), np.zeros(p, bool))
 
 
-def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list[Log], size: np.ndarray, slow: float) -> Free:
+def free_about_standstill(
+    scenario: Scenario, c: Coordinates, w: Any, logs: list[Log], size: np.ndarray, slow: float
+) -> Free:
     """What is free of the joints whose Coulomb friction and its width are looked for.
 
     Args:
@@ -78,7 +87,10 @@ def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list
         direction[own] = _direction(log, slow)[np.searchsorted(log.t, w.t[own][:, :-1])]
     length = max(2, round(PIECE / float(np.mean(np.diff(w.t)))))
     free = sorted({j for *_, j in joints})
-    parts = [[(j, part) for j in free for part in _parts(direction[i, :, j] == 0.0, length)] for i in range(W)]
+    parts = [
+        [(j, part) for j in free for part in _parts(direction[i, :, j] == 0.0, length)]
+        for i in range(W)
+    ]
     found = found._replace(torque=np.zeros((W, K, n, max(map(len, parts), default=0))), slow=slow)
     for i, own in enumerate(parts):
         for a, (j, part) in enumerate(own):
@@ -90,7 +102,9 @@ def free_about_standstill(scenario: Scenario, c: Coordinates, w: Any, logs: list
 
 
 def _joints(scenario: Scenario, c: Coordinates) -> Iterator[tuple[int, int, int]]:
-    """The numbers of Coulomb friction and of its width, and the joint, where both are looked for."""
+    """The numbers of Coulomb friction and of its width, and the joint, where both are looked
+    for.
+    """
     at = {}
     for place in c.places:
         for k, index in enumerate(np.ndindex(place.shape)):

@@ -1,22 +1,26 @@
-"""Whether what a fit leaves follows something that was left out of it: friction, gravity, inertia of a joint.
+"""Whether what a fit leaves follows something that was left out of it: friction, gravity, inertia
+of a joint.
 
 A term that was left out acts as a torque theta r(t) on one joint, r one of
 
     tanh(q_j' / w)   q_j'   q_j"   sin q_j   cos q_j   1
 
-It is looked for in the torques of the smoothed log (`regression`), at the numbers x that were found:
+It is looked for in the torques of the smoothed log (`regression`), at the numbers x that were
+found:
 
     tau - e(x; q, q', q") = de/dx dx + theta r + noise
 
-by least squares, each joint by what is left of it.  Candidates are added one by one, the one that takes away most first, while it takes
-away at least GAIN of what is left of its joint; then those are dropped that are not significant.  Residuals are far from white, so the
-standard error of theta takes blocks of the log as its observations (cluster-robust variance), which covers any correlation within a block;
-theta over its error follows Student's t with one degree of freedom less than there are blocks.  The level is divided by the number of
-candidates (Bonferroni).
+by least squares, each joint by what is left of it.  Candidates are added one by one, the one that
+takes away most first, while it takes away at least GAIN of what is left of its joint; then those
+are dropped that are not significant.  Residuals are far from white, so the standard error of theta
+takes blocks of the log as its observations (cluster-robust variance), which covers any correlation
+within a block; theta over its error follows Student's t with one degree of freedom less than there
+are blocks.  The level is divided by the number of candidates (Bonferroni).
 
 What the numbers lose when the terms are added is their bias:  x (without them) - x (with them).
 
-Source: H. White, Econometrica 50 (1982) 1-25, and K.-Y. Liang, S. L. Zeger, Biometrika 73 (1986) 13-22 (the variance).
+Source: H. White, Econometrica 50 (1982) 1-25, and K.-Y. Liang, S. L. Zeger, Biometrika 73 (1986)
+  13-22 (the variance).
 """
 
 from __future__ import annotations
@@ -38,9 +42,11 @@ OWN = 0.01
 GAIN = 0.1
 """Part of what is left of a joint that a term must take away."""
 LEAST = 3e-3
-"""Part of a joint's torque, root of the mean square, that a term must have: smoothing alone makes less."""
+"""Part of a joint's torque, root of the mean square, that a term must have: smoothing alone makes
+less."""
 SHARE = 0.2
-"""Part of what a joint's torque leaves, root of the mean square, that a term must have beside others."""
+"""Part of what a joint's torque leaves, root of the mean square, that a term must have beside
+others."""
 SLOW = 0.05
 """[rad/s]: w of the candidate for Coulomb friction."""
 BIASED_FROM = 0.05
@@ -63,8 +69,12 @@ KINDS = {
     "sign": Kind("the sign of its velocity", "Coulomb friction", "N m", ("coulomb", "friction")),
     "velocity": Kind("its velocity", "viscous friction", "N m s/rad", ("viscous", "damping")),
     "acceleration": Kind("its acceleration", "inertia", "kg m^2", ("armature", "inertia", "mass")),
-    "sine": Kind("the sine of its position", "a torque of gravity", "N m", ("mass", "centre", "payload")),
-    "cosine": Kind("the cosine of its position", "a torque of gravity", "N m", ("mass", "centre", "payload")),
+    "sine": Kind(
+        "the sine of its position", "a torque of gravity", "N m", ("mass", "centre", "payload")
+    ),
+    "cosine": Kind(
+        "the cosine of its position", "a torque of gravity", "N m", ("mass", "centre", "payload")
+    ),
     "constant": Kind("a constant", "a constant torque", "N m", ("offset",)),
 }
 
@@ -121,7 +131,9 @@ def candidates(seen: Smoothed) -> tuple[list[tuple[int, str]], np.ndarray]:
     return names, torque
 
 
-def left_out(seen: Smoothed, torque: np.ndarray, by_x: np.ndarray, delay: float, fitted: np.ndarray) -> LeftOut:
+def left_out(
+    seen: Smoothed, torque: np.ndarray, by_x: np.ndarray, delay: float, fitted: np.ndarray
+) -> LeftOut:
     """The terms that the fit lacks.
 
     Args:
@@ -129,7 +141,8 @@ def left_out(seen: Smoothed, torque: np.ndarray, by_x: np.ndarray, delay: float,
       torque: what the joints need with the numbers that were found, (P, n) [N m].
       by_x: its derivative by the numbers, (P, n, p).
       delay: of the logged torque [s].
-      fitted: which of the numbers, the delay last, were looked for and are at no limit, (p + 1,) bool.
+      fitted: which of the numbers, the delay last, were looked for and are at no limit, (p + 1,)
+        bool.
     """
     p = by_x.shape[-1]
     names, of_candidates = candidates(seen)
@@ -140,8 +153,14 @@ def left_out(seen: Smoothed, torque: np.ndarray, by_x: np.ndarray, delay: float,
     found = _significant(design, k, _added(design, k, names), len(names))
     thetas = _solved(design, [*range(k), *found])[k:]
     unit = _rms(of_candidates)
-    least = np.maximum(LEAST * _rms(seen.tau), SHARE * _rms(rest - numbers @ _solved(design, range(k))))
-    found = [i for i, theta in zip(found, thetas, strict=True) if _is_large(theta, unit, least, names, i - k)]
+    least = np.maximum(
+        LEAST * _rms(seen.tau), SHARE * _rms(rest - numbers @ _solved(design, range(k)))
+    )
+    found = [
+        i
+        for i, theta in zip(found, thetas, strict=True)
+        if _is_large(theta, unit, least, names, i - k)
+    ]
     bias = np.zeros(p)
     if not found:
         return LeftOut((), bias)
@@ -160,7 +179,9 @@ def _rms(x: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(x**2, axis=0))
 
 
-def _is_large(theta: float, unit: np.ndarray, least: np.ndarray, names: list[tuple[int, str]], c: int) -> bool:
+def _is_large(
+    theta: float, unit: np.ndarray, least: np.ndarray, names: list[tuple[int, str]], c: int
+) -> bool:
     """Whether a term is a torque that matters on its joint.
 
     Args:
@@ -174,7 +195,9 @@ def _is_large(theta: float, unit: np.ndarray, least: np.ndarray, names: list[tup
     return abs(theta) * unit[joint, c] > least[joint]
 
 
-def _weighted(seen: Smoothed, rest: np.ndarray, numbers: np.ndarray, of_candidates: np.ndarray) -> _Design:
+def _weighted(
+    seen: Smoothed, rest: np.ndarray, numbers: np.ndarray, of_candidates: np.ndarray
+) -> _Design:
     """The regression, joints weighed by what all candidates together leave of them."""
     P, n = rest.shape
     columns = np.concatenate([numbers, of_candidates], axis=-1)
@@ -190,14 +213,19 @@ def _weighted(seen: Smoothed, rest: np.ndarray, numbers: np.ndarray, of_candidat
             np.tile(np.arange(n), P),
         )
         everything = list(range(columns.shape[-1]))
-        sigma = np.maximum(np.sqrt(np.mean(_residual(design, everything).reshape(P, n) ** 2, axis=0)) * sigma, 1e-12)
+        sigma = np.maximum(
+            np.sqrt(np.mean(_residual(design, everything).reshape(P, n) ** 2, axis=0)) * sigma,
+            1e-12,
+        )
     return design
 
 
 def _inverse(A: np.ndarray) -> np.ndarray:
     """Of a symmetric matrix of any scales; combinations that nothing is known of are left out."""
     size = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    return np.linalg.pinv(A / size[:, None] / size, rcond=1e-10, hermitian=True) / size[:, None] / size
+    return (
+        np.linalg.pinv(A / size[:, None] / size, rcond=1e-10, hermitian=True) / size[:, None] / size
+    )
 
 
 def _solved(design: _Design, chosen: Any) -> np.ndarray:
@@ -218,7 +246,9 @@ def _errors(design: _Design, chosen: Any) -> np.ndarray:
     count = int(design.block[-1]) + 1
     scores = np.zeros((count, len(chosen)))
     np.add.at(scores, design.block, X * left[:, None])
-    return np.sqrt(np.maximum(np.diag(bread @ (scores.T @ scores) @ bread) * count / (count - 1), 0.0))
+    return np.sqrt(
+        np.maximum(np.diag(bread @ (scores.T @ scores) @ bread) * count / (count - 1), 0.0)
+    )
 
 
 def _gain(design: _Design, chosen: list[int], i: int, joint: int) -> float:
@@ -256,7 +286,9 @@ def _added(design: _Design, k: int, names: list[tuple[int, str]]) -> list[int]:
 
 
 def _significant(design: _Design, k: int, chosen: list[int], tests: int) -> list[int]:
-    """Those of the chosen columns that are significant, the least significant one dropped until all are."""
+    """Those of the chosen columns that are significant, the least significant one dropped until all
+    are.
+    """
     from scipy.stats import t
 
     count = int(design.block[-1]) + 1 if len(design.block) else 0
@@ -277,8 +309,9 @@ def _significant(design: _Design, k: int, chosen: list[int], tests: int) -> list
 def biased(found: LeftOut, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """What was left out adds to each number, (p,), where that matters; else 0.
 
-    It matters where it is more than the number's standard error, or than a part of the number: the standard errors have already been
-    multiplied by how much of the residuals the model does not explain.
+    It matters where it is more than the number's standard error, or than a part of the number: the
+    standard errors have already been multiplied by how much of the residuals the model does not
+    explain.
 
     Args:
       found: what was left out.
@@ -299,8 +332,9 @@ def in_words(finding: Finding, joint: str, remedy: str) -> str:
     kind = KINDS[finding.kind]
     more = "more" if finding.size > 0 else "less"
     return (
-        f"What is left of the torque of {joint} follows {kind.follows}: the robot has {abs(finding.size):.3g} +- {finding.error:.1g} "
-        f"{kind.unit} {more} of {kind.term} there than the model, which explains {finding.gain:.0%} of what is left. {remedy}"
+        f"What is left of the torque of {joint} follows {kind.follows}: the robot has"
+        f" {abs(finding.size):.3g} +- {finding.error:.1g} {kind.unit} {more} of {kind.term} there"
+        f" than the model, which explains {finding.gain:.0%} of what is left. {remedy}"
     )
 
 
@@ -321,12 +355,19 @@ def remedy_for(finding: Finding, available: Any, names: tuple[str, ...]) -> str:
     if same:
         return f"{same[0]} is looked for, so it is of another form than the model's."
     if finding.kind in ("sign", "velocity"):
-        return f"Give the scenario ij.disturbances.Friction(...) and add 'disturbance.{kind.leaves[0]}' to the paths."
+        return (
+            "Give the scenario ij.disturbances.Friction(...) and add"
+            f" 'disturbance.{kind.leaves[0]}' to the paths."
+        )
     return "The scenario has no leaf for it."
 
 
 def _is_in(path: str, joint: int, names: tuple[str, ...]) -> bool:
-    """Whether the number of a joint at a path was looked for, whichever way its owner was called."""
+    """Whether the number of a joint at a path was looked for, whichever way its owner was
+    called.
+    """
     owner, _, rest = path.partition(".")
     owners = ("plant", "robot", "model") if owner == "plant" else (owner,)
-    return any(name in (f"{one}.{rest}[{joint}]", f"{one}.{rest}") for one in owners for name in names)
+    return any(
+        name in (f"{one}.{rest}[{joint}]", f"{one}.{rest}") for one in owners for name in names
+    )

@@ -1,10 +1,12 @@
-"""C from a scalar program: one function for what only shared leaves decide, one for what time decides, one for a block of runs, and one for
-each function that the program calls (the closed loop of an arm).
+"""C from a scalar program: one function for what only shared leaves decide, one for what time
+decides, one for a block of runs, and one for each function that the program calls (the closed loop
+of an arm).
 
-The text is plain statements, one a node, and the same for every target; the headers around it say what it means.  On a CPU `c/vector.h`
-makes of a name a vector of runs, `c/mathlib.h` has the elementary functions and `c/driver.h` the loops and threads; on a GPU
-`c/scalar.h` makes of it the number of one thread's run, and `c/kernels.h` has the kernels.  Out of the package `c/plain.h` makes of it a
-number of C99, and `plain_function` gives the function alone.
+The text is plain statements, one a node, and the same for every target; the headers around it say
+what it means.  On a CPU `c/vector.h` makes of a name a vector of runs, `c/mathlib.h` has the
+elementary functions and `c/driver.h` the loops and threads; on a GPU `c/scalar.h` makes of it the
+number of one thread's run, and `c/kernels.h` has the kernels.  Out of the package `c/plain.h` makes
+of it a number of C99, and `plain_function` gives the function alone.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
 TURNS = frozenset({"sin", "cos"})
-"""Operations that `mathlib.h` has in two parts: a polynomial, and what takes its place where an angle is huge."""
+"""Operations that `mathlib.h` has in two parts: a polynomial, and what takes its place where an
+angle is huge."""
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
@@ -45,7 +48,14 @@ def _conversion(source: str, target: str, arg: str) -> str:
     return f"to_float({arg})" if target == "f" else f"to_int({arg})"
 
 
-SEEN_BY_FUNCTION = ("const word *constants", "const F *once", "const F *p", "const I *q", "F *RESTRICT r", "I *RESTRICT s")
+SEEN_BY_FUNCTION = (
+    "const word *constants",
+    "const F *once",
+    "const F *p",
+    "const I *q",
+    "F *RESTRICT r",
+    "I *RESTRICT s",
+)
 SEEN_BY_ADVANCE = (
     "const word *constants",
     "const F *leaves",
@@ -60,9 +70,11 @@ SEEN_BY_ADVANCE = (
 
 
 class _Emitter:
-    """Statements for nodes; `names` are the C expressions of nodes that were read or computed already.
+    """Statements for nodes; `names` are the C expressions of nodes that were read or computed
+    already.
 
-    `tables` says into which table each lookup looks, by the table's text; `calls` where the numbers of a call are.
+    `tables` says into which table each lookup looks, by the table's text; `calls` where the numbers
+    of a call are.
     """
 
     def __init__(self, program: Program, tables: dict[str, str], calls: Calls) -> None:
@@ -72,7 +84,9 @@ class _Emitter:
         self.classes = program.classes()
         self.lines: list[str] = []
         self.tables = {
-            i: tables.setdefault(self._numbers(node), f"table_{len(tables)}") for i, node in enumerate(program.nodes) if node.op == "lookup"
+            i: tables.setdefault(self._numbers(node), f"table_{len(tables)}")
+            for i, node in enumerate(program.nodes)
+            if node.op == "lookup"
         }
         self.calls = calls
         self.in_place: dict[int, int] = {}
@@ -81,7 +95,9 @@ class _Emitter:
         """What stands at the end of every function."""
 
     def _numbers(self, lookup: Node) -> str:
-        """The bits of its table, which are constants for every compiler; infinity is a function's result for some."""
+        """The bits of its table, which are constants for every compiler; infinity is a function's
+        result for some.
+        """
         bits = np.asarray(lookup.value, self.program.dtype).view(f"u{self.program.dtype.itemsize}")
         return ", ".join(f"(integer){x:#x}" for x in bits.tolist())
 
@@ -89,8 +105,15 @@ class _Emitter:
         """The nodes without a name that `wanted` needs, in order."""
         return needed(self.program.nodes, wanted, names)
 
-    def statements(self, names: dict[int, str], wanted: Iterable[int], stored: Mapping[int, str] = MappingProxyType({})) -> None:
-        """Adds statements for `wanted` and what it needs; `stored` has places in memory of some of them."""
+    def statements(
+        self,
+        names: dict[int, str],
+        wanted: Iterable[int],
+        stored: Mapping[int, str] = MappingProxyType({}),
+    ) -> None:
+        """Adds statements for `wanted` and what it needs; `stored` has places in memory of some of
+        them.
+        """
         nodes = self.program.nodes
         order = self.needed(names, wanted)
         turns = [i for i in order if nodes[i].op in self.turns]
@@ -98,7 +121,11 @@ class _Emitter:
             node = nodes[i]
             if i in names:
                 continue
-            together = [j for j in turns if j not in names and nodes[j].args[0] in names] if node.op in self.turns else []
+            together = (
+                [j for j in turns if j not in names and nodes[j].args[0] in names]
+                if node.op in self.turns
+                else []
+            )
             if len(together) > 1:
                 self._turned(together, names, stored)
                 continue
@@ -111,7 +138,9 @@ class _Emitter:
             args = [names[a] for a in node.args]
             if i in self.in_place:
                 condition, yes, no = args
-                old, new, unless = (no, yes, "") if node.args[2] == self.in_place[i] else (yes, no, "!")
+                old, new, unless = (
+                    (no, yes, "") if node.args[2] == self.in_place[i] else (yes, no, "!")
+                )
                 self.lines.append(f"  if ({unless}AT({condition}, 0)) {old} = {new};")
                 names[i] = old
                 continue
@@ -129,13 +158,21 @@ class _Emitter:
                 self.lines.append(f"  {stored[i]} = v{i};")
 
     def _turned(self, turns: list[int], names: dict[int, str], stored: Mapping[int, str]) -> None:
-        """Adds statements for sines and cosines: all whose angles are there, as one test sees whether any of these is huge."""
+        """Adds statements for sines and cosines: all whose angles are there, as one test sees
+        whether any of these is huge.
+        """
         nodes = self.program.nodes
         angles = {i: names[nodes[i].args[0]] for i in turns}
         names |= {i: f"v{i}" for i in turns}
         self.lines += [f"  F v{i} = near_{nodes[i].op}({angle});" for i, angle in angles.items()]
-        self.lines.append(f"  if (RARELY({' | '.join(f'is_far({angle})' for angle in dict.fromkeys(angles.values()))})) {{")
-        self.lines += [f"    v{i} = {nodes[i].op}_where(is_far({angle}), {angle}, v{i});" for i, angle in angles.items()]
+        self.lines.append(
+            "  if"
+            f" (RARELY({' | '.join(f'is_far({angle})' for angle in dict.fromkeys(angles.values()))})) {{"
+        )
+        self.lines += [
+            f"    v{i} = {nodes[i].op}_where(is_far({angle}), {angle}, v{i});"
+            for i, angle in angles.items()
+        ]
         self.lines.append("  }")
         self.lines += [f"  {stored[i]} = v{i};" for i in turns if i in stored]
 
@@ -152,15 +189,28 @@ def sizes(program: Program, shared_leaves: int, lane_leaves: int) -> str:
         "SHARED_LEAVES": shared_leaves, "LEAVES": lane_leaves, "FLOATS": floats, "INTS": ints, "CONSTANTS": constants,
         "COLUMNS": columns, "DOUBLE": int(program.dtype == np.float64),
     }  # fmt: skip
-    values["RECORDED"], values["RECORDED_SIZES"] = len(program.recorded), f"{{{', '.join(map(str, [*program.recorded, 0]))}}}"
+    values["RECORDED"], values["RECORDED_SIZES"] = (
+        len(program.recorded),
+        f"{{{', '.join(map(str, [*program.recorded, 0]))}}}",
+    )
     return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
 def source(
-    program: Program, shared_leaves: int, lane_leaves: int, target: tuple[tuple[str, ...], ...] = NATIVE, segment: int | None = None
+    program: Program,
+    shared_leaves: int,
+    lane_leaves: int,
+    target: tuple[tuple[str, ...], ...] = NATIVE,
+    segment: int | None = None,
 ) -> str:
-    """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of `segment` operations if given."""
-    if target is NATIVE and not segment:  # not the functions that it calls: they have work enough at any time, and no registers to spare
+    """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of
+    `segment` operations if given.
+    """
+    if (
+        target is NATIVE and not segment
+        # not the functions that it calls: they have work enough at any time, and no registers to
+        # spare
+    ):
         program = scheduled(program)
     layout, tables = Layout.of(program), dict[str, str]()
     calls = Calls(program, layout)
@@ -169,13 +219,22 @@ def source(
     before, after = target
     parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before)]
     parts += [f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()]
-    parts += [*functions, _constants(e, layout.constants), _signals(e, layout.constants, layout.columns)]
+    parts += [
+        *functions,
+        _constants(e, layout.constants),
+        _signals(e, layout.constants, layout.columns),
+    ]
     parts += [_advance_in_segments(e, segment, *layout) if segment else _advance(e, *layout)]
     return "\n".join([*parts, *map(header, after)])
 
 
 def plain_function(
-    program: Program, name: str, parameters: Sequence[str], inputs: Mapping[str, Sequence[str]], outputs: Sequence[str], segment: int
+    program: Program,
+    name: str,
+    parameters: Sequence[str],
+    inputs: Mapping[str, Sequence[str]],
+    outputs: Sequence[str],
+    segment: int,
 ) -> str:
     """One C99 function of one run, for the names of `c/plain.h`.
 
@@ -191,7 +250,9 @@ def plain_function(
     e = _Emitter(program, tables, Calls(program, Layout.of(program)))
     e.tables = {i: f"{name}_{table}" for i, table in e.tables.items()}
     e.turns = frozenset()  # each by itself
-    names = {i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs}
+    names = {
+        i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs
+    }
     wanted = [*(o for _, o in program.carry), *program.samples]
     seen = [p.split()[-1].lstrip("*") for p in parameters]
     parts = list[str]()
@@ -207,7 +268,9 @@ def plain_function(
         e.end = [f"  (void){x};" for x in seen]
     e.lines += [f"  {place} = {names[i]};" for place, i in zip(outputs, wanted, strict=True)]
     parts.append(e.function(f"static void {name}({', '.join([*parameters, 'F *RESTRICT r'])})"))
-    return "\n".join([*(f"TABLE {name}_{table}[] = {{{numbers}}};" for numbers, table in tables.items()), *parts])
+    return "\n".join(
+        [*(f"TABLE {name}_{table}[] = {{{numbers}}};" for numbers, table in tables.items()), *parts]
+    )
 
 
 def header(name: str) -> str:
@@ -220,8 +283,16 @@ def _functions(calls: Calls, tables: dict[str, str], segment: int | None) -> lis
     texts = []
     for k, (function, given) in enumerate(zip(calls.functions, calls.given, strict=True)):
         e = _Emitter(function, tables, calls)
-        names = {i: given[node.value] for i, node in enumerate(function.nodes) if node.op == "argument"}
-        results = list(zip(function.samples, places([function.nodes[i] for i in function.samples], "r", "s")[0], strict=True))
+        names = {
+            i: given[node.value] for i, node in enumerate(function.nodes) if node.op == "argument"
+        }
+        results = list(
+            zip(
+                function.samples,
+                places([function.nodes[i] for i in function.samples], "r", "s")[0],
+                strict=True,
+            )
+        )
         if segment:
             segments = _Segments(e, names, segment, f"part_{k}", SEEN_BY_FUNCTION)
             parts = segments.add(sorted(set(function.samples)), kept=False, own=dict(results))
@@ -238,7 +309,9 @@ def _constants(e: _Emitter, constants: list[int]) -> str:
     nodes = e.program.nodes
     names = {i: f"splat(shared[{n.value}])" for i, n in enumerate(nodes) if n.op == "shared"}
     e.statements(names, constants)
-    e.lines += [f"  out[{k}].{_part(nodes[i])} = AT({names[i]}, 0);" for k, i in enumerate(constants)]
+    e.lines += [
+        f"  out[{k}].{_part(nodes[i])} = AT({names[i]}, 0);" for k, i in enumerate(constants)
+    ]
     return e.function("FUNCTION void shared_constants(const real *shared, word *out)")
 
 
@@ -253,23 +326,32 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
     e.lines.append("  I index = from(first);")
     e.statements(names, columns)
     e.lines += [f"  write_column(table + {k}, COLUMNS, {names[i]});" for k, i in enumerate(columns)]
-    return e.function("FUNCTION void shared_signals(const word *constants, integer first, word *table)")
+    return e.function(
+        "FUNCTION void shared_signals(const word *constants, integer first, word *table)"
+    )
 
 
 HEAD_OF_ADVANCE = (
-    "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word *row, int count,\n"
-    "                    int64_t first, int64_t every, record_arrays records, int64_t runs, int64_t run)"
+    "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word"
+    " *row, int count,\n                    int64_t first, int64_t every, record_arrays records,"
+    " int64_t runs, int64_t run)"
 )
 
 
-def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
+def _advance(
+    e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]
+) -> str:
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
-    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
+    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
+        c: f"ints[{k}]" for k, c in enumerate(ints)
+    }
     for c in [*floats, *ints]:
         kind = program.kinds[c]
-        e.lines.append(f"  {'F' if kind == 'f' else 'I'} c{c} = {'-' if kind == 'b' else ''}{places[c]};")
+        e.lines.append(
+            f"  {'F' if kind == 'f' else 'I'} c{c} = {'-' if kind == 'b' else ''}{places[c]};"
+        )
         if program.carry[c][0] >= 0:
             names[program.carry[c][0]] = f"c{c}"
     e.in_place = _in_place(program)
@@ -280,37 +362,54 @@ def _advance(e: _Emitter, constants: list[int], columns: list[int], floats: list
     e.statements(names, [o for _, o in program.carry])
     if program.samples:
         _record(e, names)
-    moved = [(c, names[o]) for c, (a, o) in enumerate(program.carry) if a != o and names[o] != f"c{c}"]
+    moved = [
+        (c, names[o]) for c, (a, o) in enumerate(program.carry) if a != o and names[o] != f"c{c}"
+    ]
     e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
     e.lines += [f"  c{c} = n{c};" for c, _ in moved]
     e.lines.append("  }")
-    e.lines += [f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]]
+    e.lines += [
+        f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]
+    ]
     return e.function(HEAD_OF_ADVANCE)
 
 
 def _in_place(program: Program) -> dict[int, int]:
-    """Choices, the same for all runs, between a carried number and the next one, where nobody else needs the number before.
+    """Choices, the same for all runs, between a carried number and the next one, where nobody else
+    needs the number before.
 
     What a sampled law said is so written once a period, not copied in every step.
     """
     nodes, classes = program.nodes, program.classes()
-    uses = Counter(a for node in nodes for a in node.args) + Counter(program.samples) + Counter(o for _, o in program.carry)
+    uses = (
+        Counter(a for node in nodes for a in node.args)
+        + Counter(program.samples)
+        + Counter(o for _, o in program.carry)
+    )
     found = {}
     for a, o in program.carry:
         node = nodes[o]
         if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & LANE:
             (new,) = [x for x in node.args[1:] if x != a]
             # A call whose result is the new number has read the one before.
-            if uses[a] == 1 + (nodes[new].op == "result" and nodes[nodes[new].args[0]].args.count(a)):
+            if uses[a] == 1 + (
+                nodes[new].op == "result" and nodes[nodes[new].args[0]].args.count(a)
+            ):
                 found[o] = a
     return found
 
 
 class _Segments:
-    """The statements of a long step, cut into functions of `size` operations; a number that one hands to another has a place in memory."""
+    """The statements of a long step, cut into functions of `size` operations; a number that one
+    hands to another has a place in memory.
+    """
 
-    def __init__(self, e: _Emitter, names: dict[int, str], size: int, name: str, parameters: tuple[str, ...]):
-        """`name` begins those of the functions; `parameters` are what they see of the function that calls them."""
+    def __init__(
+        self, e: _Emitter, names: dict[int, str], size: int, name: str, parameters: tuple[str, ...]
+    ):
+        """`name` begins those of the functions; `parameters` are what they see of the function that
+        calls them.
+        """
         self.e, self.names, self.size, self.name = e, names, size, name
         places = ("F *RESTRICT x", "I *RESTRICT y")
         self.head = f"SEPARATE void {{}}({', '.join([*parameters, *places])})"
@@ -319,7 +418,9 @@ class _Segments:
         self.free: dict[str, list[str]] = {"x": [], "y": []}
         self.sizes = {"x": 0, "y": 0}
 
-    def add(self, wanted: list[int], kept: bool, own: Mapping[int, str] = MappingProxyType({})) -> list[str]:
+    def add(
+        self, wanted: list[int], kept: bool, own: Mapping[int, str] = MappingProxyType({})
+    ) -> list[str]:
         """Cuts `wanted` and what it needs; returns the calls.
 
         Args:
@@ -338,9 +439,17 @@ class _Segments:
         calls = []
         for k in range(0, len(computed), self.size):
             here = computed[k : k + self.size]
-            calls.append(self._one(here, [i for i in here if last[i] > part[i] and nodes[i].op != "call"], own))
+            calls.append(
+                self._one(
+                    here, [i for i in here if last[i] > part[i] and nodes[i].op != "call"], own
+                )
+            )
             if not kept:
-                for i in (i for i in computed if i in self.names and last[i] == k // self.size and nodes[i].op != "call"):
+                for i in (
+                    i
+                    for i in computed
+                    if i in self.names and last[i] == k // self.size and nodes[i].op != "call"
+                ):
                     self.free[self.names[i][0]].append(self.names[i])
         self.names |= {i: self.e.calls.results[i] for i in needed if nodes[i].op == "result"}
         return calls
@@ -369,11 +478,21 @@ def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> 
     """The nodes of a step that its samples read, directly or on the way."""
     computed = set(e.needed(names, outputs))
     alone = [i for i in e.needed(names, e.program.samples) if i not in computed]
-    return sorted(computed & {*e.program.samples, *(a for i in alone for a in e.program.nodes[i].args)})
+    return sorted(
+        computed & {*e.program.samples, *(a for i in alone for a in e.program.nodes[i].args)}
+    )
 
 
-def _advance_in_segments(e: _Emitter, segment: int, constants: list[int], columns: list[int], floats: list[int], ints: list[int]) -> str:
-    """`_advance` for long steps, over which a compiler would take minutes: its time grows with the square of a function's length.
+def _advance_in_segments(
+    e: _Emitter,
+    segment: int,
+    constants: list[int],
+    columns: list[int],
+    floats: list[int],
+    ints: list[int],
+) -> str:
+    """`_advance` for long steps, over which a compiler would take minutes: its time grows with the
+    square of a function's length.
 
     The functions that the step calls stay whole calls; each is itself cut (`_functions`).
     """
@@ -381,18 +500,29 @@ def _advance_in_segments(e: _Emitter, segment: int, constants: list[int], column
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
     names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
-    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {c: f"ints[{k}]" for k, c in enumerate(ints)}
+    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
+        c: f"ints[{k}]" for k, c in enumerate(ints)
+    }
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
     segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
     before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
     outputs = sorted({o for _, o in program.carry})
-    within = segments.add(sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False)
+    within = segments.add(
+        sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False
+    )
     signs = [f"  {places[c]} = -{places[c]};" for c in ints if program.kinds[c] == "b"]
-    constant = {o: literal(nodes[o], program.dtype) for _, o in program.carry if nodes[o].op == "const"}
-    moved = [(c, (segments.names | constant)[o]) for c, (a, o) in enumerate(program.carry) if a != o]
+    constant = {
+        o: literal(nodes[o], program.dtype) for _, o in program.carry if nodes[o].op == "const"
+    }
+    moved = [
+        (c, (segments.names | constant)[o]) for c, (a, o) in enumerate(program.carry) if a != o
+    ]
     e.lines += [segments.room, e.calls.room, *signs]
     e.lines += [*(f"  {call}" for call in before), *e.calls.filled(segments.names)]
-    e.lines += ["  for (int step = 0; step < count; step++, row += COLUMNS) {", *(f"  {call}" for call in within)]
+    e.lines += [
+        "  for (int step = 0; step < count; step++, row += COLUMNS) {",
+        *(f"  {call}" for call in within),
+    ]
     if program.samples:
         _record(e, segments.names)
     e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]

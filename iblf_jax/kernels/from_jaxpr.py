@@ -1,7 +1,8 @@
 """A jaxpr taken apart into scalars: every array becomes a NumPy array of node numbers.
 
-So what only moves numbers about (reshape, slice, gather) is done here and now on the node numbers, and what computes becomes one
-node a number.  Nested functions are inlined, short scans unrolled; a primitive that has no rule raises `UnsupportedError`.
+So what only moves numbers about (reshape, slice, gather) is done here and now on the node numbers,
+and what computes becomes one node a number.  Nested functions are inlined, short scans unrolled; a
+primitive that has no rule raises `UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ INLINED = {
 }  # fmt: skip
 
 READ_AGAIN = 50
-"""Equations up to which an inner function is read again at each call: that is as quick as to remember it."""
+"""Equations up to which an inner function is read again at each call: that is as quick as to
+remember it."""
 
 
 def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Ids]) -> list[Ids]:
     """The outputs of a jaxpr, given its constants and inputs as node numbers."""
-    known: dict[Any, Ids] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
+    known: dict[Any, Ids] = dict(
+        zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True)
+    )
 
     def read(atom):
         return constants(b, atom.val) if isinstance(atom, core.Literal) else known[atom]
@@ -46,7 +50,14 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         operands = [read(v) for v in eqn.invars]
         results: Sequence[Ids | None]
         if name == "jit" and len(eqn.params["jaxpr"].eqns) > READ_AGAIN:
-            results = apply(b, eqn.params["jaxpr"], operands, uses[id(eqn)], calls[id(eqn.params["jaxpr"])], closed)
+            results = apply(
+                b,
+                eqn.params["jaxpr"],
+                operands,
+                uses[id(eqn)],
+                calls[id(eqn.params["jaxpr"])],
+                closed,
+            )
         elif name in INLINED:
             results = closed(b, eqn.params[INLINED[name]], operands)
         elif name in CONTROL:
@@ -62,7 +73,9 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
             if ids is None:
                 continue
             if ids.shape != v.aval.shape:
-                raise UnsupportedError(f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}")
+                raise UnsupportedError(
+                    f"the rule for {name!r} gave shape {ids.shape}, not {v.aval.shape}"
+                )
             known[v] = ids
     return [read(v) for v in jaxpr.outvars]
 
@@ -77,7 +90,9 @@ def _live(jaxpr: Any) -> set:
 
 
 def _check_float(b: Builder, dtype, eqn) -> None:
-    """Refuses floats of another type than the program's (constants, which are rounded once, aside)."""
+    """Refuses floats of another type than the program's (constants, which are rounded once,
+    aside).
+    """
     if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
         raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
 
@@ -101,8 +116,14 @@ def _scan(b: Builder, eqn, operands, used):
     params = eqn.params
     length, (n_const, n_carry) = params["length"], _parts(params)
     if length > b.limits.scan:
-        raise UnsupportedError(f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})")
-    const, carry, xs = operands[:n_const], operands[n_const : n_const + n_carry], operands[n_const + n_carry :]
+        raise UnsupportedError(
+            f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})"
+        )
+    const, carry, xs = (
+        operands[:n_const],
+        operands[n_const : n_const + n_carry],
+        operands[n_const + n_carry :],
+    )
     stacked: list[list[Ids]] = []
     for i in reversed(range(length)) if params["reverse"] else range(length):
         out = closed(b, params["jaxpr"], [*const, *carry, *(x[i] for x in xs)])
@@ -126,17 +147,32 @@ def _cond(b: Builder, eqn, operands, used):
     results = _last(b, branches, which, rest, used)
     for i in reversed(range(len(branches) - 1)):
         is_flag = b.nodes[which].kind == "b"
-        condition = b.emit("not", which, kind="b") if is_flag else b.emit("le", which, b.constant(i, "i"), kind="b")
+        condition = (
+            b.emit("not", which, kind="b")
+            if is_flag
+            else b.emit("le", which, b.constant(i, "i"), kind="b")
+        )
         others = closed(b, branches[i], rest)
-        results = [None if no is None else choose(b, condition, yes, no) for yes, no in zip(others, results, strict=True)]
+        results = [
+            None if no is None else choose(b, condition, yes, no)
+            for yes, no in zip(others, results, strict=True)
+        ]
     return results
 
 
-def _last(b: Builder, branches: Sequence[Any], which: int, operands: Sequence[Ids], used: tuple[bool, ...]) -> list[Ids | None]:
-    """The used results of the last branch, which may be computed where it is taken alone if all runs take it together."""
+def _last(
+    b: Builder, branches: Sequence[Any], which: int, operands: Sequence[Ids], used: tuple[bool, ...]
+) -> list[Ids | None]:
+    """The used results of the last branch, which may be computed where it is taken alone if all
+    runs take it together.
+    """
     if not b.is_shared(which):
         return list(closed(b, branches[-1], operands))
-    taken = which if b.nodes[which].kind == "b" else b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
+    taken = (
+        which
+        if b.nodes[which].kind == "b"
+        else b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
+    )
     return apply(b, branches[-1], operands, used, [used], closed, taken)
 
 
@@ -146,7 +182,10 @@ def _while(b: Builder, eqn, operands, used):
 
 def choose(b: Builder, condition: int, yes: Ids, no: Ids) -> Ids:
     """`yes` where one scalar condition holds, else `no`, entry by entry."""
-    flat = [b.emit("select", condition, int(x), int(y), kind=b.nodes[int(x)].kind) for x, y in zip(yes.ravel(), no.ravel(), strict=True)]
+    flat = [
+        b.emit("select", condition, int(x), int(y), kind=b.nodes[int(x)].kind)
+        for x, y in zip(yes.ravel(), no.ravel(), strict=True)
+    ]
     return np.asarray(flat, np.int64).reshape(yes.shape)
 
 

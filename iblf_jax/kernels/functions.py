@@ -1,14 +1,16 @@
-"""Inner functions of a jaxpr: each is read once, and written out wherever it is called or, if it is long, called there.
+"""Inner functions of a jaxpr: each is read once, and written out wherever it is called or, if it is
+long, called there.
 
-The closed loop is such a function: a step evaluates it once a stage of the integrator.  A compiler that sees it once has a quarter of the
+The closed loop is such a function: a step evaluates it once a stage of the integrator.  A compiler
+  that sees it once has a quarter of the
 text to read, and its time grows faster than that.
 
-A branch that all runs take or leave together, as only time decides (the law of a sampled loop), is such a function too, and called where it
-is taken; what its other side gives is chosen afterwards.
+A branch that all runs take or leave together, as only time decides (the law of a sampled loop), is
+such a function too, and called where it is taken; what its other side gives is chosen afterwards.
 
-A call computes what moves with the state.  What leaves and time alone decide stays with the caller, which computes it as seldom as its
-class allows; so does what not every caller asks for (the sample, which the first stage alone gives): it is written out there, on numbers
-that the call hands over.
+A call computes what moves with the state.  What leaves and time alone decide stays with the caller,
+which computes it as seldom as its class allows; so does what not every caller asks for (the sample,
+which the first stage alone gives): it is written out there, on numbers that the call hands over.
 """
 
 from __future__ import annotations
@@ -55,7 +57,8 @@ class Template(NamedTuple):
     """A function, read once for operands of one pattern."""
 
     program: Program
-    """Its samples are the results; operands are "argument" where they move with the state, else "shared"."""
+    """Its samples are the results; operands are "argument" where they move with the state, else
+    "shared"."""
     results: list[Ids]
     """Places among the samples, in the shape of each result."""
 
@@ -73,7 +76,13 @@ class Split(NamedTuple):
 
 
 def apply(
-    b: Builder, jaxpr: Any, operands: Sequence[Ids], used: Uses, all_uses: Sequence[Uses], read: Callable, condition: int | None = None
+    b: Builder,
+    jaxpr: Any,
+    operands: Sequence[Ids],
+    used: Uses,
+    all_uses: Sequence[Uses],
+    read: Callable,
+    condition: int | None = None,
 ) -> list[Ids | None]:
     """The results of an inner function that are used.
 
@@ -84,13 +93,26 @@ def apply(
       used: which results this call's are used.
       all_uses: `used` of every call that the caller makes.
       read: function (builder, jaxpr, operands) -> results.
-      condition: where it holds, the same for all runs, the results are wanted; everywhere if not given.
+      condition: where it holds, the same for all runs, the results are wanted; everywhere if not
+        given.
     """
     flat = [int(i) for x in operands for i in x.ravel()]
-    called = Called(jaxpr, _pattern(b, flat), tuple(x.shape for x in operands), b.dtype, b.sparse, b.limits, read)
+    called = Called(
+        jaxpr,
+        _pattern(b, flat),
+        tuple(x.shape for x in operands),
+        b.dtype,
+        b.sparse,
+        b.limits,
+        read,
+    )
     template, split = _template(called), None
-    if _moving(template.program) > (b.limits.written_out if condition is None else b.limits.under_condition):
-        split = _split(called, *(tuple(map(which, zip(*all_uses, strict=True))) for which in (all, any)))
+    if _moving(template.program) > (
+        b.limits.written_out if condition is None else b.limits.under_condition
+    ):
+        split = _split(
+            called, *(tuple(map(which, zip(*all_uses, strict=True))) for which in (all, any))
+        )
 
     program = split.program if split else template.program
     known = {i: flat[node.value] for i, node in enumerate(program.nodes) if node.op in INPUTS}
@@ -99,11 +121,16 @@ def apply(
         call = b.call(split.function, [known[i] for i in split.given], condition)
         known |= {i: b.result(call, k) for k, i in enumerate(split.handed)}
     _write(b, program, known, _samples(program, template.results, used))
-    return [_new(known, program, places) if yes else None for places, yes in zip(template.results, used, strict=True)]
+    return [
+        _new(known, program, places) if yes else None
+        for places, yes in zip(template.results, used, strict=True)
+    ]
 
 
 def _pattern(b: Builder, operands: list[int]) -> tuple:
-    """What of the operands decides how a function is read: constants, equal ones, and what moves with the state."""
+    """What of the operands decides how a function is read: constants, equal ones, and what moves
+    with the state.
+    """
     first: dict[int, int] = {}
     pattern: list[tuple] = []
     for place, i in enumerate(operands):
@@ -119,7 +146,11 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
 
 @lru_cache(maxsize=16)
 def _template(called: Called) -> Template:
-    b = Builder(called.dtype, sparse=called.sparse, limits=called.limits._replace(written_out=math.inf, under_condition=math.inf))
+    b = Builder(
+        called.dtype,
+        sparse=called.sparse,
+        limits=called.limits._replace(written_out=math.inf, under_condition=math.inf),
+    )
 
     def node_of(kind, value, *known):
         if value is None:
@@ -132,11 +163,20 @@ def _template(called: Called) -> Template:
         return node
 
     numbers = iter([node_of(*entry) for entry in called.pattern])
-    operands = [np.asarray([next(numbers) for _ in range(math.prod(shape))], np.int64).reshape(shape) for shape in called.shapes]
+    operands = [
+        np.asarray([next(numbers) for _ in range(math.prod(shape))], np.int64).reshape(shape)
+        for shape in called.shapes
+    ]
     results = called.read(b, called.jaxpr, operands)
     program = finished(b, [], [], [int(i) for ids in results for i in ids.ravel()])
     starts = np.cumsum([0, *(ids.size for ids in results)])
-    return Template(program, [start + np.arange(ids.size).reshape(ids.shape) for start, ids in zip(starts, results, strict=False)])
+    return Template(
+        program,
+        [
+            start + np.arange(ids.size).reshape(ids.shape)
+            for start, ids in zip(starts, results, strict=False)
+        ],
+    )
 
 
 @lru_cache(maxsize=16)
@@ -146,11 +186,19 @@ def _with_reciprocals(called: Called) -> Program:
 
 def _moving(program: Program) -> int:
     """How many operations move with the state."""
-    return sum(bool(c & LANE) and node.op not in INPUTS for c, node in zip(program.classes(), program.nodes, strict=True))
+    return sum(
+        bool(c & LANE) and node.op not in INPUTS
+        for c, node in zip(program.classes(), program.nodes, strict=True)
+    )
 
 
 def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:
-    return [program.samples[place] for places, yes in zip(results, used, strict=True) if yes for place in places.ravel()]
+    return [
+        program.samples[place]
+        for places, yes in zip(results, used, strict=True)
+        if yes
+        for place in places.ravel()
+    ]
 
 
 @lru_cache(maxsize=16)
@@ -176,10 +224,14 @@ def _split(called: Called, everywhere: Uses, anywhere: Uses) -> Split:
 
 
 def _write(b: Builder, program: Program, known: dict[int, int], wanted: Iterable[int]) -> None:
-    """Adds the nodes of a program that `wanted` needs to another builder; `known` says which of its nodes they are."""
+    """Adds the nodes of a program that `wanted` needs to another builder; `known` says which of its
+    nodes they are.
+    """
     for i in needed(program.nodes, wanted, known):
         known[i] = b.again(program.nodes[i], [known[a] for a in program.nodes[i].args])
 
 
 def _new(known: dict[int, int], program: Program, places: Ids) -> Ids:
-    return np.asarray([known[program.samples[place]] for place in places.ravel()], np.int64).reshape(places.shape)
+    return np.asarray(
+        [known[program.samples[place]] for place in places.ravel()], np.int64
+    ).reshape(places.shape)

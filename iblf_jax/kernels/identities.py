@@ -1,9 +1,11 @@
-"""Constant folding, and identities that hold for every floating-point number, NaN and infinities included.
+"""Constant folding, and identities that hold for every floating-point number, NaN and infinities
+included.
 
-x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN, and a run that is not finite must
-be seen to be so.  There are three exceptions: programs of derivatives (`Builder.sparse`), whose values are those of a program without
-derivatives; zeros of a mechanism (`Builder.absent`): what has no lever moves nothing; and whether a sum with logarithms is finite, where
-it is so large that it overflows (`_is_finite`).
+x + 0 and x * 1 are x (the sign of a zero aside); x * 0 is not 0, because infinity times 0 is NaN,
+and a run that is not finite must be seen to be so.  There are three exceptions: programs of
+derivatives (`Builder.sparse`), whose values are those of a program without derivatives; zeros of a
+mechanism (`Builder.absent`): what has no lever moves nothing; and whether a sum with logarithms is
+  finite, where it is so large that it overflows (`_is_finite`).
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ def simplify(b: Builder, op: str, args: tuple[int, ...], kind: str) -> int | Non
 
 
 def without_absent(b: Builder, op: str, args: tuple[int, ...]) -> int | None:
-    """op(*args), of which one is not there (`Builder.absent`); None for an operation to which it is a zero as any other."""
+    """op(*args), of which one is not there (`Builder.absent`); None for an operation to which it is
+    a zero as any other.
+    """
     x, y = args[0], args[-1]
     if op in ("mul", "neg") or (op == "div" and y != b.absent):
         return b.absent
@@ -95,7 +99,13 @@ def _div(b: Builder, args, kind):
     value = b.value(y)
     if value == 1 or (b.sparse and b.value(x) == 0):
         return x
-    if kind == "f" and value and math.isfinite(value) and abs(math.frexp(value)[0]) == 0.5 and abs(math.frexp(value)[1]) < 100:
+    if (
+        kind == "f"
+        and value
+        and math.isfinite(value)
+        and abs(math.frexp(value)[0]) == 0.5
+        and abs(math.frexp(value)[1]) < 100
+    ):
         return b.emit("mul", x, b.constant(1 / value, "f"), kind=kind)
     if kind == "f" and b.nodes[x].op == "neg":
         return b.emit("neg", b.emit("div", b.nodes[x].args[0], y))
@@ -113,7 +123,13 @@ def _neg(b: Builder, args, kind):
 
 def _abs(b: Builder, args, kind):
     node = b.nodes[args[0]]
-    return b.emit("abs", node.args[0], kind=kind) if node.op == "neg" else args[0] if node.op == "abs" else None
+    return (
+        b.emit("abs", node.args[0], kind=kind)
+        if node.op == "neg"
+        else args[0]
+        if node.op == "abs"
+        else None
+    )
 
 
 def _select(b: Builder, args, kind):
@@ -149,14 +165,15 @@ def _not(b: Builder, args, kind):
 
 
 LONGEST_SUM = 64
-"""Operations of a sum in which logarithms are looked for: V has 17 with two joints, 57 with seven."""
+"""Operations of a sum in which logarithms are looked for: V has 17 with two joints, 57 with
+seven."""
 
 
 def _is_finite(b: Builder, args, kind):
     """Whether a sum is finite: its logarithms have a value, and the rest is.
 
-    No logarithm is above 1e3, and where a sum may overflow its numbers have no digits there.  A status asks so of V, which a run that is
-    not recorded needs for nothing else.
+    No logarithm is above 1e3, and where a sum may overflow its numbers have no digits there.  A
+    status asks so of V, which a run that is not recorded needs for nothing else.
     """
     parts = _of_sum(b, args[0])
     if not any(b.nodes[i].op == "log1p" for i in parts):
@@ -164,7 +181,10 @@ def _is_finite(b: Builder, args, kind):
     rest, logarithms = _without_logarithms(b, parts)
     found = [b.emit("is_finite", rest, kind="b")] if rest is not None else []
     for x in logarithms:
-        found += [b.emit("gt", x, b.constant(-1, "f"), kind="b"), b.emit("lt", x, b.constant(math.inf, "f"), kind="b")]
+        found += [
+            b.emit("gt", x, b.constant(-1, "f"), kind="b"),
+            b.emit("lt", x, b.constant(math.inf, "f"), kind="b"),
+        ]
     return reduce(lambda one, other: b.emit("and", one, other, kind="b"), found)
 
 
@@ -188,12 +208,17 @@ def _of_sum(b: Builder, total: int) -> list[int]:
 
 
 def _without_logarithms(b: Builder, parts: list[int]) -> tuple[int | None, list[int]]:
-    """The last of `parts` (`_of_sum`) without its terms log1p(x), None if it has no others, and these x."""
+    """The last of `parts` (`_of_sum`) without its terms log1p(x), None if it has no others, and
+    these x.
+    """
     known: dict[int, tuple[int | None, list[int]]] = {}
     for i in parts:
         node = b.nodes[i]
         terms = [known[a] for a in node.args] if _adds(b, node) else []
-        logarithms, rests = list(dict.fromkeys(x for _, found in terms for x in found)), [rest for rest, _ in terms if rest is not None]
+        logarithms, rests = (
+            list(dict.fromkeys(x for _, found in terms for x in found)),
+            [rest for rest, _ in terms if rest is not None],
+        )
         if node.op == "log1p":
             known[i] = None, [node.args[0]]
         elif not logarithms:
@@ -203,7 +228,10 @@ def _without_logarithms(b: Builder, parts: list[int]) -> tuple[int | None, list[
         elif _halves(b, node) or not rests:
             known[i] = None, logarithms
         else:
-            known[i] = b.emit("neg", rests[0]) if node.op == "sub" and terms[0][0] is None else rests[0], logarithms
+            known[i] = (
+                (b.emit("neg", rests[0]) if node.op == "sub" and terms[0][0] is None else rests[0]),
+                logarithms,
+            )
     return known[parts[-1]]
 
 

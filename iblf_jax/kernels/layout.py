@@ -1,4 +1,6 @@
-"""Where the numbers of a program stand in the generated C: constants, columns of time, and what goes in and out of functions."""
+"""Where the numbers of a program stand in the generated C: constants, columns of time, and what
+goes in and out of functions.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +59,12 @@ class Layout(NamedTuple):
         )
 
 
-def places(nodes: Iterable[Node], floats: str, others: str, begin: tuple[int, int] = (0, 0)) -> tuple[list[str], tuple[int, int]]:
-    """A place for each node, in two arrays that are filled from `begin` on, and how far they are filled then."""
+def places(
+    nodes: Iterable[Node], floats: str, others: str, begin: tuple[int, int] = (0, 0)
+) -> tuple[list[str], tuple[int, int]]:
+    """A place for each node, in two arrays that are filled from `begin` on, and how far they are
+    filled then.
+    """
     used, found = dict(zip((floats, others), begin, strict=True)), list[str]()
     for node in nodes:
         array = floats if c_type(node) == "F" else others
@@ -75,14 +81,18 @@ def given_to(call: Node) -> tuple[int, ...]:
 class Calls:
     """The functions that a program calls, and where the numbers are that go in and out.
 
-    What is the same in every call is read where it is: shared constants, and what is computed once a run (`once`).  The rest is put into
-    arrays for each call, `p` of floats and `q` of others; the results of each call have places of their own, in `r` and `s`.
+    What is the same in every call is read where it is: shared constants, and what is computed once
+      a run (`once`).  The rest is put into
+    arrays for each call, `p` of floats and `q` of others; the results of each call have places of
+    their own, in `r` and `s`.
     """
 
     def __init__(self, program: Program, layout: Layout) -> None:
         nodes = self.nodes = program.nodes
         calls = [i for i, node in enumerate(nodes) if node.op == "call"]
-        self.functions: list[Program] = list({id(nodes[i].value): nodes[i].value for i in calls}.values())
+        self.functions: list[Program] = list(
+            {id(nodes[i].value): nodes[i].value for i in calls}.values()
+        )
         self.once: list[int] = []
         """Nodes that are computed once a run."""
         self.given: list[list[str]] = []
@@ -94,7 +104,10 @@ class Calls:
         self.begins: dict[int, tuple[int, int]] = {}
         """Where the results of a call begin."""
         self.used = (0, 0)
-        constants, classes = {i: f"constants[{k}]" for k, i in enumerate(layout.constants)}, program.classes()
+        constants, classes = (
+            {i: f"constants[{k}]" for k, i in enumerate(layout.constants)},
+            program.classes(),
+        )
 
         def where_it_is(same: set[int]) -> str | None:
             a = next(iter(same))
@@ -108,7 +121,9 @@ class Calls:
             return None
 
         for function in self.functions:
-            arguments = list(zip(*(given_to(nodes[i]) for i in calls if nodes[i].value is function), strict=True))
+            arguments = list(
+                zip(*(given_to(nodes[i]) for i in calls if nodes[i].value is function), strict=True)
+            )
             known = [where_it_is(set(each)) for each in arguments]
             self.put.append([k for k, name in enumerate(known) if name is None])
             own = iter(places([nodes[arguments[k][0]] for k in self.put[-1]], "p", "q")[0])
@@ -116,13 +131,20 @@ class Calls:
         found, begin = {}, (0, 0)
         for i in calls:
             made = [nodes[i].value.nodes[s] for s in nodes[i].value.samples]
-            read = max((node.value for node in nodes if node.op == "result" and node.args[0] == i), default=-1)
+            read = max(
+                (node.value for node in nodes if node.op == "result" and node.args[0] == i),
+                default=-1,
+            )
             self.begins[i] = begin
             found[i], end = places(made, "r", "s", begin)
             self.used = (max(self.used[0], end[0]), max(self.used[1], end[1]))
             # What nobody reads of a call may be written over by the next one.
             begin = places(made[: read + 1], "r", "s", begin)[1]
-        self.results = {i: found[node.args[0]][node.value] for i, node in enumerate(nodes) if node.op == "result"}
+        self.results = {
+            i: found[node.args[0]][node.value]
+            for i, node in enumerate(nodes)
+            if node.op == "result"
+        }
 
     @property
     def room(self) -> str:
@@ -142,8 +164,17 @@ class Calls:
         for place in self.put[k]:
             given[c_type(self.nodes[given_to(node)[place]])].append(args[place])
         # Element by element: a list of all makes GCC clear the array before.
-        arrays = [f"  {t} {name}{call}[{len(given[t]) + 1}];" for t, name in (("F", "p"), ("I", "q"))]
-        arrays += [f"  {name}{call}[{k}] = {x};" for t, name in (("F", "p"), ("I", "q")) for k, x in enumerate(given[t])]
+        arrays = [
+            f"  {t} {name}{call}[{len(given[t]) + 1}];" for t, name in (("F", "p"), ("I", "q"))
+        ]
+        arrays += [
+            f"  {name}{call}[{k}] = {x};"
+            for t, name in (("F", "p"), ("I", "q"))
+            for k, x in enumerate(given[t])
+        ]
         floats, others = self.begins[call]
-        made = [*arrays, f"  function_{k}(constants, once, p{call}, q{call}, r + {floats}, s + {others});"]
+        made = [
+            *arrays,
+            f"  function_{k}(constants, once, p{call}, q{call}, r + {floats}, s + {others});",
+        ]
         return made if condition is None else [f"  if (AT({condition}, 0)) {{", *made, "  }"]

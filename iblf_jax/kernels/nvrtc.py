@@ -1,8 +1,10 @@
-"""NVIDIA's run-time compiler, NVRTC, which jax brings along with its CUDA plugin: CUDA C++ in, machine code of one kind of GPU out.
+"""NVIDIA's run-time compiler, NVRTC, which jax brings along with its CUDA plugin: CUDA C++ in,
+machine code of one kind of GPU out.
 
-It is a library of this process: no nvcc, no CUDA installation and no shell are needed, and no GPU either, so that a kernel can be
-compiled, though not run, anywhere.  What comes out is machine code and not PTX: a driver accepts the machine code of a newer compiler
-of its generation, but the PTX of its own only.
+It is a library of this process: no nvcc, no CUDA installation and no shell are needed, and no GPU
+  either, so that a kernel can be
+compiled, though not run, anywhere.  What comes out is machine code and not PTX: a driver accepts
+the machine code of a newer compiler of its generation, but the PTX of its own only.
 """
 
 from __future__ import annotations
@@ -18,13 +20,21 @@ from pathlib import Path
 
 from iblf_jax.kernels.toolchain import ToolchainError, content_of, kept
 
-NVRTC_FLAGS = ("--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true", "-w")
-"""Products go into sums unrounded, as on `native`; otherwise every operation is rounded as IEEE 754 wants it."""
+NVRTC_FLAGS = (
+    "--std=c++17",
+    "--fmad=true",
+    "--ftz=false",
+    "--prec-div=true",
+    "--prec-sqrt=true",
+    "-w",
+)
+"""Products go into sums unrounded, as on `native`; otherwise every operation is rounded as IEEE 754
+wants it."""
 
 
 def _candidates() -> Iterator[Path | str]:
-    """Where the library may be: the wheels that jax's CUDA plugin needs (those of CUDA 12 first, any driver takes their code), the system's
-    path, $CUDA_HOME.
+    """Where the library may be: the wheels that jax's CUDA plugin needs (those of CUDA 12 first,
+    any driver takes their code), the system's path, $CUDA_HOME.
     """
     spec = importlib.util.find_spec("nvidia")
     for folder in (spec.submodule_search_locations or ()) if spec else ():
@@ -45,7 +55,10 @@ def library() -> ctypes.CDLL:
             return ctypes.CDLL(str(path))
         except OSError:
             continue
-    raise ToolchainError('there is no NVRTC, which comes with jax[cuda12] and jax[cuda13] (package "nvidia-cuda-nvrtc")')
+    raise ToolchainError(
+        "there is no NVRTC, which comes with jax[cuda12] and jax[cuda13] (package"
+        ' "nvidia-cuda-nvrtc")'
+    )
 
 
 def _check(code: int, what: str) -> None:
@@ -72,11 +85,18 @@ def _log(program: c_void_p) -> str:
 
 def _compile(source: str, flags: tuple[str, ...]) -> bytes:
     program, size = c_void_p(), c_size_t()
-    _check(library().nvrtcCreateProgram(byref(program), source.encode(), b"kernel.cu", c_int(0), None, None), "start")
+    _check(
+        library().nvrtcCreateProgram(
+            byref(program), source.encode(), b"kernel.cu", c_int(0), None, None
+        ),
+        "start",
+    )
     try:
         options = (c_char_p * len(flags))(*(flag.encode() for flag in flags))
         if library().nvrtcCompileProgram(program, c_int(len(flags)), options):
-            lines = [line for line in _log(program).splitlines() if "error" in line] or ["no message"]
+            lines = [line for line in _log(program).splitlines() if "error" in line] or [
+                "no message"
+            ]
             raise ToolchainError(f"NVRTC {version()} failed: {lines[0][:200]}")
         _check(library().nvrtcGetCUBINSize(program, byref(size)), "output")
         image = ctypes.create_string_buffer(size.value)
@@ -97,5 +117,9 @@ def compiled(source: str, architecture: str) -> bytes:
       ToolchainError: no NVRTC, an error from it, or an architecture that it does not know.
     """
     flags = (*NVRTC_FLAGS, f"--gpu-architecture={architecture}")
-    path, _ = kept([source, *flags, version()], ".cubin", lambda result: result.write_bytes(_compile(source, flags)))
+    path, _ = kept(
+        [source, *flags, version()],
+        ".cubin",
+        lambda result: result.write_bytes(_compile(source, flags)),
+    )
     return content_of(path)

@@ -1,6 +1,8 @@
-"""The operations of scalar programs, one row each: what folds them, what XLA and C call them, what they cost.
+"""The operations of scalar programs, one row each: what folds them, what XLA and C call them, what
+they cost.
 
-A new operation that a jaxpr does entry by entry is a row here and, if C has no word for it, its `f_<name>` in `c/mathlib.h`.
+A new operation that a jaxpr does entry by entry is a row here and, if C has no word for it, its
+`f_<name>` in `c/mathlib.h`.
 """
 
 from __future__ import annotations
@@ -19,11 +21,13 @@ class Operation(NamedTuple):
     numpy: Callable[..., Any] | None
     """Folds constants; None where it depends on more than their values."""
     lax: Callable[..., Any] | None
-    """In XLA: no function of jnp, as those are jitted, and within a function that XLA may not inline each would be a call."""
+    """In XLA: no function of jnp, as those are jitted, and within a function that XLA may not
+    inline each would be a call."""
     cost: int | None
     """Vector instructions, roughly; None: a call into the C library for every run."""
     c: Mapping[str, str] | None = None
-    """Kind of the first argument -> its C, {} for each argument; None: `f_<name>`, of floats alone."""
+    """Kind of the first argument -> its C, {} for each argument; None: `f_<name>`, of floats
+    alone."""
     cheap: bool = False
     """Whether XLA takes one instruction for it on CPU."""
     commutes: bool = False
@@ -54,25 +58,35 @@ def _arithmetic(numpy: Callable, xla: Callable, sign: str, cost: int = 1, **more
     return Operation(numpy, xla, cost, dict.fromkeys("fi", f"{{}} {sign} {{}}"), **more)
 
 
-def _comparison(numpy: Callable, xla: Callable, sign: str, of_flags: str | None = None, **more: Any) -> Operation:
+def _comparison(
+    numpy: Callable, xla: Callable, sign: str, of_flags: str | None = None, **more: Any
+) -> Operation:
     c = dict.fromkeys("fi", f"MASK({{}} {sign} {{}})") | ({"b": of_flags} if of_flags else {})
     return Operation(numpy, xla, 1, c, cheap=True, **more)
 
 
 def _logic(numpy: Callable, xla: Callable, sign: str) -> Operation:
-    return Operation(numpy, xla, 1, dict.fromkeys("ib", f"{{}} {sign} {{}}"), cheap=True, commutes=True)
+    return Operation(
+        numpy, xla, 1, dict.fromkeys("ib", f"{{}} {sign} {{}}"), cheap=True, commutes=True
+    )
 
 
 OPERATIONS: dict[str, Operation] = {
-    "add": _arithmetic(np.add, lax.add, "+", cheap=True, commutes=True, primitives=("add", "add_any")),
+    "add": _arithmetic(
+        np.add, lax.add, "+", cheap=True, commutes=True, primitives=("add", "add_any")
+    ),
     "sub": _arithmetic(np.subtract, lax.sub, "-", cheap=True),
     "mul": _arithmetic(np.multiply, lax.mul, "*", cheap=True, commutes=True),
     "div": _arithmetic(np.divide, lax.div, "/", cost=8),
     "rem": Operation(np.fmod, lax.rem, None),
     "neg": Operation(np.negative, lax.neg, 1, {"f": "-{}", "i": "-{}"}, cheap=True),
     "abs": Operation(np.abs, lax.abs, 1, cheap=True),
-    "max": Operation(np.maximum, lax.max, 3, {"f": "f_max({}, {})", "i": "i_max({}, {})"}, cheap=True),
-    "min": Operation(np.minimum, lax.min, 3, {"f": "f_min({}, {})", "i": "i_min({}, {})"}, cheap=True),
+    "max": Operation(
+        np.maximum, lax.max, 3, {"f": "f_max({}, {})", "i": "i_max({}, {})"}, cheap=True
+    ),
+    "min": Operation(
+        np.minimum, lax.min, 3, {"f": "f_min({}, {})", "i": "i_min({}, {})"}, cheap=True
+    ),
     "sign": Operation(np.sign, lax.sign, 4),
     "floor": Operation(np.floor, lax.floor, 1),
     "ceil": Operation(np.ceil, lax.ceil, 1),
@@ -117,4 +131,5 @@ OPERATIONS: dict[str, Operation] = {
     "convert": Operation(None, None, 1, {}, cheap=True, primitives=()),
     "lookup": Operation(None, None, 24, {}, primitives=()),
 }
-"""What a program may hold, besides constants and inputs.  What "convert" does depends on both kinds, a "lookup" has its table."""
+"""What a program may hold, besides constants and inputs.  What "convert" does depends on both
+kinds, a "lookup" has its table."""

@@ -1,4 +1,6 @@
-"""A step as a scalar program, and the arrays that go in and out of it: one row a number, one column a run."""
+"""A step as a scalar program, and the arrays that go in and out of it: one row a number, one column
+a run.
+"""
 
 from __future__ import annotations
 
@@ -66,15 +68,19 @@ def lowered(
     sparse: bool = False,
     known: tuple[Known | None, ...] = (),
 ) -> Lowered:
-    """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves, records)`.
+    """The program of `step(shared leaves, lane leaves, carry leaves, index) -> (carry leaves,
+    records)`.
 
-    `limits`: what is too long; `sparse`: for steps that hold derivatives, see `Builder`; `known`: of each shared number.
+    `limits`: what is too long; `sparse`: for steps that hold derivatives, see `Builder`; `known`:
+      of each shared number.
 
     Raises:
       UnsupportedError: the step holds something that a scalar program cannot express.
     """
     index = jax.ShapeDtypeStruct((), jnp.int32)
-    jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(shared.structs(), lane.structs(), carry.structs(), index)
+    jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(
+        shared.structs(), lane.structs(), carry.structs(), index
+    )
     b = Builder(dtype, sparse=sparse, limits=limits)
     operands, read = [], []
     for op, group in (("shared", shared), ("lane", lane), ("carry", carry)):
@@ -82,7 +88,10 @@ def lowered(
         for shape, array_dtype in group.items:
             kind = _accepted(kind_of(array_dtype), array_dtype, op, dtype)
             size = int(np.prod(shape))
-            ids = [_shared(b, i, known) if op == "shared" else b.input(op, i, kind) for i in range(count, count + size)]
+            ids = [
+                _shared(b, i, known) if op == "shared" else b.input(op, i, kind)
+                for i in range(count, count + size)
+            ]
             count += size
             operands.append(np.asarray(ids, np.int64).reshape(shape))
             read += ids if op == "carry" else []
@@ -157,13 +166,29 @@ def unpack(packed: Packed, shapes: Shapes, runs: int) -> list[jax.Array]:
     return result
 
 
-def record_shapes(program: Program, runs: int, steps: int, every: int | None) -> list[jax.ShapeDtypeStruct]:
-    """(rows, numbers * runs) of each recorded array: a row for every `every`-th of the steps, from the first on."""
-    return [jax.ShapeDtypeStruct((-(-steps // every), size * runs), program.dtype) for size in program.recorded] if every else []
+def record_shapes(
+    program: Program, runs: int, steps: int, every: int | None
+) -> list[jax.ShapeDtypeStruct]:
+    """(rows, numbers * runs) of each recorded array: a row for every `every`-th of the steps, from
+    the first on.
+    """
+    return (
+        [
+            jax.ShapeDtypeStruct((-(-steps // every), size * runs), program.dtype)
+            for size in program.recorded
+        ]
+        if every
+        else []
+    )
 
 
 def unpacked_records(records: Any, arrays: Sequence[jax.Array]) -> Any:
-    """What a step gives besides its carry, run axis first, then time, from arrays (rows, numbers, runs) and its shapes for one run."""
+    """What a step gives besides its carry, run axis first, then time, from arrays (rows, numbers,
+    runs) and its shapes for one run.
+    """
     shapes, treedef = jax.tree.flatten(records)
-    rows = [a.transpose(2, 0, 1).reshape(a.shape[2], len(a), *x.shape).astype(x.dtype) for a, x in zip(arrays, shapes, strict=True)]
+    rows = [
+        a.transpose(2, 0, 1).reshape(a.shape[2], len(a), *x.shape).astype(x.dtype)
+        for a, x in zip(arrays, shapes, strict=True)
+    ]
     return jax.tree.unflatten(treedef, rows)

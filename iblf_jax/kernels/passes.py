@@ -1,9 +1,9 @@
-"""Rewritings of a whole program that save time: divisions become products with a reciprocal, at the price of one rounding, and operations
-are put in an order in which a processor need not wait.
+"""Rewritings of a whole program that save time: divisions become products with a reciprocal, at the
+price of one rounding, and operations are put in an order in which a processor need not wait.
 
-A division takes as long as ten products.  Where the denominator is of a lower class than the quotient (a bound, which only time
-decides) or serves several quotients (a pivot), its reciprocal is computed once; a denominator that is a choice of shared ones has
-the choice of their reciprocals.
+A division takes as long as ten products.  Where the denominator is of a lower class than the
+quotient (a bound, which only time decides) or serves several quotients (a pivot), its reciprocal is
+computed once; a denominator that is a choice of shared ones has the choice of their reciprocals.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from iblf_jax.kernels.program import LANE, TIME, Builder, Node, Program, finishe
 
 
 def rebuilt(program: Program, rule) -> Program:
-    """The program with every operation made again by `rule(builder, node, args, index)`, or as it was where that gives None."""
+    """The program with every operation made again by `rule(builder, node, args, index)`, or as it
+    was where that gives None.
+    """
     b = Builder(program.dtype)
     new: list[int] = []
     for i, node in enumerate(program.nodes):
@@ -25,7 +27,13 @@ def rebuilt(program: Program, rule) -> Program:
         made = rule(b, node, args, i)
         new.append(b.again(node, args) if made is None else made)
     carry_in = [new[a] if a >= 0 else -1 for a, _ in program.carry]
-    return finished(b, carry_in, [new[o] for _, o in program.carry], [new[s] for s in program.samples], program.recorded)
+    return finished(
+        b,
+        carry_in,
+        [new[o] for _, o in program.carry],
+        [new[s] for s in program.samples],
+        program.recorded,
+    )
 
 
 @lru_cache(maxsize=64)
@@ -38,7 +46,11 @@ def written_out(program: Program) -> Program:
             function, new = node.value, list[int]()
             args = args if node.kind == "call" else args[1:]
             for inner in function.nodes:
-                new.append(args[inner.value] if inner.op == "argument" else b.again(inner, [new[a] for a in inner.args]))
+                new.append(
+                    args[inner.value]
+                    if inner.op == "argument"
+                    else b.again(inner, [new[a] for a in inner.args])
+                )
             found[i] = [new[s] for s in function.samples]
             return -1
         return found[node.args[0]][node.value] if node.op == "result" else None
@@ -57,7 +69,9 @@ def with_reciprocals(program: Program) -> Program:
     def reciprocal(b: Builder, old: int, new: int) -> int:
         node = program.nodes[old]
         if node.op == "select" and classes[old] & LANE and all(is_shared(a) for a in node.args[1:]):
-            condition, yes, no = b.nodes[new].args if b.nodes[new].op == "select" else (None, None, None)
+            condition, yes, no = (
+                b.nodes[new].args if b.nodes[new].op == "select" else (None, None, None)
+            )
             if condition is not None and yes is not None and no is not None:
                 one = b.constant(1, "f")
                 return b.emit("select", condition, b.emit("div", one, yes), b.emit("div", one, no))
@@ -69,7 +83,12 @@ def with_reciprocals(program: Program) -> Program:
         return choice or classes[i] != classes[quotient] or uses[i] > 1
 
     def rule(b: Builder, node, args, i):
-        if node.op == "div" and node.kind == "f" and b.value(args[0]) != 1 and cheap(node.args[1], i):
+        if (
+            node.op == "div"
+            and node.kind == "f"
+            and b.value(args[0]) != 1
+            and cheap(node.args[1], i)
+        ):
             return b.emit("mul", args[0], reciprocal(b, node.args[1], args[1]))
         return None
 
@@ -77,10 +96,12 @@ def with_reciprocals(program: Program) -> Program:
 
 
 def scheduled(program: Program) -> Program:
-    """The program in an order in which a processor need not wait: of what can be computed, first what the longest chain hangs on.
+    """The program in an order in which a processor need not wait: of what can be computed, first
+    what the longest chain hangs on.
 
-    A processor looks a few hundred instructions ahead.  In depth-first order it sees one chain of a step there; in this one, what metrics
-    and estimates ask for stands between the stages of the integrator.
+    A processor looks a few hundred instructions ahead.  In depth-first order it sees one chain of a
+    step there; in this one, what metrics and estimates ask for stands between the stages of the
+    integrator.
     """
     nodes, classes = program.nodes, program.classes()
     cost, users = [_cost(node) for node in nodes], [list[int]() for _ in nodes]
@@ -109,17 +130,21 @@ def scheduled(program: Program) -> Program:
             if not left[user]:
                 heapq.heappush(waiting, (at[user], user))
         now += cost[i]
-    # What only samples need stays last: a call that only they need must not write over what the next one has left there (`layout.Calls`).
+    # What only samples need stays last: a call that only they need must not write over what the
+    # next one has left there (`layout.Calls`).
     in_time = set(needed(nodes, [o for _, o in program.carry])) | known
     order.sort(key=lambda i: i not in in_time)
     place = {i: k for k, i in enumerate(order)}
     carry = tuple((place.get(a, -1), place[o]) for a, o in program.carry)
     moved = tuple(nodes[i]._replace(args=tuple(place[a] for a in nodes[i].args)) for i in order)
-    return program._replace(nodes=moved, carry=carry, samples=tuple(place[s] for s in program.samples))
+    return program._replace(
+        nodes=moved, carry=carry, samples=tuple(place[s] for s in program.samples)
+    )
 
 
 LATENCY, LIBRARY = 4, 100
-"""Cycles until an instruction's result is there; instructions of a call into the C library, roughly."""
+"""Cycles until an instruction's result is there; instructions of a call into the C library,
+roughly."""
 
 
 def _cost(node: Node) -> int:

@@ -1,10 +1,12 @@
 """Scalar programs: what one step of a run does, number by number.
 
-A jaxpr works on small arrays; a processor that steps many runs at once wants to see single numbers, each of which is a register
-full of runs.  So arrays are taken apart (`from_jaxpr`): a `Program` is a list of nodes in an order in which each uses only earlier
-ones.  Equal nodes are one node (hash-consing), constants are folded, and what no output needs is dropped.
+A jaxpr works on small arrays; a processor that steps many runs at once wants to see single numbers,
+each of which is a register full of runs.  So arrays are taken apart (`from_jaxpr`): a `Program` is
+a list of nodes in an order in which each uses only earlier ones.  Equal nodes are one node
+(hash-consing), constants are folded, and what no output needs is dropped.
 
-Every node has one of four classes, by what it depends on; each is computed as seldom as that allows:
+Every node has one of four classes, by what it depends on; each is computed as seldom as that
+allows:
 
     SHARED        the shared leaves alone                   once
     SHARED|TIME   shared leaves and time                    once a step, for all runs
@@ -26,8 +28,8 @@ from iblf_jax.kernels.operations import OPERATIONS
 
 SHARED, LANE, TIME = 0, 1, 2
 INPUTS = ("shared", "lane", "carry", "index", "argument")
-"""Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step to step, number of the step, and of a
-function that a program calls, what it is given."""
+"""Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step
+to step, number of the step, and of a function that a program calls, what it is given."""
 
 
 Ids = np.ndarray
@@ -50,11 +52,13 @@ def kind_of(dtype) -> str:
 
 
 class Node(NamedTuple):
-    """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a constant, an input's index, or the
-    numbers among which a "lookup" chooses by its whole-numbered argument (the nearest end, outside).
+    """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a
+    constant, an input's index, or the numbers among which a "lookup" chooses by its whole-numbered
+    argument (the nearest end, outside).
 
-    A "call" is no number: it has the results of a function, a program whose "samples" they are; a "result" is one of them.  One of the
-    kind "call if" is made where its first argument, the same for all runs, holds; elsewhere its results are no numbers either.
+    A "call" is no number: it has the results of a function, a program whose "samples" they are; a
+    "result" is one of them.  One of the kind "call if" is made where its first argument, the same
+    for all runs, holds; elsewhere its results are no numbers either.
     """
 
     op: str
@@ -96,7 +100,9 @@ NO_LIMITS = LoweringLimits()
 
 
 def extend_classes(classes: list[int], nodes: Sequence[Node], still: Container[int]) -> None:
-    """Adds the classes of the nodes that have none yet; `still`: carried numbers that a step leaves alone, of class LANE."""
+    """Adds the classes of the nodes that have none yet; `still`: carried numbers that a step leaves
+    alone, of class LANE.
+    """
     of_input = {"const": SHARED, "shared": SHARED, "index": TIME, "lane": LANE}
     for node in nodes[len(classes) :]:
         if node.args:
@@ -112,8 +118,8 @@ class Builder:
     """Makes nodes; equal ones are made once."""
 
     def __init__(self, dtype, *, sparse: bool = False, limits: LoweringLimits = NO_LIMITS) -> None:
-        """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such a zero says "does not depend".
-        `limits`: for what is read from a jaxpr.
+        """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such
+        a zero says "does not depend". `limits`: for what is read from a jaxpr.
         """
         self.dtype = np.dtype(dtype)
         self.sparse = sparse
@@ -126,11 +132,18 @@ class Builder:
         self.known_finite: set[int] = set()
         """Inputs that are known to be finite (`Known`), and what was computed of them alone."""
         self.absent = self._add(Node("const", (), "f", 0.0), "absent")
-        """The zero of what is not there: a product with it is not there either, whatever the other factor."""
+        """The zero of what is not there: a product with it is not there either, whatever the other
+        factor."""
 
     def constant(self, value, kind: str) -> int:
         """The node of a constant."""
-        value = float(self.dtype.type(value)) if kind == "f" else int(value) if kind == "i" else bool(value)
+        value = (
+            float(self.dtype.type(value))
+            if kind == "f"
+            else int(value)
+            if kind == "i"
+            else bool(value)
+        )
         return self._add(Node("const", (), kind, value), value.hex() if kind == "f" else value)
 
     def input(self, op: str, index: int, kind: str) -> int:
@@ -154,8 +167,14 @@ class Builder:
         simpler = simplify(self, op, args, kind)
         if simpler is not None:
             return simpler
-        new = self._add(Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None)
-        if self.known_finite and kind == "f" and all(a in self.known_finite or self._is_finite_constant(a) for a in args):
+        new = self._add(
+            Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None
+        )
+        if (
+            self.known_finite
+            and kind == "f"
+            and all(a in self.known_finite or self._is_finite_constant(a) for a in args)
+        ):
             self.known_finite.add(new)
         return new
 
@@ -171,7 +190,9 @@ class Builder:
     def result(self, call: int, number: int) -> int:
         """The node of one of its results."""
         function = self.nodes[call].value
-        return self._add(Node("result", (call,), function.nodes[function.samples[number]].kind, number), number)
+        return self._add(
+            Node("result", (call,), function.nodes[function.samples[number]].kind, number), number
+        )
 
     def again(self, node: Node, args: Sequence[int]) -> int:
         """A node of another builder, on nodes of this one."""
@@ -182,8 +203,16 @@ class Builder:
         if node.op == "lookup":
             return self.lookup(node.value, *args)
         if node.op == "call":
-            return self.call(node.value, args) if node.kind == "call" else self.call(node.value, args[1:], args[0])
-        return self.result(args[0], node.value) if node.op == "result" else self.emit(node.op, *args, kind=node.kind)
+            return (
+                self.call(node.value, args)
+                if node.kind == "call"
+                else self.call(node.value, args[1:], args[0])
+            )
+        return (
+            self.result(args[0], node.value)
+            if node.op == "result"
+            else self.emit(node.op, *args, kind=node.kind)
+        )
 
     def moves(self, node: int) -> bool:
         """Whether a node is of class LANE|TIME."""
@@ -227,7 +256,8 @@ class Program(NamedTuple):
     Args:
       dtype: floating-point type of every "f".
       nodes: in an order in which each uses earlier ones only.
-      carry: (input node, output node) of every number that goes from step to step; input -1 where the step does not read it.
+      carry: (input node, output node) of every number that goes from step to step; input -1 where
+        the step does not read it.
       samples: output nodes that a record may ask for; the results of a function.
       kinds: kind of every carried number.
       recorded: how many of the samples each recorded array has, in order.
@@ -241,7 +271,9 @@ class Program(NamedTuple):
     recorded: tuple[int, ...] = ()
 
     def classes(self) -> list[int]:
-        """The class of every node (head of this module); a carried number that a step leaves alone is of class LANE."""
+        """The class of every node (head of this module); a carried number that a step leaves alone
+        is of class LANE.
+        """
         result: list[int] = []
         extend_classes(result, self.nodes, {a for a, b in self.carry if a == b})
         return result
@@ -262,7 +294,9 @@ class Program(NamedTuple):
 
 
 def needed(nodes: Sequence[Node], wanted: Iterable[int], known: Container[int] = ()) -> list[int]:
-    """The nodes that `wanted` needs, itself included, in order; what is known needs nothing and is left out."""
+    """The nodes that `wanted` needs, itself included, in order; what is known needs nothing and is
+    left out.
+    """
     stack, found = list(wanted), set()
     while stack:
         i = stack.pop()
@@ -272,10 +306,17 @@ def needed(nodes: Sequence[Node], wanted: Iterable[int], known: Container[int] =
     return sorted(found)
 
 
-def finished(builder: Builder, carry_in: list[int], carry_out: list[int], samples: list[int], recorded: tuple[int, ...] = ()) -> Program:
+def finished(
+    builder: Builder,
+    carry_in: list[int],
+    carry_out: list[int],
+    samples: list[int],
+    recorded: tuple[int, ...] = (),
+) -> Program:
     """The program of the given outputs, without what they do not need, in depth-first order.
 
-    The order matters to a compiler with few registers: a number is computed shortly before its first use.
+    The order matters to a compiler with few registers: a number is computed shortly before its
+      first use.
     """
     order: list[int] = []
     place: dict[int, int] = {}
@@ -293,14 +334,21 @@ def finished(builder: Builder, carry_in: list[int], carry_out: list[int], sample
             place[node] = len(order)
             order.append(node)
             stack.pop()
-    nodes = tuple(builder.nodes[i]._replace(args=tuple(place[a] for a in builder.nodes[i].args)) for i in order)
+    nodes = tuple(
+        builder.nodes[i]._replace(args=tuple(place[a] for a in builder.nodes[i].args))
+        for i in order
+    )
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
     return Program(builder.dtype, nodes, carry, tuple(place[s] for s in samples), kinds, recorded)
 
 
-def frontier(program: Program, classes: list[int], of: int, used_by: Callable[[int], bool]) -> list[int]:
-    """The operations and inputs of class `of` that a node of a class accepted by `used_by` reads, and no constants."""
+def frontier(
+    program: Program, classes: list[int], of: int, used_by: Callable[[int], bool]
+) -> list[int]:
+    """The operations and inputs of class `of` that a node of a class accepted by `used_by` reads,
+    and no constants.
+    """
     found = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
     found |= {i for i in [*(o for _, o in program.carry), *program.samples] if used_by(LANE | TIME)}
     return sorted(a for a in found if classes[a] == of and program.nodes[a].op != "const")

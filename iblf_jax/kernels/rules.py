@@ -1,4 +1,6 @@
-"""What each jaxpr primitive becomes: the rules that compute.  Those that only move numbers about are in `structure`."""
+"""What each jaxpr primitive becomes: the rules that compute.  Those that only move numbers about
+are in `structure`.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +97,14 @@ def _reduce(op: str) -> Callable:
         rows = np.transpose(x, [*axes, *kept]).reshape(-1, *(x.shape[a] for a in kept))
         if len(rows) == 0:
             kind = kind_of(eqn.outvars[0].aval.dtype)
-            neutral = {"add": 0, "mul": 1, "or": 0, "and": -1 if kind == "i" else True, "max": -np.inf, "min": np.inf}[op]
+            neutral = {
+                "add": 0,
+                "mul": 1,
+                "or": 0,
+                "and": -1 if kind == "i" else True,
+                "max": -np.inf,
+                "min": np.inf,
+            }[op]
             return np.full(rows.shape[1:], b.constant(neutral, kind))
         return _along(b, op, eqn, rows)
 
@@ -116,7 +125,14 @@ def _arg_extreme(op: str) -> Callable:
         best, where = rows[0], np.full(rows.shape[1:], b.constant(0, "i"))
         for i, row in enumerate(rows[1:], 1):
             better = each(b, op, eqn, row, best, kind="b")
-            first_nan = each(b, "and", eqn, each(b, "ne", eqn, row, row, kind="b"), each(b, "eq", eqn, best, best, kind="b"), kind="b")
+            first_nan = each(
+                b,
+                "and",
+                eqn,
+                each(b, "ne", eqn, row, row, kind="b"),
+                each(b, "eq", eqn, best, best, kind="b"),
+                kind="b",
+            )
             better = each(b, "or", eqn, better, first_nan, kind="b")
             where = each(b, "select", eqn, better, np.full(where.shape, b.constant(i, "i")), where)
             best = each(b, "select", eqn, better, row, best, kind=b.nodes[int(row.flat[0])].kind)
@@ -139,7 +155,9 @@ def _cumulative(op: str) -> Callable:
 
 
 def _dot_general(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
-    """Products and sums; a factor that is a literal zero leaves its term out, as a matrix that is written with zeros means it."""
+    """Products and sums; a factor that is a literal zero leaves its term out, as a matrix that is
+    written with zeros means it.
+    """
     (xc, yc), (xb, yb) = eqn.params["dimension_numbers"]
     xf = [a for a in range(x.ndim) if a not in (*xc, *xb)]
     yf = [a for a in range(y.ndim) if a not in (*yc, *yb)]
@@ -147,7 +165,12 @@ def _dot_general(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
     xs = np.transpose(x, [*xb, *xf, *xc]).reshape(int(np.prod(batch)), int(np.prod(shape[0])), -1)
     ys = np.transpose(y, [*yb, *yf, *yc]).reshape(int(np.prod(batch)), int(np.prod(shape[1])), -1)
     kind = kind_of(eqn.outvars[0].aval.dtype)
-    flat = [_dot(b, kind, u.tolist(), v.tolist()) for us, vs in zip(xs, ys, strict=True) for u in us for v in vs]
+    flat = [
+        _dot(b, kind, u.tolist(), v.tolist())
+        for us, vs in zip(xs, ys, strict=True)
+        for u in us
+        for v in vs
+    ]
     return np.asarray(flat, np.int64).reshape((*batch, *shape[0], *shape[1]))
 
 
@@ -172,14 +195,17 @@ def _one_minus_square(b: Builder, eqn, x: Ids) -> Ids:
 
 
 def _log2(b: Builder, eqn, x: Ids) -> Ids:
-    return each(b, "div", eqn, each(b, "log", eqn, x), np.full(x.shape, b.constant(np.log(2.0), "f")))
+    return each(
+        b, "div", eqn, each(b, "log", eqn, x), np.full(x.shape, b.constant(np.log(2.0), "f"))
+    )
 
 
 RULES: dict[str, Callable] = {
     **{name: _elementwise(op) for op, row in OPERATIONS.items() for name in ((op,) if row.primitives is None else row.primitives)},
     **STRUCTURE,
     "square": _square, "pow": _pow, "integer_pow": _integer_pow, "round": _round, "select_n": _select_n, "clamp": _clamp,
-    "convert_element_type": _convert, "one_minus_square": _one_minus_square, "log2": _log2,  # the last two since jax 0.11
+    # the last two since jax 0.11
+    "convert_element_type": _convert, "one_minus_square": _one_minus_square, "log2": _log2,
     "stop_gradient": _stop, "optimization_barrier": _stop, "copy": _stop, "copy_p": _stop, "reduce_precision": _stop,
     "reduce_sum": _reduce("add"), "reduce_prod": _reduce("mul"), "reduce_max": _reduce("max"), "reduce_min": _reduce("min"),
     "reduce_and": _reduce("and"), "reduce_or": _reduce("or"), "argmin": _arg_extreme("lt"), "argmax": _arg_extreme("gt"),

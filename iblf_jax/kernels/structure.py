@@ -1,7 +1,7 @@
 """Rules for the primitives that only move numbers about: they run here and now, on node numbers.
 
-An index that is known only in the run (the piece of a spline at time t) becomes a choice among the entries that it can mean, or a
-lookup where all of these are constants.
+An index that is known only in the run (the piece of a spline at time t) becomes a choice among the
+entries that it can mean, or a lookup where all of these are constants.
 """
 
 from __future__ import annotations
@@ -33,7 +33,12 @@ def _transpose(b: Builder, eqn, x: Ids) -> Ids:
 def _slice(b: Builder, eqn, x: Ids) -> Ids:
     p = eqn.params
     strides = p["strides"] or (1,) * x.ndim
-    return x[tuple(slice(lo, hi, s) for lo, hi, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
+    return x[
+        tuple(
+            slice(lo, hi, s)
+            for lo, hi, s in zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+        )
+    ]
 
 
 def _concatenate(b: Builder, eqn, *operands: Ids) -> Ids:
@@ -79,25 +84,41 @@ def _iota(b: Builder, eqn, *_: Ids) -> Ids:
 def _now(eqn, *operands):
     """The primitive itself, run on node numbers."""
     with jax.ensure_compile_time_eval():
-        return np.asarray(eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params), np.int64)
+        return np.asarray(
+            eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params),
+            np.int64,
+        )
 
 
-def _chosen(b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None) -> Ids:
-    """`at(values of the index)`, of entries of x; where the run alone knows an index, a choice among its values 0 ... longest axis - 1."""
+def _chosen(
+    b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None
+) -> Ids:
+    """`at(values of the index)`, of entries of x; where the run alone knows an index, a choice
+    among its values 0 ... longest axis - 1.
+    """
     known, size = known or {}, max(x.shape, default=1)
     flat = [known.get(i, b.value(i)) for i in index.ravel().tolist()]
     unknown = [i for i, v in zip(index.ravel().tolist(), flat, strict=True) if v is None]
     if not unknown:
         return at(np.asarray(flat, np.int32).reshape(index.shape))
     choices = size ** len({*unknown, *known})
-    if choices > (b.limits.table if choices == size and _is_table(b, x.ravel().tolist()) else b.limits.choices):
-        raise UnsupportedError(f"indices that only the run knows choose among {choices} entries, which is too many")
+    if choices > (
+        b.limits.table if choices == size and _is_table(b, x.ravel().tolist()) else b.limits.choices
+    ):
+        raise UnsupportedError(
+            f"indices that only the run knows choose among {choices} entries, which is too many"
+        )
     node = unknown[0]
     cases = [_chosen(b, x, index, at, known | {node: v}) for v in range(size)]
     columns = np.stack([case.ravel() for case in cases], axis=1)
     if columns.size > b.limits.tables:
-        raise UnsupportedError(f"an index that only the run knows chooses among {columns.size} numbers, which is too many")
-    return np.asarray([_one_of(b, column, node) for column in columns.tolist()], np.int64).reshape(cases[0].shape)
+        raise UnsupportedError(
+            f"an index that only the run knows chooses among {columns.size} numbers, which is too"
+            " many"
+        )
+    return np.asarray([_one_of(b, column, node) for column in columns.tolist()], np.int64).reshape(
+        cases[0].shape
+    )
 
 
 def _is_table(b: Builder, entries: list[int]) -> bool:
@@ -111,15 +132,26 @@ def _one_of(b: Builder, entries: list[int], index: int) -> int:
     if _is_table(b, entries):
         return b.lookup(tuple(b.value(i) for i in entries), index)
     if len(entries) > b.limits.choices:
-        raise UnsupportedError(f"an index that only the run knows chooses among {len(entries)} entries, which is too many")
+        raise UnsupportedError(
+            f"an index that only the run knows chooses among {len(entries)} entries, which is too"
+            " many"
+        )
     result = entries[-1]
     for v, entry in reversed(list(enumerate(entries[:-1]))):
-        result = b.emit("select", b.emit("le", index, b.constant(v, "i"), kind="b"), entry, result, kind=b.nodes[entry].kind)
+        result = b.emit(
+            "select",
+            b.emit("le", index, b.constant(v, "i"), kind="b"),
+            entry,
+            result,
+            kind=b.nodes[entry].kind,
+        )
     return result
 
 
 def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
-    """Entries of x, the nearest one for an index outside; a gather that fills what lies outside is refused."""
+    """Entries of x, the nearest one for an index outside; a gather that fills what lies outside is
+    refused.
+    """
     filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
     if filled and not _is_inside(b, eqn, x, index):
         raise UnsupportedError("a gather that fills what lies outside; index with mode='clip'")
@@ -127,7 +159,12 @@ def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
     def at(values):
         params = dict(eqn.params, fill_value=None, mode=jax.lax.GatherScatterMode.CLIP)
         with jax.ensure_compile_time_eval():
-            return np.asarray(eqn.primitive.bind(jax.numpy.asarray(x, np.int32), jax.numpy.asarray(values), **params), np.int64)
+            return np.asarray(
+                eqn.primitive.bind(
+                    jax.numpy.asarray(x, np.int32), jax.numpy.asarray(values), **params
+                ),
+                np.int64,
+            )
 
     rows = list(np.ndindex(index.shape[:-1]))
     if len(rows) == 1 or all(b.value(i) is not None for i in index.ravel().tolist()):
@@ -148,20 +185,31 @@ def _is_inside(b: Builder, eqn, x: Ids, index: Ids) -> bool:
     """Whether all places of a gather are known and inside."""
     axes, sizes = eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
     rows = [[b.value(i) for i in row] for row in index.reshape(-1, len(axes)).tolist()]
-    return all(v is not None and 0 <= v <= x.shape[a] - sizes[a] for row in rows for a, v in zip(axes, row, strict=True))
+    return all(
+        v is not None and 0 <= v <= x.shape[a] - sizes[a]
+        for row in rows
+        for a, v in zip(axes, row, strict=True)
+    )
 
 
 def _dynamic_slice(b: Builder, eqn, x: Ids, *starts: Ids) -> Ids:
     def at(values):
-        corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, eqn.params["slice_sizes"], strict=True)]
-        return x[tuple(slice(c, c + s) for c, s in zip(corner, eqn.params["slice_sizes"], strict=True))]
+        corner = [
+            min(max(int(v), 0), n - s)
+            for v, n, s in zip(values, x.shape, eqn.params["slice_sizes"], strict=True)
+        ]
+        return x[
+            tuple(slice(c, c + s) for c, s in zip(corner, eqn.params["slice_sizes"], strict=True))
+        ]
 
     return _chosen(b, x, np.asarray(starts), at)
 
 
 def _dynamic_update_slice(b: Builder, eqn, x: Ids, new: Ids, *starts: Ids) -> Ids:
     def at(values):
-        corner = [min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, new.shape, strict=True)]
+        corner = [
+            min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, new.shape, strict=True)
+        ]
         result = x.copy()
         result[tuple(slice(c, c + s) for c, s in zip(corner, new.shape, strict=True))] = new
         return result
@@ -179,8 +227,12 @@ def _scatter(op: str | None) -> Callable:
         places = np.asarray(values, np.int32).reshape(index.shape)
         with jax.ensure_compile_time_eval():
             numbers = jax.numpy.arange(new.size, dtype=np.int32).reshape(new.shape)
-            params = {k: eqn.params[k] for k in eqn.params if k not in ("update_jaxpr", "update_consts")}
-            landed = jax.lax.scatter(jax.numpy.full(x.shape, -1, np.int32), places, numbers, **params)
+            params = {
+                k: eqn.params[k] for k in eqn.params if k not in ("update_jaxpr", "update_consts")
+            }
+            landed = jax.lax.scatter(
+                jax.numpy.full(x.shape, -1, np.int32), places, numbers, **params
+            )
         source = np.asarray(landed)
         if np.sum(source >= 0) != new.size:
             raise UnsupportedError(f"{eqn.primitive.name} with repeated or outlying places")
@@ -188,7 +240,9 @@ def _scatter(op: str | None) -> Callable:
         for place, which in enumerate(source.ravel().tolist()):
             if which >= 0:
                 old, update = int(result[place]), int(flat[which])
-                result[place] = update if op is None else b.emit(op, old, update, kind=b.nodes[old].kind)
+                result[place] = (
+                    update if op is None else b.emit(op, old, update, kind=b.nodes[old].kind)
+                )
         return result.reshape(x.shape)
 
     return rule

@@ -1,12 +1,15 @@
-"""The C++ compiler: found, run without a shell, its results kept by content in a directory that only the user can write.
+"""The C++ compiler: found, run without a shell, its results kept by content in a directory that
+only the user can write.
 
-It is the system's, GCC or Clang, or Clang as the wheel `ziglang` brings it.  The flags depend on which of them it is, which
-its version text tells; each compiler prints that text once in a process.
+It is the system's, GCC or Clang, or Clang as the wheel `ziglang` brings it.  The flags depend on
+which of them it is, which its version text tells; each compiler prints that text once in a process.
 
-The key of a kernel is a hash of its source, the flags, the compiler's version, the processor and the header of XLA's interface, so a
-stale kernel is never loaded.  A kernel is made in a draft, written out to the disk and renamed, so that two processes do not disturb each
-other.  A digest of key and content stands at its end: a file that does not fit it, for whatever reason, is made again, and what is loaded
-is a copy of what was checked.  Nothing here follows a symbolic link that it finds in the directory.
+The key of a kernel is a hash of its source, the flags, the compiler's version, the processor and
+the header of XLA's interface, so a stale kernel is never loaded.  A kernel is made in a draft,
+written out to the disk and renamed, so that two processes do not disturb each other.  A digest of
+key and content stands at its end: a file that does not fit it, for whatever reason, is made again,
+  and what is loaded is a copy of what was checked.  Nothing here follows a symbolic link that it
+  finds in the directory.
 """
 
 from __future__ import annotations
@@ -47,9 +50,10 @@ COMMON_FLAGS = (
 )  # fmt: skip
 """Flags that GCC and Clang share.
 
-NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  Without `-ffp-contract=fast`, which makes one
-operation of a product and a sum, the sine of a large angle would lose digits.  The headers are C's: C++ makes of `math.h` a
-tenth of a second more to read."""
+NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  Without
+  `-ffp-contract=fast`, which makes one
+operation of a product and a sum, the sine of a large angle would lose digits.  The headers are C's:
+C++ makes of `math.h` a tenth of a second more to read."""
 FLAGS_OF_KIND = {
     "gcc": ("-fexpensive-optimizations", "-fcaller-saves", "-ftree-loop-vectorize"),
     "clang": ("-fvectorize", "-fslp-vectorize", "-fno-sanitize=undefined", "-nostdlib++"),
@@ -57,13 +61,16 @@ FLAGS_OF_KIND = {
 }
 """Flags that only one kind of compiler knows, by kind.
 
-GCC: of -O3 what the generated text gains by.  The paper's loop runs as fast (1 % either way, one run 3 % slower) and builds in
-0.6 s instead of 2.7.  The first flag is needed for products and sums to become one operation; with the second, numbers stay in
-registers across rare calls (a step of seven joints takes 5 to 25 % longer without); the third makes one instruction of a root
-of many runs.
+GCC: of -O3 what the generated text gains by.  The paper's loop runs as fast (1 % either way, one
+  run 3 % slower) and builds in
+0.6 s instead of 2.7.  The first flag is needed for products and sums to become one operation; with
+the second, numbers stay in registers across rare calls (a step of seven joints takes 5 to 25 %
+longer without); the third makes one instruction of a root of many runs.
 
-Clang: the first two make one instruction of a root of many runs.  `ziglang` adds checks of undefined behaviour to what is not
-optimised, and its own C++ library, of which a kernel uses nothing; the other two flags leave both out."""
+Clang: the first two make one instruction of a root of many runs.  `ziglang` adds checks of
+  undefined behaviour to what is not
+optimised, and its own C++ library, of which a kernel uses nothing; the other two flags leave both
+out."""
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""
 VERSION_TIMEOUT = 20.0
@@ -77,7 +84,9 @@ DIGEST = hashlib.sha256
 
 
 class ToolchainError(Exception):
-    """No compiler, or it failed, or there is no safe place for its result; the message is one line for the user."""
+    """No compiler, or it failed, or there is no safe place for its result; the message is one line
+    for the user.
+    """
 
 
 class StoppedError(ToolchainError):
@@ -85,7 +94,8 @@ class StoppedError(ToolchainError):
 
 
 def compiler() -> tuple[str, ...]:
-    """The command of a C++ compiler: $CXX if it is set, else c++, g++, clang++ or that of the wheel `ziglang`.
+    """The command of a C++ compiler: $CXX if it is set, else c++, g++, clang++ or that of the wheel
+    `ziglang`.
 
     Raises:
       ToolchainError: there is none.
@@ -99,7 +109,9 @@ def compiler() -> tuple[str, ...]:
             return (path,)
     if has_ziglang():
         return ziglang("c++")
-    raise ToolchainError("there is no C++ compiler (c++, g++, clang++; pip install ziglang has one)")
+    raise ToolchainError(
+        "there is no C++ compiler (c++, g++, clang++; pip install ziglang has one)"
+    )
 
 
 def _command_of(wanted: str) -> tuple[str, ...]:
@@ -186,7 +198,11 @@ def built_for() -> dict[str, str]:
     """What a kernel is tied to, in words; ToolchainError if there is no compiler."""
     found = processor()
     command = compiler()
-    names = [line.partition(":")[2].strip() for line in found.splitlines() if line.startswith(("model name", "CPU part"))]
+    names = [
+        line.partition(":")[2].strip()
+        for line in found.splitlines()
+        if line.startswith(("model name", "CPU part"))
+    ]
     features = hashlib.sha256(found.encode()).hexdigest()[:8]
     return {
         "processor": f"{', '.join(names) or platform.machine()}, features {features}",
@@ -216,7 +232,9 @@ atexit.register(stop_compilers)
 
 
 def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
-    """Starts `built` beside what this process does meanwhile; whoever wants the result waits for it, and is told what went wrong."""
+    """Starts `built` beside what this process does meanwhile; whoever wants the result waits for
+    it, and is told what went wrong.
+    """
 
     def build() -> None:
         _this_thread.is_ahead = True
@@ -227,12 +245,18 @@ def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
 
 
 def _run(command: list[str], stream: str, seconds: float) -> bytes:
-    """What a command says on one of its streams; ToolchainError if it fails, or takes too long, it and all that it has started."""
+    """What a command says on one of its streams; ToolchainError if it fails, or takes too long, it
+    and all that it has started.
+    """
     name = _name_of(command)
     said = list[bytes]()
-    out, err = (subprocess.PIPE if stream == x else subprocess.DEVNULL for x in ("stdout", "stderr"))
+    out, err = (
+        subprocess.PIPE if stream == x else subprocess.DEVNULL for x in ("stdout", "stderr")
+    )
     try:
-        process = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+        process = subprocess.Popen(
+            command, start_new_session=True, stdin=subprocess.DEVNULL, stdout=out, stderr=err
+        )
     except (OSError, ValueError) as error:
         raise ToolchainError(f"{name} could not be run: {error}") from None
 
@@ -262,12 +286,16 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
     if code:
         lines = text.decode(errors="replace").splitlines()
         named = [line for line in lines if "error" in line] or lines or ["no message"]
-        raise ToolchainError(f"{name} failed: " + (f"ended by signal {-code}" if code < 0 else named[0][:200]))
+        raise ToolchainError(
+            f"{name} failed: " + (f"ended by signal {-code}" if code < 0 else named[0][:200])
+        )
     return text
 
 
 def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
-    """The shared library of a source and its key, compiled unless it is in the cache; ToolchainError on failure."""
+    """The shared library of a source and its key, compiled unless it is in the cache;
+    ToolchainError on failure.
+    """
     command = compiler()
     version = _version(command)
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
@@ -279,14 +307,17 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
         text.write_text(source)
         files = [f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"]
         lines = source.count("\n")
-        with told(f"{_name_of(command)} is compiling a step of {lines:,} lines: once, the result is kept"):
+        with told(
+            f"{_name_of(command)} is compiling a step of {lines:,} lines: once, the result is kept"
+        ):
             _run([*command, *flags, *files], "stderr", TIMEOUT)
 
     return kept(content, ".so", compile_to)
 
 
 def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) -> tuple[Path, str]:
-    """The file that holds what `make(path)` writes, and the key of its content; made unless it is in the cache, whole and this user's.
+    """The file that holds what `make(path)` writes, and the key of its content; made unless it is
+    in the cache, whole and this user's.
 
     Raises:
       ToolchainError: it cannot be made, or there is no safe place or no room for it.
@@ -363,19 +394,29 @@ def _write(folder: Path, image: bytes, path: Path) -> None:
 
 
 def _read(path: Path, forbidden: int = 0) -> bytes | None:
-    """The bytes of a file; None if it is none of this user's, or has a bit of `forbidden` in its mode."""
+    """The bytes of a file; None if it is none of this user's, or has a bit of `forbidden` in its
+    mode.
+    """
     try:
-        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # neither follows a link nor waits at a pipe
+        file = os.open(
+            path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        )  # neither follows a link nor waits at a pipe
         with open(file, "rb") as opened:
             status = os.fstat(file)
-            fits = stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & forbidden
+            fits = (
+                stat.S_ISREG(status.st_mode)
+                and status.st_uid == os.getuid()
+                and not status.st_mode & forbidden
+            )
             return opened.read() if fits else None
     except OSError:
         return None
 
 
 def _checked(path: Path) -> bytes | None:
-    """What a kept file holds; None if it is not there, not whole, of another key, or could have been written by another user."""
+    """What a kept file holds; None if it is not there, not whole, of another key, or could have
+    been written by another user.
+    """
     whole, size = _read(path, forbidden=0o022) or b"", DIGEST().digest_size
     image, digest = whole[:-size], whole[-size:]
     return image if DIGEST(path.stem.encode() + image).digest() == digest else None
@@ -394,7 +435,9 @@ _libraries: dict[str, ctypes.CDLL] = {}
 
 
 def loaded(library: Path, *names: str) -> ctypes.CDLL:
-    """A library of `built` in this process, from a copy that nobody can change; ToolchainError if it does not load or lacks a name."""
+    """A library of `built` in this process, from a copy that nobody can change; ToolchainError if
+    it does not load or lacks a name.
+    """
     key = library.stem
     try:
         found = _libraries[key] if key in _libraries else _load(content_of(library))
@@ -414,7 +457,9 @@ def _load(image: bytes) -> ctypes.CDLL:
         file = os.memfd_create("iblf_jax")
         with open(file, "wb", closefd=False) as out:
             out.write(image)
-        return ctypes.CDLL(f"/proc/self/fd/{file}")  # and stays open: the loader takes another library of this name for this one
+        return ctypes.CDLL(
+            f"/proc/self/fd/{file}"
+        )  # and stays open: the loader takes another library of this name for this one
     except (OSError, AttributeError):  # no such files on this system, or none that may be executed
         if file is not None:
             os.close(file)
@@ -430,9 +475,11 @@ def processors() -> int:
 
 
 def threads() -> int:
-    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the process's processors, divided among its CPU devices.
+    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the process's processors, divided
+    among its CPU devices.
 
-    What is no whole number from 1 to 256 is warned of: a larger one counts as 256, anything else as not given.
+    What is no whole number from 1 to 256 is warned of: a larger one counts as 256, anything else as
+      not given.
     """
     wanted = os.environ.get("IBLF_JAX_THREADS", "")
     usual = max(1, processors() // jax.local_device_count("cpu"))

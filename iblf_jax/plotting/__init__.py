@@ -5,8 +5,9 @@
     plotting.save(figures, "figures")                               PNG and PDF
     plotting.animate(run, "arm.gif")                                or "arm.html"
 
-Every function takes one run or a dict of runs by name (`overview`: one run) and returns a matplotlib Figure, which a notebook
-shows when it is the value of a cell.  Runs may differ in length; of a batch, select a run first.
+Every function takes one run or a dict of runs by name (`overview`: one run) and returns a
+matplotlib Figure, which a notebook shows when it is the value of a cell.  Runs may differ in
+length; of a batch, select a run first.
 """
 
 from iblf_jax.plotting._figures import errors as errors

@@ -1,8 +1,10 @@
-"""The moving parts of an animation: arms, ghost, joint limits and joint bars, as artists that are only moved.
+"""The moving parts of an animation: arms, ghost, joint limits and joint bars, as artists that are
+only moved.
 
-A joint's limits are a fan around its link: where the link's direction would be with that joint anywhere from its lower to its upper
-bound, found by moving the robot's own `skeleton`, so that it is right for any robot, planar or not.  The bars beside the arm
-show the same for every joint as numbers, also for joints whose fan has no width (a wrist that rolls).
+A joint's limits are a fan around its link: where the link's direction would be with that joint
+anywhere from its lower to its upper bound, found by moving the robot's own `skeleton`, so that it
+is right for any robot, planar or not.  The bars beside the arm show the same for every joint as
+numbers, also for joints whose fan has no width (a wrist that rolls).
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What the runs should do and may do, at the instants of the frames; taken from the first run."""
+    """What the runs should do and may do, at the instants of the frames; taken from the first
+    run.
+    """
 
     t: np.ndarray
     """(F,) [s]."""
@@ -56,7 +60,9 @@ def _fans(robot: Any, q: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.A
     n, here = q.shape[0], robot.skeleton(q)
     share = jnp.linspace(0.0, 1.0, FAN_POINTS)
     angles = lower[:, None] + share * (upper - lower)[:, None]
-    moved = jax.vmap(lambda joint, row: jax.vmap(lambda a: robot.skeleton(q.at[joint].set(a)))(row))(jnp.arange(n), angles)
+    moved = jax.vmap(
+        lambda joint, row: jax.vmap(lambda a: robot.skeleton(q.at[joint].set(a)))(row)
+    )(jnp.arange(n), angles)
     joint = jnp.arange(n)
     rim = moved[joint, :, joint + 1] - moved[joint, :, joint]
     centre = here[:-1, None]
@@ -75,7 +81,9 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[World, list[Moti
         motions.append(Motion(q, skeletons(curve.run.scenario.plant, q)))
         shape = motions[-1].skeleton.shape[1:]
         if shape != motions[0].skeleton.shape[1:]:
-            raise checks.fail("plant.skeleton(q)", shape, "points in the plane or in space, alike for all runs")
+            raise checks.fail(
+                "plant.skeleton(q)", shape, "points in the plane or in space, alike for all runs"
+            )
     robot = first.run.scenario.plant
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
     ghost = skeletons(robot, q_d)
@@ -106,7 +114,9 @@ class Scene:
         self.dots: list[Any] = []
         points = [self.world.ghost, *(motion.skeleton for motion in self.motions)]
         robot, regions = curves[0].run.scenario.plant, curves[0].run.scenario.regions
-        limits = frame(self.arm, np.concatenate([x.reshape(-1, x.shape[-1]) for x in points]), regions)
+        limits = frame(
+            self.arm, np.concatenate([x.reshape(-1, x.shape[-1]) for x in points]), regions
+        )
         draw_walls(self.arm, robot, regions, limits)
         self._add_fans()
         self._add_arms(curves)
@@ -126,53 +136,95 @@ class Scene:
 
     def _add_fans(self) -> None:
         n, planar = self.world.q_d.shape[1], self.world.ghost.shape[-1] == 2
-        look: dict[str, Any] = {"edgecolor": _style.bound(), "facecolor": _style.shade(0.11, _style.colour(0)), "linewidth": 0.7}
+        look: dict[str, Any] = {
+            "edgecolor": _style.bound(),
+            "facecolor": _style.shade(0.11, _style.colour(0)),
+            "linewidth": 0.7,
+        }
         for joint in range(n):
             text = "joint limits" if joint == 0 else None
             if planar:
                 self.fans.append(self._keep(self.arm.fill([0.0], [0.0], label=text, **look)[0]))
             else:
-                self.fans.append(self._line(self.arm, color=_style.bound(), linewidth=0.8, label=text))
+                self.fans.append(
+                    self._line(self.arm, color=_style.bound(), linewidth=0.8, label=text)
+                )
 
     def _add_arms(self, curves: Sequence[Curve]) -> None:
-        self.arm.plot(*self.world.ghost[:, -1].T, **(_style.reference() | {"linewidth": 0.8, "color": _style.shade(0.533)}))
-        look: dict[str, Any] = {"color": _style.shade(0.4), "linewidth": 1.6, "marker": "o", "markersize": 4}
+        self.arm.plot(
+            *self.world.ghost[:, -1].T,
+            **(_style.reference() | {"linewidth": 0.8, "color": _style.shade(0.533)}),
+        )
+        look: dict[str, Any] = {
+            "color": _style.shade(0.4),
+            "linewidth": 1.6,
+            "marker": "o",
+            "markersize": 4,
+        }
         look["markerfacecolor"] = _style.paper()
         self.ghost = self._line(self.arm, label="reference", **look)
-        self.trails = [self._line(self.arm, color=_style.series(i)["color"], linewidth=0.9) for i in range(len(curves))]
+        self.trails = [
+            self._line(self.arm, color=_style.series(i)["color"], linewidth=0.9)
+            for i in range(len(curves))
+        ]
         look = {"linewidth": 2.6, "marker": "o", "markersize": 5}
-        self.arms = [self._line(self.arm, label=curve.name or "arm", **look, **_style.series(i)) for i, curve in enumerate(curves)]
+        self.arms = [
+            self._line(self.arm, label=curve.name or "arm", **look, **_style.series(i))
+            for i, curve in enumerate(curves)
+        ]
 
     def _add_bars(self, curves: Sequence[Curve]) -> None:
         rows = np.arange(self.world.q_d.shape[1])
-        shown = np.concatenate([x[np.isfinite(x)] for x in (self.world.lower, self.world.upper, self.world.q_d)])
+        shown = np.concatenate(
+            [x[np.isfinite(x)] for x in (self.world.lower, self.world.upper, self.world.q_d)]
+        )
         room = 0.15 * float(np.ptp(shown))
         self.bars.set(
-            xlim=(shown.min() - room, shown.max() + room), ylim=(len(rows) - 0.4, -0.6), xlabel=_style.label("position $q$", "rad")
+            xlim=(shown.min() - room, shown.max() + room),
+            ylim=(len(rows) - 0.4, -0.6),
+            xlabel=_style.label("position $q$", "rad"),
         )
         self.bars.set_yticks(rows, called(curves[0].run.scenario.plant, len(rows)))
         self.bars.spines["left"].set_visible(False)
         self.bars.tick_params(axis="y", length=0)
         width = max(4.0, min(18.0, 90.0 / len(rows)))
-        self.ranges = [self._line(self.bars, color=_style.shade(0.149), linewidth=width, solid_capstyle="butt") for _ in rows]
-        look: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": width + 3, "markeredgewidth": 1.6}
+        self.ranges = [
+            self._line(self.bars, color=_style.shade(0.149), linewidth=width, solid_capstyle="butt")
+            for _ in rows
+        ]
+        look: dict[str, Any] = {
+            "linestyle": "none",
+            "marker": "|",
+            "markersize": width + 3,
+            "markeredgewidth": 1.6,
+        }
         self.wanted = self._line(self.bars, color=_style.ink(), **look)
         for i in range(len(curves)):
-            look = {"linestyle": "none", "marker": "oDs^v"[i % 5], "markersize": max(3.0, min(5.5, width / len(curves)))}
+            look = {
+                "linestyle": "none",
+                "marker": "oDs^v"[i % 5],
+                "markersize": max(3.0, min(5.5, width / len(curves))),
+            }
             self.dots.append(self._line(self.bars, color=_style.series(i)["color"], **look))
 
     def move_to(self, frame: int) -> list[tuple[Any, Artist]]:
-        """Moves every part to where it is in this frame; returns (axes, part) in the order of drawing."""
+        """Moves every part to where it is in this frame; returns (axes, part) in the order of
+        drawing.
+        """
         world = self.world
         rows = np.arange(world.q_d.shape[1])
         for joint, fan in enumerate(self.fans):
             outline = world.fans[frame, joint]
             fan.set_xy(outline) if outline.shape[-1] == 2 else _move(fan, outline)
-            self.ranges[joint].set_data([world.lower[frame, joint], world.upper[frame, joint]], [joint, joint])
+            self.ranges[joint].set_data(
+                [world.lower[frame, joint], world.upper[frame, joint]], [joint, joint]
+            )
         _move(self.ghost, world.ghost[frame])
         self.wanted.set_data(world.q_d[frame], rows)
         shifts = 0.14 * (np.arange(len(self.motions)) - 0.5 * (len(self.motions) - 1))
-        for motion, arm, trail, dots, shift in zip(self.motions, self.arms, self.trails, self.dots, shifts, strict=True):
+        for motion, arm, trail, dots, shift in zip(
+            self.motions, self.arms, self.trails, self.dots, shifts, strict=True
+        ):
             _move(arm, motion.skeleton[frame])
             _move(trail, motion.skeleton[: frame + 1, -1])
             dots.set_data(np.clip(motion.q[frame], *self.bars.get_xlim()), rows + shift)

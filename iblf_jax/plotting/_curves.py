@@ -1,7 +1,9 @@
-"""What a figure draws: the runs that were given, on the host, checked, cut where they broke and thinned for drawing.
+"""What a figure draws: the runs that were given, on the host, checked, cut where they broke and
+thinned for drawing.
 
-A run whose state ran away was frozen there by the simulator; it is drawn up to that sample.  Lines are thinned so that no peak is
-lost: every piece of the time axis keeps its first, lowest and highest sample.
+A run whose state ran away was frozen there by the simulator; it is drawn up to that sample.  Lines
+are thinned so that no peak is lost: every piece of the time axis keeps its first, lowest and
+  highest sample.
 """
 
 from __future__ import annotations
@@ -27,12 +29,15 @@ DERIVED = {
     "error_upper": lambda run: np.asarray(run.upper) - np.asarray(run.q_d),
     "wall_lower": lambda run: -np.ones(run.q.shape),
     "wall_upper": lambda run: np.ones(run.q.shape),
-    "estimate_error": lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate),
+    "estimate_error": (
+        lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate)
+    ),
     "measured_q": lambda run: run.measured.q,
     "measured_dq": lambda run: run.measured.dq,
     "region_wall": lambda run: np.zeros(np.shape(run.region_margin)),
 }
-"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f - f_hat, what was measured, walls."""
+"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f -
+f_hat, what was measured, walls."""
 
 HELD = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
 """Signals of a sampled law that stay as they are from sample to sample."""
@@ -59,7 +64,8 @@ SAME = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One run as figures see it: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run was frozen before its end.
+    """One run as figures see it: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run
+    was frozen before its end.
 
     A signal that the run's scenario does not have is no number.
     """
@@ -72,7 +78,9 @@ class Curve:
 
     def __getitem__(self, field: str) -> np.ndarray:
         values = DERIVED[field](self.run) if field in DERIVED else getattr(self.run, field)
-        values = np.full(self.run.q.shape, np.nan) if isinstance(values, tuple) else np.asarray(values)
+        values = (
+            np.full(self.run.q.shape, np.nan) if isinstance(values, tuple) else np.asarray(values)
+        )
         return values if field in GIVEN else values[: self.samples]
 
     @property
@@ -81,14 +89,24 @@ class Curve:
         return self["t"]
 
     def at(self, field: str, t: np.ndarray) -> np.ndarray:
-        """A signal at other times t [s], linearly between its samples and constant after its end, (len(t), n)."""
+        """A signal at other times t [s], linearly between its samples and constant after its end,
+        (len(t), n).
+        """
         values = self[field]
-        return np.stack([np.interp(t, self.t[: len(values)], column) for column in values.T], axis=-1)
+        return np.stack(
+            [np.interp(t, self.t[: len(values)], column) for column in values.T], axis=-1
+        )
 
     def is_held(self, field: str) -> bool:
-        """Whether a signal goes in steps: the law is sampled, and no drive makes something else of its torque."""
+        """Whether a signal goes in steps: the law is sampled, and no drive makes something else of
+        its torque.
+        """
         scenario = self.run.scenario
-        return scenario.sampling is not None and field in HELD and (field != "tau" or isinstance(scenario.actuator, IdealActuator))
+        return (
+            scenario.sampling is not None
+            and field in HELD
+            and (field != "tau" or isinstance(scenario.actuator, IdealActuator))
+        )
 
     @property
     def is_measured(self) -> bool:
@@ -125,7 +143,9 @@ class Curve:
         return called(getattr(self.run.scenario, "plant", None), self.run.n)[joint]
 
     def break_index(self) -> int | None:
-        """The first sample at which the run was outside its bounds or regions, or its last one if it ran away; None if neither."""
+        """The first sample at which the run was outside its bounds or regions, or its last one if
+        it ran away; None if neither.
+        """
         lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
         inside = ((lower < self["q"]) & (self["q"] < upper)).all(axis=1)
         if self.has_regions:
@@ -137,12 +157,16 @@ class Curve:
 
 
 def called(robot: Any, n: int) -> list[str]:
-    """What the joints of a robot are called in a figure: as in the robot's file, if it has names."""
+    """What the joints of a robot are called in a figure: as in the robot's file, if it has
+    names.
+    """
     return [plain(name) for name in joint_names(robot, n)]
 
 
 def plain(name: str) -> str:
-    """A name from a file as it is: matplotlib takes $ for mathematics, and leaves what begins with _ out of legends."""
+    """A name from a file as it is: matplotlib takes $ for mathematics, and leaves what begins with
+    _ out of legends.
+    """
     return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
 
@@ -160,9 +184,19 @@ def _sound_samples(run: Rollout) -> int:
 def _checked(name: str, run: Any) -> Curve:
     called = f"runs[{name!r}]" if name else "run"
     if not isinstance(run, Rollout):
-        raise checks.fail(called, type(run).__name__, "a Rollout", "Draw what ij.simulate returns, or a dict of such runs.")
+        raise checks.fail(
+            called,
+            type(run).__name__,
+            "a Rollout",
+            "Draw what ij.simulate returns, or a dict of such runs.",
+        )
     if not checks.is_concrete(run):
-        raise checks.fail(called, "a run that is being traced", "one with numbers", "Draw outside of jit, vmap and grad.")
+        raise checks.fail(
+            called,
+            "a run that is being traced",
+            "one with numbers",
+            "Draw outside of jit, vmap and grad.",
+        )
     if run.is_batch:
         raise checks.fail(called, f"a batch of {len(run)} runs", "one run", "Select a run: run[0].")
     return Curve(name, run, _sound_samples(run))
@@ -172,10 +206,12 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
     """The runs to draw, in the order given.
 
     Args:
-      runs: one run, or a dict of such runs by name; they may differ in length and in what they recorded.
+      runs: one run, or a dict of such runs by name; they may differ in length and in what they
+        recorded.
 
     Raises:
-      ValueError: nothing to draw, a batch, something that is no Rollout, or runs of robots with different numbers of joints.
+      ValueError: nothing to draw, a batch, something that is no Rollout, or runs of robots with
+        different numbers of joints.
     """
     if not isinstance(runs, Mapping):
         return [_checked("", runs)]
@@ -184,12 +220,16 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
     curves = [_checked(str(name), run) for name, run in runs.items()]
     joints = {curve.name: curve.run.n for curve in curves}
     if len(set(joints.values())) > 1:
-        raise checks.fail("runs", joints, "runs with one number of joints", "Draw the robots one by one.")
+        raise checks.fail(
+            "runs", joints, "runs with one number of joints", "Draw the robots one by one."
+        )
     return curves
 
 
 def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> int:
-    """The index of a joint, given by its index or its name, if the robot has it; ValueError if not."""
+    """The index of a joint, given by its index or its name, if the robot has it; ValueError if
+    not.
+    """
     n = curves[0].run.n
     names = joint_names(getattr(curves[0].run.scenario, "plant", None), n)
     if isinstance(joint, str) and joint in names:
@@ -200,7 +240,9 @@ def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> in
 
 
 def distinct(curves: Sequence[Curve], fields: Sequence[str], joints: Sequence[int]) -> list[Curve]:
-    """The curves that can be told apart in these fields on the time they share, longest first; one, if all follow one reference."""
+    """The curves that can be told apart in these fields on the time they share, longest first; one,
+    if all follow one reference.
+    """
     kept: list[Curve] = []
     for curve in sorted(curves, key=lambda c: -float(c.t[-1])):
         if all(_differ(curve, other, fields, joints) for other in kept):
@@ -233,6 +275,8 @@ def thinned(t: np.ndarray, y: np.ndarray, points: int = POINTS) -> tuple[np.ndar
     pieces = np.nan_to_num(y[:whole], posinf=np.inf, neginf=-np.inf).reshape(-1, width)
     starts = np.arange(0, whole, width)
     rest = np.append(np.arange(whole, len(t)), len(t) - 1)
-    picked = np.concatenate([starts, starts + pieces.argmin(axis=1), starts + pieces.argmax(axis=1), rest])
+    picked = np.concatenate(
+        [starts, starts + pieces.argmin(axis=1), starts + pieces.argmax(axis=1), rest]
+    )
     index = np.unique(picked)
     return t[index], y[index]

@@ -1,4 +1,6 @@
-"""One run at a glance: every joint in its tube, then errors, phase portrait, torque, estimate and Lyapunov function."""
+"""One run at a glance: every joint in its tube, then errors, phase portrait, torque, estimate and
+Lyapunov function.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +38,10 @@ COLUMNS = 4
 def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     """One run at a glance, its status in the title: what `run.plot()` shows.
 
-    Position of every joint in its tube, and velocity where it has bounds or is measured; then, with the joints together, e1, xi and the
-    phase portrait of the first two joints; torque, uncertain term with estimate, and Lyapunov function; where there are regions, the
-    distances to their walls and the path of the tip.
+    Position of every joint in its tube, and velocity where it has bounds or is measured; then, with
+    the joints together, e1, xi and the phase portrait of the first two joints; torque, uncertain
+    term with estimate, and Lyapunov function; where there are regions, the distances to their walls
+    and the path of the tip.
 
     Args:
       run: one run of n joints.
@@ -51,7 +54,12 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
       ValueError: a batch, something that is no Rollout, or a title that is no text.
     """
     if not isinstance(run, Rollout):
-        raise checks.fail("run", type(run).__name__, "a Rollout", "To compare several, use plotting.joint and the other figures.")
+        raise checks.fail(
+            "run",
+            type(run).__name__,
+            "a Rollout",
+            "To compare several, use plotting.joint and the other figures.",
+        )
     checks.word("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
@@ -70,7 +78,9 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     return figure
 
 
-def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, quantity: Plotted, whole: Window) -> None:
+def _tubes(
+    figure: Figure, where: SubplotSpec, curve: Curve, quantity: Plotted, whole: Window
+) -> None:
     """Position, or velocity, of every joint in its tube."""
     rows = _style.spread(figure, curve.run.n, COLUMNS, where)
     for joint, axes in enumerate(axes for row in rows for axes in row):
@@ -86,7 +96,12 @@ def _tubes(figure: Figure, where: SubplotSpec, curve: Curve, quantity: Plotted, 
 def _together(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
     """The panels that show all joints together."""
     grid = where.subgridspec(2, 3)
-    places: dict[str, Any] = {"e1": grid[0, 0], "xi": grid[0, 1], "tau": grid[1, 0], "disturbance_estimate": grid[1, 1]}
+    places: dict[str, Any] = {
+        "e1": grid[0, 0],
+        "xi": grid[0, 1],
+        "tau": grid[1, 0],
+        "disturbance_estimate": grid[1, 1],
+    }
     for field, place in places.items():
         _joints(figure.add_subplot(place), curve, QUANTITIES[field], whole)
     if curve.run.n > 1:
@@ -107,8 +122,22 @@ def _joints(axes: Axes, curve: Curve, quantity: Plotted, whole: Window) -> None:
     for joint in range(curve.run.n):
         look = _style.series(joint)
         if quantity.truth:
-            drawn.append(draw(axes, curve, quantity.truth, joint, whole, color=look["color"], linewidth=4.0, alpha=0.3, label="_"))
-        drawn.append(draw(axes, curve, quantity.field, joint, whole, label=curve.called(joint), **look))
+            drawn.append(
+                draw(
+                    axes,
+                    curve,
+                    quantity.truth,
+                    joint,
+                    whole,
+                    color=look["color"],
+                    linewidth=4.0,
+                    alpha=0.3,
+                    label="_",
+                )
+            )
+        drawn.append(
+            draw(axes, curve, quantity.field, joint, whole, label=curve.called(joint), **look)
+        )
     axes.set_xlim(*whole)
     set_limits(axes, [curve] * len(drawn), drawn, frame, spikes=quantity.unit == "N m")
     say_what_is_cut(axes, [curve] * len(drawn), drawn, quantity.unit)
@@ -119,10 +148,17 @@ def _joints(axes: Axes, curve: Curve, quantity: Plotted, whole: Window) -> None:
 def _regions(figure: Figure, where: SubplotSpec, curve: Curve, whole: Window) -> None:
     """The distances to the walls of the regions, and the path of the tip between them."""
     grid = where.subgridspec(1, 2, width_ratios=(1.5, 1))
-    axes, quantity, scenario = figure.add_subplot(grid[0]), QUANTITIES["region_margin"], curve.run.scenario
+    axes, quantity, scenario = (
+        figure.add_subplot(grid[0]),
+        QUANTITIES["region_margin"],
+        curve.run.scenario,
+    )
     for i in range(len(scenario.regions)):
         draw(axes, curve, quantity.field, i, whole, **(_style.series(i) | {"label": "_"}))
-    names = [plain(f"{i}: {in_words(region, scenario.plant)}") for i, region in enumerate(scenario.regions)]
+    names = [
+        plain(f"{i}: {in_words(region, scenario.plant)}")
+        for i, region in enumerate(scenario.regions)
+    ]
     axes.legend(axes.get_lines(), names, title="regions")
     axes.axhline(0.0, color=_style.alarm(), linewidth=1.0)
     axes.set_xlim(*whole)

@@ -1,4 +1,6 @@
-"""Figures of a Monte-Carlo study: the tube with quantile bands, histograms by verdict, margin against each drawn parameter."""
+"""Figures of a Monte-Carlo study: the tube with quantile bands, histograms by verdict, margin
+against each drawn parameter.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,10 @@ def _check(study: Study) -> None:
 def _verdict(study: Study) -> str:
     outside = study.status_counts["STARTED_OUTSIDE"]
     apart = f", {outside} of them because they started outside" if outside else ""
-    return f"{study.runs} runs, {len(study.failed)} failed; bound violated or run away: {study.violation_probability}{apart}"
+    return (
+        f"{study.runs} runs, {len(study.failed)} failed; bound violated or run away:"
+        f" {study.violation_probability}{apart}"
+    )
 
 
 def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
@@ -46,12 +51,19 @@ def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 @_style.styled()
-def bands(study: Study, *, quantiles: Sequence[float] = (0.05, 0.5, 0.95), runs: int = 1024, exclude_failed: bool = False) -> Figure:
+def bands(
+    study: Study,
+    *,
+    quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+    runs: int = 1024,
+    exclude_failed: bool = False,
+) -> Figure:
     """The tube of every joint with the quantiles of the runs' positions along time.
 
     Args:
       study: of n joints.
-      quantiles: an odd number of levels in [0, 1]; the middle one is drawn as a line, the others as bands around it.
+      quantiles: an odd number of levels in [0, 1]; the middle one is drawn as a line, the others as
+        bands around it.
       runs: from how many of the runs, which are made again.
       exclude_failed: leave out failed runs; the title says how many.
 
@@ -73,7 +85,11 @@ def bands(study: Study, *, quantiles: Sequence[float] = (0.05, 0.5, 0.95), runs:
 
 def _bands_title(data: xarray.Dataset) -> str:
     left_out = f", {data.attrs['excluded']} left out" if data.attrs["excluded"] else ""
-    failed = f", {data.attrs['failed_included']} failed ones among them" if data.attrs["failed_included"] else ""
+    failed = (
+        f", {data.attrs['failed_included']} failed ones among them"
+        if data.attrs["failed_included"]
+        else ""
+    )
     return f"Quantiles of {data.attrs['runs']} runs{failed}{left_out}"
 
 
@@ -87,7 +103,9 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
     for k in range(len(levels) // 2):
         low, high = order[k], order[-1 - k]
         words = f"{100 * levels[low]:g} to {100 * levels[high]:g} %"
-        axes.fill_between(t, q[low], q[high], color=_style.colour(0), alpha=0.25, linewidth=0, label=words)
+        axes.fill_between(
+            t, q[low], q[high], color=_style.colour(0), alpha=0.25, linewidth=0, label=words
+        )
         axes.plot(t, q[low], color=_style.colour(0), linewidth=0.6, label="_")
         axes.plot(t, q[high], color=_style.colour(0), linewidth=0.6, label="_")
     if len(levels) % 2:
@@ -118,10 +136,18 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
       ValueError: not a study, or an unknown metric.
     """
     _check(study)
-    names = list(study.metrics) if metrics is None else checks.listed("metrics", metrics, '["margin", "rmse"]')
+    names = (
+        list(study.metrics)
+        if metrics is None
+        else checks.listed("metrics", metrics, '["margin", "rmse"]')
+    )
     values = {name: statistics.one_number(study.metrics, name) for name in names}
     if metrics is None:
-        values = {name: x for name, x in values.items() if np.isfinite(x).any() and np.ptp(x[np.isfinite(x)]) > 0}
+        values = {
+            name: x
+            for name, x in values.items()
+            if np.isfinite(x).any() and np.ptp(x[np.isfinite(x)]) > 0
+        }
     if not values:
         raise checks.fail("metrics", names, "at least one metric with values that differ")
     figure, panels = _grid(len(values), 2.0)
@@ -157,7 +183,8 @@ def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: in
 
 @_style.styled()
 def scatter(study: Study, metric: str = "margin") -> Figure:
-    """A metric (its worst joint) of every run against each drawn parameter, with the rank correlation.
+    """A metric (its worst joint) of every run against each drawn parameter, with the rank
+    correlation.
 
     Args:
       study: the study.
@@ -187,20 +214,27 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
     good = np.flatnonzero(some & ~failed)
     good = good[:: max(1, len(good) // MOST_POINTS)]
     bad = np.flatnonzero(some & failed)[:MOST_POINTS]
-    axes.scatter(x[good], y[good], s=4, alpha=0.5, linewidths=0, label="not failed", color=_style.colour(0))
-    axes.scatter(x[bad], y[bad], s=9, marker="x", linewidths=0.8, label="failed", color=_style.colour(1))
+    axes.scatter(
+        x[good], y[good], s=4, alpha=0.5, linewidths=0, label="not failed", color=_style.colour(0)
+    )
+    axes.scatter(
+        x[bad], y[bad], s=9, marker="x", linewidths=0.8, label="failed", color=_style.colour(1)
+    )
     if metric in ("margin", "xi_margin"):
         axes.axhline(0.0, color=_style.bound(), linewidth=1.0)
     rho, _ = statistics.rank_correlation(x[some], y[some])
     axes.set_title("" if np.isnan(rho) else f"rank correlation {rho:.2f}")
     axes.locator_params(axis="x", nbins=4)
     axes.set_xlabel(_style.label(plain(path), study.parameter_unit(path)))
-    axes.set_ylabel(_style.label(f"worst {metric.replace('_', ' ')}", study.metrics.units.get(metric, "1")))
+    axes.set_ylabel(
+        _style.label(f"worst {metric.replace('_', ' ')}", study.metrics.units.get(metric, "1"))
+    )
 
 
 @_style.styled()
 def study_overview(study: Study, *, runs: int = 512) -> Figure:
-    """A study at a glance: the tube with bands, the margins by verdict, the margin against each parameter.
+    """A study at a glance: the tube with bands, the margins by verdict, the margin against each
+    parameter.
 
     Args:
       study: of n joints.

@@ -1,4 +1,6 @@
-"""Figures of a sweep: heat maps over two of its dimensions, and parallel coordinates over all of its parameters."""
+"""Figures of a sweep: heat maps over two of its dimensions, and parallel coordinates over all of
+its parameters.
+"""
 
 from __future__ import annotations
 
@@ -28,20 +30,32 @@ COLOURS = "viridis"
 
 
 def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
-    """One number a point, and what it is: the median over runs of the worst joint's metric, or the share of failed runs."""
+    """One number a point, and what it is: the median over runs of the worst joint's metric, or the
+    share of failed runs.
+    """
     if "config" not in getattr(data, "attrs", {}):
-        raise checks.fail("data", type(data).__name__, "the Dataset of a sweep", "ij.sweep and ij.load_sweep return one.")
+        raise checks.fail(
+            "data",
+            type(data).__name__,
+            "the Dataset of a sweep",
+            "ij.sweep and ij.load_sweep return one.",
+        )
     if metric in SHARES:
         flags, words = SHARES[metric]
         raised = ((data.status & flags) != 0).astype(float).where(data.status >= 0)
         return (raised.mean("run") if "run" in raised.dims else raised), words
     if metric not in data.data_vars:
-        raise checks.fail("metric", metric, "one of " + ", ".join([*SHARES, *map(str, data.data_vars)]))
+        raise checks.fail(
+            "metric", metric, "one of " + ", ".join([*SHARES, *map(str, data.data_vars)])
+        )
     values, words = data[metric], metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
     if "joint" in values.dims:
         smaller = metric in SMALLER_IS_WORSE
-        values, words = (values.min("joint") if smaller else values.max("joint")), f"{words} of the worst joint"
+        values, words = (
+            (values.min("joint") if smaller else values.max("joint")),
+            f"{words} of the worst joint",
+        )
     if "run" in values.dims:
         values, words = values.median("run"), f"median {words}"
     return values, f"{words} [{unit}]"
@@ -54,22 +68,30 @@ def _axis_label(data: xarray.Dataset, name: str) -> str:
 
 @_style.styled()
 def heat_map(
-    data: xarray.Dataset, metric: str | Sequence[str] = "failed", *, x: str | None = None, y: str | None = None, **at: Any
+    data: xarray.Dataset,
+    metric: str | Sequence[str] = "failed",
+    *,
+    x: str | None = None,
+    y: str | None = None,
+    **at: Any,
 ) -> Figure:
     """A number at every point over two dimensions of a grid; several numbers side by side.
 
     Args:
       data: the Dataset of a sweep.
-      metric: name of a metric (the median over the runs, of the worst joint), "failed" for the share of runs that failed, or "violated" for
-        that of those that left a bound; or several of them.
+      metric: name of a metric (the median over the runs, of the worst joint), "failed" for the
+        share of runs that failed, or "violated" for that of those that left a bound; or several of
+        them.
       x, y: dimensions of the axes; the first two if not given.
-      at: for further dimensions, which value to show (`sel`, nearest), given as a dict: `heat_map(data, **{"observer.kf": 20})`.
+      at: for further dimensions, which value to show (`sel`, nearest), given as a dict:
+        `heat_map(data, **{"observer.kf": 20})`.
 
     Returns:
       The figure, with the numbers in its cells if there are few.
 
     Raises:
-      ValueError: no Dataset of a sweep, an unknown metric or dimension, or a dimension that is neither shown nor fixed.
+      ValueError: no Dataset of a sweep, an unknown metric or dimension, or a dimension that is
+        neither shown nor fixed.
     """
     metrics = [metric] if isinstance(metric, str) else list(metric)
     if not metrics:
@@ -80,7 +102,15 @@ def heat_map(
     return figure
 
 
-def _heat(figure: Figure, axes: Any, data: xarray.Dataset, metric: str, x: str | None, y: str | None, at: dict[str, Any]) -> None:
+def _heat(
+    figure: Figure,
+    axes: Any,
+    data: xarray.Dataset,
+    metric: str,
+    x: str | None,
+    y: str | None,
+    at: dict[str, Any],
+) -> None:
     """One panel of a heat map."""
     values, words = summary(data, metric)
     for name, value in at.items():
@@ -91,7 +121,12 @@ def _heat(figure: Figure, axes: Any, data: xarray.Dataset, metric: str, x: str |
     x = x if x is not None else (dims[0] if dims else "")
     y = y if y is not None else next((d for d in dims if d != x), "")
     if len(dims) != 2 or {x, y} != set(dims):
-        raise checks.fail("x, y", (x, y), f"two dimensions of {dims}", "Fix the others, heat_map(data, ..., **{'observer.kf': 20.0}).")
+        raise checks.fail(
+            "x, y",
+            (x, y),
+            f"two dimensions of {dims}",
+            "Fix the others, heat_map(data, ..., **{'observer.kf': 20.0}).",
+        )
     picture = values.transpose(y, x).values
     image = axes.imshow(picture, origin="lower", aspect="auto", cmap=_style.colour_map(COLOURS))
     axes.grid(visible=False)
@@ -113,12 +148,21 @@ def _write_numbers(axes: Any, picture: np.ndarray, image: Any) -> None:
     for (row, column), value in np.ndenumerate(picture):
         behind = image.cmap(image.norm(value))[:3] if np.isfinite(value) else _style.paper()
         colour = "black" if _style.is_light(behind) else "white"
-        axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=colour, fontsize=_style.size(7.5))
+        axes.text(
+            column,
+            row,
+            f"{value:.3g}",
+            ha="center",
+            va="center",
+            color=colour,
+            fontsize=_style.size(7.5),
+        )
 
 
 @_style.styled()
 def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
-    """Parallel coordinates: one line a point through the values of all swept parameters, coloured by a metric.
+    """Parallel coordinates: one line a point through the values of all swept parameters, coloured
+    by a metric.
 
     Args:
       data: the Dataset of a sweep.
@@ -149,7 +193,9 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     axes.set_yticks([])
     for place, (bottom, top) in enumerate(zip(low, high, strict=True)):
         for value, height, side in ((bottom, -0.02, "top"), (top, 1.02, "bottom")):
-            axes.text(place, height, f"{value:.4g}", ha="center", va=side, fontsize=_style.size(7.5))
+            axes.text(
+                place, height, f"{value:.4g}", ha="center", va=side, fontsize=_style.size(7.5)
+            )
     axes.set_ylim(-0.1, 1.1)
     figure.colorbar(mapper, ax=axes, label=words)
     return figure

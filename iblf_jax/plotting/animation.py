@@ -1,7 +1,9 @@
-"""The arm in motion, as a GIF or as a web page with controls: its joint limits, its reference as a ghost, its tip's path.
+"""The arm in motion, as a GIF or as a web page with controls: its joint limits, its reference as a
+ghost, its tip's path.
 
-What stands still is drawn once; each frame moves and draws only what moves, which makes 20 s of motion a matter of seconds.
-A run longer than `LONGEST_FILM` plays faster than it was, unless the caller names a speed.
+What stands still is drawn once; each frame moves and draws only what moves, which makes 20 s of
+motion a matter of seconds. A run longer than `LONGEST_FILM` plays faster than it was, unless the
+caller names a speed.
 """
 
 from __future__ import annotations
@@ -39,13 +41,15 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
       runs: one run, or a dict of runs by name.
       path: where to; its ending, ".gif" or ".html", decides.
       fps: frames a second of the animation, up to 50.
-      speed: how many times faster than the run it plays; 1 if not given, more for runs longer than 10 s.
+      speed: how many times faster than the run it plays; 1 if not given, more for runs longer than
+        10 s.
 
     Returns:
       The path of the file.
 
     Raises:
-      ValueError: another ending, no run, a batch, robots that do not fit together, or fps or speed out of range.
+      ValueError: another ending, no run, a batch, robots that do not fit together, or fps or speed
+        out of range.
     """
     curves, path = curves_of(runs), film_path(path)
     fps = checks.positive_number("fps", fps, "1/s")
@@ -75,10 +79,19 @@ def write_film(pictures: list[Image.Image], path: Path, fps: float) -> Path:
 
 def frame_times(end: float, fps: float, speed: float | None = None) -> np.ndarray:
     """The times of the frames of a run that ends then [s], from 0 on, (F,) [s]."""
-    speed = max(1.0, end / LONGEST_FILM) if speed is None else checks.positive_number("speed", speed, "1")
+    speed = (
+        max(1.0, end / LONGEST_FILM)
+        if speed is None
+        else checks.positive_number("speed", speed, "1")
+    )
     frames = end / speed * fps
     if not frames <= MOST_FRAMES:
-        raise checks.fail("speed", speed, f"one at which the run has at most {MOST_FRAMES} frames", f"It would have {frames:.3g}.")
+        raise checks.fail(
+            "speed",
+            speed,
+            f"one at which the run has at most {MOST_FRAMES} frames",
+            f"It would have {frames:.3g}.",
+        )
     return np.linspace(0.0, end, max(2, round(frames) + 1))
 
 
@@ -98,7 +111,9 @@ def _pictures(scene: Scene) -> Iterator[Image.Image]:
 
 
 def _with_one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
-    """The pictures in 96 colours, the same for all, taken from the last one, in which every colour occurs."""
+    """The pictures in 96 colours, the same for all, taken from the last one, in which every colour
+    occurs.
+    """
     palette = pictures[-1].quantize(96, method=Image.Quantize.MAXCOVERAGE)
     return [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
 
@@ -106,7 +121,9 @@ def _with_one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
 def _write_gif(pictures: list[Image.Image], path: Path, fps: float) -> None:
     """Writes a GIF that repeats."""
     first, *rest = pictures
-    first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=False)
+    first.save(
+        path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=False
+    )
 
 
 class _Screen(Figure):

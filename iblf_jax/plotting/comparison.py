@@ -1,7 +1,9 @@
-"""The figure of a comparison: error, torque and settling time of every law, at the gains given and at equal effort, side by side.
+"""The figure of a comparison: error, torque and settling time of every law, at the gains given and
+at equal effort, side by side.
 
-The error is drawn on a logarithmic scale, where an exponential decay is a straight line and its rate a slope; the torque during a tenth
-of that time, because its transient, 1/K2 against 1/k1, is so much shorter.
+The error is drawn on a logarithmic scale, where an exponential decay is a straight line and its
+rate a slope; the torque during a tenth of that time, because its transient, 1/K2 against 1/k1, is
+so much shorter.
 """
 
 from __future__ import annotations
@@ -31,9 +33,11 @@ TORQUE_SHARE = 0.1
 
 @_style.styled()
 def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None) -> Figure:
-    """Error |e1| and torque of one joint during the transient, and every law's settling time (worst joint).
+    """Error |e1| and torque of one joint during the transient, and every law's settling time (worst
+    joint).
 
-    One column at the gains given and, if factors were sought, one at equal effort; a law has the same colour in both.
+    One column at the gains given and, if factors were sought, one at equal effort; a law has the
+    same colour in both.
 
     Args:
       result: what `iblf_jax.compare` returned.
@@ -47,16 +51,22 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
       ValueError: not a comparison, no such joint, or a zoom that is no time.
     """
     if not hasattr(result, "equal_effort") or not hasattr(result, "rollouts"):
-        raise checks.fail("result", type(result).__name__, "a Comparison", "Draw what ij.compare returns.")
+        raise checks.fail(
+            "result", type(result).__name__, "a Comparison", "Draw what ij.compare returns."
+        )
     given = curves_of(result.rollouts)
     joint = check_joint(given, joint)
-    error, torque = (PanelRow(QUANTITIES[field], joint, QUANTITIES[field].label) for field in ("e1", "tau"))
+    error, torque = (
+        PanelRow(QUANTITIES[field], joint, QUANTITIES[field].label) for field in ("e1", "tau")
+    )
     start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:
         columns["equal effort (RMS torque above gravity)"] = curves_of(result.equal_effort)
     figure = _style.new_figure(_style.WIDTH, 6.6)
-    table = figure.subplots(3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0))
+    table = figure.subplots(
+        3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0)
+    )
     order = list(result.rollouts)
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
@@ -73,7 +83,11 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
 
 
 def _look(curve: Curve, order: list[str]) -> dict[str, Any]:
-    return {"label": curve.name} | _style.series(order.index(curve.name)) | (_style.FAINT if curve.failed else {})
+    return (
+        {"label": curve.name}
+        | _style.series(order.index(curve.name))
+        | (_style.FAINT if curve.failed else {})
+    )
 
 
 def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, window: Window) -> None:
@@ -85,7 +99,9 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
         t, shown = thinned(curve.t[: len(size)][near], np.maximum(size[near], SMALLEST))
         axes.semilogy(t, shown, **_look(curve, order))
         start = max(start, size[0])
-    axes.axhline(float(Settling().tolerance), color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
+    axes.axhline(
+        float(Settling().tolerance), color=_style.bound(), linewidth=0.8, zorder=1, label="settled"
+    )
     axes.set_xlim(*window)
     axes.set_ylim(SMALLEST, 3.0 * max(start, 10.0 * SMALLEST))
     axes.set_xlabel(_style.label("time $t$", "s"))
@@ -99,16 +115,33 @@ def _torques(axes: Axes, curves: list[Curve], order: list[str], joint: int, wind
 
 
 def _settling(axes: Axes, curves: list[Curve], order: list[str]) -> None:
-    """A bar a law, at the same place in both columns; what never settled, or has no factor, has none and says so."""
-    found = {curve.name: float(np.max(np.asarray(curve.run.metrics.settling_time))) for curve in curves}
+    """A bar a law, at the same place in both columns; what never settled, or has no factor, has
+    none and says so.
+    """
+    found = {
+        curve.name: float(np.max(np.asarray(curve.run.metrics.settling_time))) for curve in curves
+    }
     for i, name in enumerate(order):
         if name in found and np.isfinite(found[name]):
             axes.bar(i, found[name], color=_style.series(i)["color"], width=0.7)
         else:
             words = "never" if name in found else "no factor"
             axes.annotate(
-                words, (i, 0.0), xytext=(0, 3), textcoords="offset points", rotation=90, ha="center", va="bottom", fontsize=_style.size(7)
+                words,
+                (i, 0.0),
+                xytext=(0, 3),
+                textcoords="offset points",
+                rotation=90,
+                ha="center",
+                va="bottom",
+                fontsize=_style.size(7),
             )
     axes.set_xlim(-0.6, len(order) - 0.4)
-    axes.set_xticks(range(len(order)), [name.replace("_", " ") for name in order], rotation=40, ha="right", fontsize=_style.size(7))
+    axes.set_xticks(
+        range(len(order)),
+        [name.replace("_", " ") for name in order],
+        rotation=40,
+        ha="right",
+        fontsize=_style.size(7),
+    )
     axes.grid(axis="x", visible=False)

@@ -1,4 +1,6 @@
-"""Scenarios that are ready to run, each with its source.  `PRESETS` names them for the command line."""
+"""Scenarios that are ready to run, each with its source.  `PRESETS` names them for the command
+line.
+"""
 
 from __future__ import annotations
 
@@ -27,21 +29,25 @@ from iblf_jax.world.robots import TwoLink
 def customary_two_link() -> TwoLink:
     """The two-link arm of this literature.
 
-    The paper prints no parameters and refers to others; these are the customary ones and an ASSUMPTION of this package:
-    m = (2, 0.85) kg, l = (0.35, 0.31) m, lc = l/2, I = m l^2/4, g = 9.81 m/s^2.
+    The paper prints no parameters and refers to others; these are the customary ones and an
+    ASSUMPTION of this package: m = (2, 0.85) kg, l = (0.35, 0.31) m, lc = l/2, I = m l^2/4, g =
+      9.81 m/s^2.
     """
     mass, length = np.array([2.0, 0.85]), np.array([0.35, 0.31])
     return TwoLink(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
 
 
 def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 1) -> Scenario:
-    """The paper's simulation, section 4.                                                                 (4.1)-(4.3)
+    """The paper's simulation, section 4.
+    (4.1)-(4.3)
 
     Args:
-      law: "integral" (the paper's), "log" (its comparison), or any other of `LAWS`: the systems that the paper names, at the same gains
-        k1, K2 and o, and the yardsticks "computed_torque" and "pd" at their own.  "backstepping" is the unconstrained one;
-        "adaptive_rbf" and "pd" run without an observer.  Of `controllers.KEEPERS` those that need no bounds on velocities.
-      reading: "printed", or "corrected" (law with C0 alpha, observer in momentum form), for which Theorem 2 is exact.
+      law: "integral" (the paper's), "log" (its comparison), or any other of `LAWS`: the systems
+        that the paper names, at the same gains k1, K2 and o, and the yardsticks "computed_torque"
+        and "pd" at their own.  "backstepping" is the unconstrained one; "adaptive_rbf" and "pd" run
+        without an observer.  Of `controllers.KEEPERS` those that need no bounds on velocities.
+      reading: "printed", or "corrected" (law with C0 alpha, observer in momentum form), for which
+        Theorem 2 is exact.
       p: exponent of the logarithmic barrier.
 
     Returns:
@@ -50,14 +56,17 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
     Raises:
       ValueError: an unknown law or reading.
 
-    Source: Zhang & Yan 2024, section 4; the arm's parameters are an assumption, see `customary_two_link`.
+    Source: Zhang & Yan 2024, section 4; the arm's parameters are an assumption, see
+      `customary_two_link`.
     """
     checks.one_of("reading", reading, ("printed", "corrected"))
     controller = law_by_name(law, k1=2.0, K2=20.0, o=0.1, reading=reading, p=p)
     cosine = math.pi / 2
     return Scenario(
         plant=customary_two_link(),
-        reference=references.Sinusoid(offset=0.5, amplitude=0.14, frequency=1.0, phase=[0.0, cosine]),
+        reference=references.Sinusoid(
+            offset=0.5, amplitude=0.14, frequency=1.0, phase=[0.0, cosine]
+        ),
         bounds=bounds_.Bounds(
             lower=bounds_.Sinusoid(offset=0.2, amplitude=0.14, frequency=1.0, phase=[cosine, 0.0]),
             upper=bounds_.Sinusoid(offset=0.9, amplitude=0.14, frequency=1.0, phase=[cosine, 0.0]),
@@ -77,11 +86,13 @@ def zhang_yan_2024(*, law: str = "integral", reading: str = "printed", p: int = 
 
 
 def printed_gap(*, reading: str = "printed") -> Scenario:
-    """A start at which the law as printed breaks its own inequality, and the corrected one keeps it.                (3.18), (3.20)
+    """A start at which the law as printed breaks its own inequality, and the corrected one keeps
+    it.                (3.18), (3.20)
 
-    The paper's arm, reference and bounds without disturbance, so that V2 should fall at once.  The gains are inside (3.17) and (3.25),
-    near their lower limits; the joints move fast, 4 rad/s.  There the terms that the printed proof drops outweigh what it leaves, and
-    V2 grows.  Found by `certificates.counterexample` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded;
+    The paper's arm, reference and bounds without disturbance, so that V2 should fall at once.  The
+    gains are inside (3.17) and (3.25), near their lower limits; the joints move fast, 4 rad/s.
+    There the terms that the printed proof drops outweigh what it leaves, and V2 grows.  Found by
+    `certificates.counterexample` with |dq| <= 4 rad/s, K2 >= 0.6, 1.1 <= kf <= 40, and rounded;
     f_hat(0) = (-0.5, 1.4) N m.
 
     Args:
@@ -108,13 +119,19 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
 
 
 def zhang_yan_2024_saturated(
-    *, law: str = "integral", reading: str = "corrected", limit: float | tuple[float, ...] = (7.2, 1.5), edge: str = "hard"
+    *,
+    law: str = "integral",
+    reading: str = "corrected",
+    limit: float | tuple[float, ...] = (7.2, 1.5),
+    edge: str = "hard",
 ) -> Scenario:
-    """The paper's simulation with a torque limit below the peak that the law asks for (13.8, 16.3 N m).
+    """The paper's simulation with a torque limit below the peak that the law asks for (13.8, 16.3 N
+    m).
 
-    The limit is above what gravity and the motion need: the bounds are kept, the error converges as before and the estimate is as
-    good.  But while the torque is cut, at the start, the inequality of Theorem 2 fails and the envelope (3.28) claims nothing.
-    Below gravity, at (6, 2) N m, the arm falls through its bound.
+    The limit is above what gravity and the motion need: the bounds are kept, the error converges as
+      before and the estimate is as
+    good.  But while the torque is cut, at the start, the inequality of Theorem 2 fails and the
+    envelope (3.28) claims nothing. Below gravity, at (6, 2) N m, the arm falls through its bound.
 
     Args:
       law, reading: as `zhang_yan_2024`.
@@ -127,15 +144,21 @@ def zhang_yan_2024_saturated(
     Source: this package; the paper leaves saturation to future work.
     """
     scenario = zhang_yan_2024(law=law, reading=reading)
-    return dataclasses.replace(scenario, controller=Saturated(law=scenario.controller, limit=limit, edge=edge))
+    return dataclasses.replace(
+        scenario, controller=Saturated(law=scenario.controller, limit=limit, edge=edge)
+    )
 
 
-def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str = "corrected") -> Scenario:
-    """The paper's arm, reference and disturbance with prescribed performance: funnels inside the paper's bounds.
+def zhang_yan_2024_funnel(
+    *, law: str = "prescribed_performance", reading: str = "corrected"
+) -> Scenario:
+    """The paper's arm, reference and disturbance with prescribed performance: funnels inside the
+    paper's bounds.
 
         q_d - r_l(t) < q < q_d + r_u(t),   r(t) = (r0 - 0.05) exp(-2 t) + 0.05
 
-    with r0 = (0.5, 0.25) rad above and (0.15, 0.4) rad below: from 1 s on the error must be within 0.12 rad, in the end within 0.05 rad.
+    with r0 = (0.5, 0.25) rad above and (0.15, 0.4) rad below: from 1 s on the error must be within
+    0.12 rad, in the end within 0.05 rad.
 
     Args:
       law, reading: as `zhang_yan_2024`.
@@ -143,7 +166,8 @@ def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str =
     Raises:
       ValueError: an unknown law or reading.
 
-    Source: Zhang & Yan 2024, section 4, with a funnel as in its references [10, 11]; the funnel's numbers are this package's.
+    Source: Zhang & Yan 2024, section 4, with a funnel as in its references [10, 11]; the funnel's
+      numbers are this package's.
     """
     scenario = zhang_yan_2024(law=law, reading=reading)
     lower = bounds_.Funnel(initial=[-0.15, -0.4], final=-0.05, rate=2.0)
@@ -152,12 +176,13 @@ def zhang_yan_2024_funnel(*, law: str = "prescribed_performance", reading: str =
 
 
 def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
-    """The paper's arm, reference, bounds and disturbance with bounds on the velocities too, and the law that keeps both.
+    """The paper's arm, reference, bounds and disturbance with bounds on the velocities too, and the
+    law that keeps both.
 
         -1.6 - 0.1 sin t < q1' < 0.6 + 0.1 cos t,   -1.4 < q2' < 0.5   [rad/s]
 
-    `controllers.FullState` with k1 = 2, K2 = 20 1/s, o = 0.1 and the momentum observer.  The claim of case 2 needs c > 6.5 with kf = 100,
-    and c > 33 with the paper's kf = 20.
+    `controllers.FullState` with k1 = 2, K2 = 20 1/s, o = 0.1 and the momentum observer.  The claim
+    of case 2 needs c > 6.5 with kf = 100, and c > 33 with the paper's kf = 20.
 
     Args:
       kf: gain of the observer [1/s].
@@ -173,7 +198,9 @@ def zhang_yan_2024_full_state(*, kf: float = 100.0, c: float = 8.0) -> Scenario:
     upper = bounds_.Sinusoid(offset=[0.6, 0.5], amplitude=[0.1, 0.0], phase=cosine)
     law = FullState(k1=2.0, K2=20.0, c=c, o=0.1)
     speeds = bounds_.Bounds(lower=lower, upper=upper)
-    return dataclasses.replace(scenario, controller=law, observer=Momentum(kf=kf), velocity_bounds=speeds)
+    return dataclasses.replace(
+        scenario, controller=law, observer=Momentum(kf=kf), velocity_bounds=speeds
+    )
 
 
 PRESETS: dict[str, Callable[..., Scenario]] = {

@@ -1,15 +1,17 @@
 """The closed loop: the one place where plant, sensor, law, observer and actuator meet.
 
     state  x = (q, q', state of the law, state of the observer, state of the actuator)
-    q" = M^-1 (tau + disturbance + friction - C q' - G)                 with the plant's M, C, G, friction at time t
-    f  = M0 q" + C0 q' + G0 - tau                                       what the observer should have estimated      (2.1)
-    V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde, without the second term where V1 `includes_e2`             (3.12)
+    q" = M^-1 (tau + disturbance + friction - C q' - G)                 with the plant's M, C, G,
+    friction at time t f  = M0 q" + C0 q' + G0 - tau                                       what the
+    observer should have estimated      (2.1) V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde,
+    without the second term where V1 `includes_e2`             (3.12)
 
-`evaluate` gives the rate of the state and everything that can be looked at; where only the rate is used (the inner stages of an
-integrator) the compiler drops the rest.
+`evaluate` gives the rate of the state and everything that can be looked at; where only the rate is
+used (the inner stages of an integrator) the compiler drops the rest.
 
-Where the law is sampled (`Sampling`), `sampled` runs sensor, law and observer at the start of a period, and the rate is that of what moves
-between: q, q' and the actuator.  Then alpha, V1 and f_hat of a sample are what the law said last.
+Where the law is sampled (`Sampling`), `sampled` runs sensor, law and observer at the start of a
+period, and the rate is that of what moves between: q, q' and the actuator.  Then alpha, V1 and
+  f_hat of a sample are what the law said last.
 """
 
 from __future__ import annotations
@@ -49,7 +51,15 @@ class Said(NamedTuple):
 
 def said_by(command: Command, f_hat: jax.Array) -> Said:
     """What a command says besides its torque."""
-    return Said(command.alpha, command.V1, f_hat, command.guard_active, command.saturated, command.slack, command.region_slack)
+    return Said(
+        command.alpha,
+        command.V1,
+        f_hat,
+        command.guard_active,
+        command.saturated,
+        command.slack,
+        command.region_slack,
+    )
 
 
 class Held(NamedTuple):
@@ -80,7 +90,12 @@ class LoopState(NamedTuple):
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; torques that are under way then are those that hold the model still."""
     q, dq, n = scenario.initial.q, scenario.initial.dq, scenario.n
-    state = LoopState(q, dq, scenario.controller.init(q, dq, scenario.setting), stepping_observer(scenario).init(q, dq, scenario.model))
+    state = LoopState(
+        q,
+        dq,
+        scenario.controller.init(q, dq, scenario.setting),
+        stepping_observer(scenario).init(q, dq, scenario.model),
+    )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
     still = scenario.model.gravity(q)
@@ -88,11 +103,22 @@ def initial_state(scenario: Scenario) -> LoopState:
     if scenario.sampling is None:
         return state
     zero, no = jnp.zeros_like(q), jnp.zeros((n,), bool)
-    command = jax.eval_shape(scenario.controller.command, zero[0], q, dq, zero, scenario.setting, state.controller)[0]
-    slack, region_slack = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (command.slack, command.region_slack))
+    command = jax.eval_shape(
+        scenario.controller.command, zero[0], q, dq, zero, scenario.setting, state.controller
+    )[0]
+    slack, region_slack = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), (command.slack, command.region_slack)
+    )
     commands = jnp.repeat(still[None], scenario.sampling.queue + 1, axis=0)
     sensor = scenario.sensor.init(q, dq, scenario.sampling.period)
-    return state._replace(held=Held(commands, sensor, Measurement(q, dq), Said(zero, zero, zero, no, no, slack, region_slack)))
+    return state._replace(
+        held=Held(
+            commands,
+            sensor,
+            Measurement(q, dq),
+            Said(zero, zero, zero, no, no, slack, region_slack),
+        )
+    )
 
 
 def moving(state: LoopState) -> LoopState:
@@ -102,7 +128,11 @@ def moving(state: LoopState) -> LoopState:
 
 def still(state: LoopState, moved: LoopState) -> LoopState:
     """The state, with what has moved."""
-    return moved if state.held == () else state._replace(q=moved.q, dq=moved.dq, actuator=moved.actuator)
+    return (
+        moved
+        if state.held == ()
+        else state._replace(q=moved.q, dq=moved.dq, actuator=moved.actuator)
+    )
 
 
 @jax.jit
@@ -116,11 +146,16 @@ def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Arra
       normal: what the sensor draws, (draws, n).
     """
     held = state.held
-    measured, sensor = scenario.sensor.measure(state.q, state.dq, normal, scenario.sampling.period, held.sensor)  # type: ignore[union-attr]
+    assert scenario.sampling is not None
+    measured, sensor = scenario.sensor.measure(
+        state.q, state.dq, normal, scenario.sampling.period, held.sensor
+    )
     answer = answered(scenario, t, measured, state.controller, state.observer)
     commands = jnp.concatenate([answer.command.tau[None], held.commands[:-1]])
     return state._replace(
-        controller=answer.controller, observer=answer.observer, held=Held(commands, sensor, measured, said_by(answer.command, answer.f_hat))
+        controller=answer.controller,
+        observer=answer.observer,
+        held=Held(commands, sensor, measured, said_by(answer.command, answer.f_hat)),
     )
 
 
@@ -135,8 +170,11 @@ class Answer(NamedTuple):
     """State of the observer there."""
 
 
-def answered(scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any) -> Answer:
-    """What law and observer make of what was measured at the start of a period: this is what runs on a robot's computer.
+def answered(
+    scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any
+) -> Answer:
+    """What law and observer make of what was measured at the start of a period: this is what runs
+    on a robot's computer.
 
     Args:
       scenario: with a sampling.
@@ -154,7 +192,9 @@ def answered(scenario: Scenario, t: jax.Array, measured: Measurement, controller
 
 
 def stepping_observer(scenario: Scenario) -> Any:
-    """The observer as it runs: in a sampled loop, the one whose step of Euler has the poles, where that is asked for."""
+    """The observer as it runs: in a sampled loop, the one whose step of Euler has the poles, where
+    that is asked for.
+    """
     sampling, observer = scenario.sampling, scenario.observer
     if sampling is not None and sampling.observer == "poles" and hasattr(observer, "at_period"):
         return observer.at_period(sampling.period)
@@ -165,17 +205,28 @@ def _advanced(sampling: Any, observer: Any, told: tuple) -> Any:
     """The observer's state at the start of the next period."""
     if sampling.observer == "exact" and hasattr(observer, "advance"):
         return observer.advance(*told, sampling.period)
-    return jax.tree.map(lambda x, dx: x + sampling.period * dx, told[-1], observer.derivative(*told))
+    return jax.tree.map(
+        lambda x, dx: x + sampling.period * dx, told[-1], observer.derivative(*told)
+    )
 
 
-def sampled_if_due(scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array) -> LoopState:
+def sampled_if_due(
+    scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array
+) -> LoopState:
     """The state after an instant's sample, if it is the start of a period."""
     normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
-    return jax.lax.cond(now.phase == 0, lambda state: sampled(scenario, t, state, normal), lambda state: state, state)
+    return jax.lax.cond(
+        now.phase == 0,
+        lambda state: sampled(scenario, t, state, normal),
+        lambda state: state,
+        state,
+    )
 
 
 class Surroundings(NamedTuple):
-    """What may be moved a little in a sampled loop to see what it does: the plant, its torque, and what its law remembers."""
+    """What may be moved a little in a sampled loop to see what it does: the plant, its torque, and
+    what its law remembers.
+    """
 
     plant: LoopState
     torque: jax.Array
@@ -186,13 +237,23 @@ def surroundings(state: LoopState) -> Any:
     """What decides how a loop goes on: its state, or the `Surroundings` of a sampled one."""
     if state.held == ():
         return state
-    return Surroundings(moving(state), state.held.commands[0], (state.controller, state.observer, state.held.sensor))
+    return Surroundings(
+        moving(state), state.held.commands[0], (state.controller, state.observer, state.held.sensor)
+    )
 
 
-def change(scenario: Scenario, t: jax.Array, around: Any, dt: jax.Array | None = None, piece: Callable = lambda function: function) -> Any:
-    """How what `surroundings` gives changes: its rate, or of a sampled loop the plant's rate, the next command and what is remembered then.
+def change(
+    scenario: Scenario,
+    t: jax.Array,
+    around: Any,
+    dt: jax.Array | None = None,
+    piece: Callable = lambda function: function,
+) -> Any:
+    """How what `surroundings` gives changes: its rate, or of a sampled loop the plant's rate, the
+    next command and what is remembered then.
 
-    Rounding of a sensor (`unrounded`) and limits of an actuator (`unlimited`) are left out: their derivatives are 0, as without a law.
+    Rounding of a sensor (`unrounded`) and limits of an actuator (`unlimited`) are left out: their
+    derivatives are 0, as without a law.
 
     Args:
       scenario: what runs.
@@ -204,33 +265,62 @@ def change(scenario: Scenario, t: jax.Array, around: Any, dt: jax.Array | None =
     if not isinstance(around, Surroundings):
         return piece(evaluate)(scenario, t, around, *(() if dt is None else (dt,)))[0]
     sensor, actuator = scenario.sensor, scenario.actuator
-    sensor, actuator = getattr(sensor, "unrounded", sensor), getattr(actuator, "unlimited", actuator)
+    sensor, actuator = (
+        getattr(sensor, "unrounded", sensor),
+        getattr(actuator, "unlimited", actuator),
+    )
     scenario = dataclasses.replace(scenario, sensor=sensor, actuator=actuator)
     state = still(initial_state(scenario), around.plant)
     controller, observer, sensor = around.memory
-    state = state._replace(controller=controller, observer=observer, held=state.held._replace(sensor=sensor))
-    after = piece(sampled)(scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype))
+    state = state._replace(
+        controller=controller, observer=observer, held=state.held._replace(sensor=sensor)
+    )
+    after = piece(sampled)(
+        scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
+    )
     rate = piece(evaluate)(scenario, t, state, 0.0 if dt is None else dt, around.torque)[0]
-    return Surroundings(rate, after.held.commands[0], (after.controller, after.observer, after.held.sensor))
+    return Surroundings(
+        rate, after.held.commands[0], (after.controller, after.observer, after.held.sensor)
+    )
 
 
-def acceleration(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array) -> jax.Array:
+def acceleration(
+    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
+) -> jax.Array:
     """q" of the plant under a torque that acts, (n,) [rad/s^2]."""
     plant = at_time(scenario.plant, t)
-    pushed = tau + scenario.disturbance.torque(t, q, dq, plant, scenario.model) + friction_torque(plant, dq)
+    pushed = (
+        tau
+        + scenario.disturbance.torque(t, q, dq, plant, scenario.model)
+        + friction_torque(plant, dq)
+    )
     return solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
 
 
-def torque_needed(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array) -> jax.Array:
-    """The torque under which the plant moves like this, (n,) [N m]: the inverse of `acceleration`."""
+def torque_needed(
+    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array
+) -> jax.Array:
+    """The torque under which the plant moves like this, (n,) [N m]: the inverse of
+    `acceleration`.
+    """
     plant = at_time(scenario.plant, t)
-    against = scenario.disturbance.torque(t, q, dq, plant, scenario.model) + friction_torque(plant, dq)
-    return matvec(plant.mass_matrix(q), ddq) + plant.coriolis(q, dq, dq) + plant.gravity(q) - against
+    against = scenario.disturbance.torque(t, q, dq, plant, scenario.model) + friction_torque(
+        plant, dq
+    )
+    return (
+        matvec(plant.mass_matrix(q), ddq) + plant.coriolis(q, dq, dq) + plant.gravity(q) - against
+    )
 
 
-@jax.jit  # so that it is traced once for all the places that call it, and `lowering` sees that they call one function
+# so that it is traced once for all the places that call it, and `lowering` sees that they call one
+# function
+@jax.jit
 def evaluate(
-    scenario: Scenario, t: jax.Array, state: LoopState, dt: jax.Array | float = 0.0, torque: jax.Array | None = None
+    scenario: Scenario,
+    t: jax.Array,
+    state: LoopState,
+    dt: jax.Array | float = 0.0,
+    torque: jax.Array | None = None,
 ) -> tuple[LoopState, Sample]:
     """The rate of the state and the sample at time t.
 
@@ -239,12 +329,15 @@ def evaluate(
       t: time, () [s].
       state: state at t.
       dt: weight of the sample in an integral over time, () [s].
-      torque: what arrives at the actuator, (n,) [N m], where the law is sampled; the last command if not given.
+      torque: what arrives at the actuator, (n,) [N m], where the law is sampled; the last command
+        if not given.
     """
     model, q, dq = scenario.model, state.q, state.dq
     if scenario.sampling is None:
         f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
-        command, controller_rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, state.controller)
+        command, controller_rate = scenario.controller.command(
+            t, q, dq, f_hat, scenario.setting, state.controller
+        )
         asked, said = command.tau, said_by(command, f_hat)
     else:
         asked, said = state.held.commands[0] if torque is None else torque, state.held.said

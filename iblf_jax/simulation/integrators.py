@@ -1,7 +1,8 @@
 """Explicit Runge-Kutta steps on pytrees, each method a Butcher table.
 
-What is integrated may say more than its rate (the closed loop has a sample to record): a step hands on what was said at its start.
-Fixed steps: the loop is sampled in practice, gradients are exact, and a batch stays in step.  A new method is a new row of TABLEAUS.
+What is integrated may say more than its rate (the closed loop has a sample to record): a step hands
+on what was said at its start. Fixed steps: the loop is sampled in practice, gradients are exact,
+  and a batch stays in step.  A new method is a new row of TABLEAUS.
 """
 
 from __future__ import annotations
@@ -32,7 +33,14 @@ class Tableau(NamedTuple):
 
 TABLEAUS = {
     "euler": Tableau(c=(0.0,), a=((),), b=(1.0,), order=1, stability=2.0, differences=(-0.5, 0.5)),
-    "heun": Tableau(c=(0.0, 1.0), a=((), (1.0,)), b=(0.5, 0.5), order=2, stability=2.0, differences=(1.0, -2.0, 1.0)),
+    "heun": Tableau(
+        c=(0.0, 1.0),
+        a=((), (1.0,)),
+        b=(0.5, 0.5),
+        order=2,
+        stability=2.0,
+        differences=(1.0, -2.0, 1.0),
+    ),
     "rk4": Tableau(
         c=(0.0, 0.5, 0.5, 1.0),
         a=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
@@ -62,7 +70,9 @@ class Stepped(NamedTuple):
     """What was said besides the slope at the start."""
 
 
-def step(method: str, evaluate, t: jax.Array, state, dt: jax.Array, *, rolled: bool = False) -> Stepped:
+def step(
+    method: str, evaluate, t: jax.Array, state, dt: jax.Array, *, rolled: bool = False
+) -> Stepped:
     """One step.
 
     Args:
@@ -91,7 +101,8 @@ def stage_states(method: str, state, dt: jax.Array, slopes: list) -> list:
 
 def _combine(state, dt, weights, slopes):
     def one(x, *ks):
-        # Weights times dt are shared by all numbers and runs; x is added last, so that it is rounded once.
+        # Weights times dt are shared by all numbers and runs; x is added last, so that it is
+        # rounded once.
         terms = [weight * dt * k for weight, k in zip(weights, ks, strict=True) if weight != 0.0]
         return x + sum(terms[1:], terms[0]) if terms else x
 
@@ -105,10 +116,17 @@ def _rolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
 
     def stage(slopes, at):
         index, c, row = at
-        slope, besides = evaluate(t + c * dt, whole(x + dt * jnp.sum(row[:, None] * slopes, axis=0)))
-        return jax.lax.dynamic_update_index_in_dim(slopes, ravel_pytree(slope)[0], index, 0), besides
+        slope, besides = evaluate(
+            t + c * dt, whole(x + dt * jnp.sum(row[:, None] * slopes, axis=0))
+        )
+        return (
+            jax.lax.dynamic_update_index_in_dim(slopes, ravel_pytree(slope)[0], index, 0),
+            besides,
+        )
 
     stages = (jnp.arange(count), jnp.asarray(table.c, x.dtype), rows)
     slopes, besides = jax.lax.scan(stage, jnp.zeros((count, x.size), x.dtype), stages)
     total = jnp.sum(jnp.asarray(table.b, x.dtype)[:, None] * slopes, axis=0)
-    return Stepped(whole(x + dt * total), [whole(k) for k in slopes], jax.tree.map(lambda y: y[0], besides))
+    return Stepped(
+        whole(x + dt * total), [whole(k) for k in slopes], jax.tree.map(lambda y: y[0], besides)
+    )

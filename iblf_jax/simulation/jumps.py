@@ -9,7 +9,8 @@ pieces that end where
 A jump at the end of a step belongs to that step.  A piece of length 0 follows it, through which the
 state has a derivative by the jump time there, too.  The lengths of the pieces carry the derivatives
 by jump times and delays, so the jump of the right-hand side reaches the derivative of the state.
-Jumps at one time are one cut.  They have the derivative of all together, which the first of them gets.
+Jumps at one time are one cut.  They have the derivative of all together, which the first of them
+gets.
 
 The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, one
 that begins there after it.  A jump time may be the result of rounding, so stages keep away from it
@@ -28,7 +29,8 @@ import numpy as np
 from iblf_jax.simulation import integrators
 
 MOST_CUTS = 4
-"""Different jump times at which one step is divided at most; the accuracy of a step with more is not known."""
+"""Different jump times at which one step is divided at most; the accuracy of a step with more is
+not known."""
 APART = 4.0
 """Units in the last place between a stage and a jump time."""
 
@@ -87,13 +89,16 @@ def stage_time(piece: Piece, t: jax.Array) -> jax.Array:
     return t if piece.earliest is None else _limited(t, piece.earliest, piece.latest)
 
 
-def divided(times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] | None = None) -> Division:
+def divided(
+    times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] | None = None
+) -> Division:
     """The pieces of a step.
 
     Args:
       times: the scenario's jump times, (J,) [s].
       span: the step.
-      arrival: when a command arrives within the step, counted from its start, () [s], and whether one does; None where none can.
+      arrival: when a command arrives within the step, counted from its start, () [s], and whether
+        one does; None where none can.
     """
     count = times.size
     most = min(count, MOST_CUTS) + (arrival is not None)
@@ -114,10 +119,16 @@ def divided(times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] |
         if number < most:
             first = _first(places, pending)
             until = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, places, 0.0)), span.length)
-            chosen = _with_equal_times(first, places, pending, count, span) if count > MOST_CUTS else first
+            chosen = (
+                _with_equal_times(first, places, pending, count, span)
+                if count > MOST_CUTS
+                else first
+            )
         earliest, latest = _limits(times, passed | done[-count:], span) if count else (None, None)
         arrived = _arrived(done, number, count, arrival is not None)
-        pieces.append(Piece(begin, until if since is None else until - since, made, earliest, latest, arrived))
+        pieces.append(
+            Piece(begin, until if since is None else until - since, made, earliest, latest, arrived)
+        )
         if chosen is not None:
             begin, since, made = span.start + until, until, jnp.any(chosen)
             pending, done = pending & ~chosen, done | chosen
@@ -129,11 +140,17 @@ def _first(places: jax.Array, pending: jax.Array) -> jax.Array:
     if places.size == 1:
         return pending
     order = jnp.where(pending, jax.lax.stop_gradient(places), jnp.inf)
-    return pending & (jnp.arange(places.size, dtype=jnp.int32) == jnp.argmin(order).astype(jnp.int32))
+    return pending & (
+        jnp.arange(places.size, dtype=jnp.int32) == jnp.argmin(order).astype(jnp.int32)
+    )
 
 
-def _with_equal_times(first: jax.Array, places: jax.Array, pending: jax.Array, jumps: int, span: Span) -> jax.Array:
-    """The event that comes first with those of the pending jumps at its time, (E,) bool, if it is a jump itself."""
+def _with_equal_times(
+    first: jax.Array, places: jax.Array, pending: jax.Array, jumps: int, span: Span
+) -> jax.Array:
+    """The event that comes first with those of the pending jumps at its time, (E,) bool, if it is a
+    jump itself.
+    """
     apart = APART * jnp.finfo(places.dtype).eps * jnp.abs(span.end)
     place = jax.lax.stop_gradient(jnp.sum(jnp.where(first, places, 0.0)))
     equal = jnp.abs(jax.lax.stop_gradient(places) - place) <= apart
@@ -150,7 +167,9 @@ def _arrived(done: jax.Array, number: int, jumps: int, can_arrive: bool) -> Any:
 
 
 def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array, jax.Array]:
-    """Between which times the stages of a piece lie, () [s] each: after some jumps, before others."""
+    """Between which times the stages of a piece lie, () [s] each: after some jumps, before
+    others.
+    """
     times = jax.lax.stop_gradient(times)
     apart = APART * jnp.finfo(times.dtype).eps * jnp.abs(times)
     earliest = jnp.max(jnp.where(passed, times + apart, span.start))
@@ -171,7 +190,9 @@ def within(times: jax.Array, after: jax.Array, until: jax.Array) -> jax.Array:
     return jnp.any((times > after) & (times <= until))
 
 
-def since_last(times: jax.Array, before: Span, arrival: tuple[jax.Array, jax.Array] | None = None) -> jax.Array:
+def since_last(
+    times: jax.Array, before: Span, arrival: tuple[jax.Array, jax.Array] | None = None
+) -> jax.Array:
     """How long before the end of a step its last piece begins, () [s]; the step if it is whole.
 
     Args:
@@ -200,19 +221,29 @@ class Passage(NamedTuple):
     """Length [s] of each piece, and the slopes of its stages; 0 where it is not made."""
 
 
-def integrated(method: str, evaluate: Callable, division: Division, state: Any, *, rolled: bool = False) -> Passage:
+def integrated(
+    method: str, evaluate: Callable, division: Division, state: Any, *, rolled: bool = False
+) -> Passage:
     """One step of the integrator over every piece of a step.
 
     Args:
       method: a name in `integrators.TABLEAUS`.
-      evaluate: function (t, state) -> (rate of the state, anything else), as for `integrators.step`.
+      evaluate: function (t, state) -> (rate of the state, anything else), as for
+        `integrators.step`.
       division: of the step.
       state: at its start.
       rolled: as for `integrators.step`.
     """
 
     def over(piece: Piece, state: Any) -> integrators.Stepped:
-        return integrators.step(method, lambda t, x: evaluate(stage_time(piece, t), x), piece.begin, state, piece.length, rolled=rolled)
+        return integrators.step(
+            method,
+            lambda t, x: evaluate(stage_time(piece, t), x),
+            piece.begin,
+            state,
+            piece.length,
+            rolled=rolled,
+        )
 
     start = over(division.pieces[0], state)
     state, parts = start.state, [(division.pieces[0].length, start.slopes)]

@@ -1,14 +1,17 @@
 """Metrics: what a run is judged by, each a fold over its samples.
 
-A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`; it sees every step whatever is recorded, so the same
-definition serves one recorded run, a million runs that store no trajectory, and a tuning loss.
+A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`; it sees every step whatever is
+recorded, so the same definition serves one recorded run, a million runs that store no trajectory,
+and a tuning loss.
 
 Integrals are sums by the trapezoidal rule, of second order in the step,
 
-    int_0^T g dt = sum_k dt_k g(t_k),      dt_k = dt, and dt/2 for the first and the last sample (`Sample.dt`).
+    int_0^T g dt = sum_k dt_k g(t_k),      dt_k = dt, and dt/2 for the first and the last sample
+    (`Sample.dt`).
 
-Where signals jump, at a sample of a sampled law, at the arrival of a command, or at a jump time of the scenario, the fold sees both limits
-as samples of one time, so the rule is applied to each smooth part by itself.
+Where signals jump, at a sample of a sampled law, at the arrival of a command, or at a jump time of
+the scenario, the fold sees both limits as samples of one time, so the rule is applied to each
+smooth part by itself.
 
 A fold is a component: thresholds are leaves.  Its `units` name what `finish` returns.
 """
@@ -32,14 +35,17 @@ from iblf_jax.simulation.signals import speed_margin
 class Fold(Protocol):
     """What the package asks of a metric.
 
-    It may also have, as a class attribute, `needs`: an optional signal that it reads, which not every scenario has (`OF_SCENARIO`).
+    It may also have, as a class attribute, `needs`: an optional signal that it reads, which not
+      every scenario has (`OF_SCENARIO`).
     """
 
     units: ClassVar[dict[str, str]]
     """Name -> SI unit of everything that `finish` returns."""
 
     def init(self, sample: Sample) -> Any:
-        """The accumulator before the first sample; `sample` is that first sample, for shapes and types."""
+        """The accumulator before the first sample; `sample` is that first sample, for shapes and
+        types.
+        """
         ...
 
     def update(self, acc: Any, sample: Sample) -> Any:
@@ -63,10 +69,17 @@ class _TrackingSums(NamedTuple):
 class Tracking:
     """Integrals and peak of the position error e1, joint by joint.
 
-    ISE = int e1^2, IAE = int |e1|, ITAE = int t |e1|, rmse = sqrt(ISE / duration), peak_error = max |e1|.
+    ISE = int e1^2, IAE = int |e1|, ITAE = int t |e1|, rmse = sqrt(ISE / duration), peak_error = max
+    |e1|.
     """
 
-    units: ClassVar[dict[str, str]] = {"rmse": "rad", "ise": "rad^2 s", "iae": "rad s", "itae": "rad s^2", "peak_error": "rad"}
+    units: ClassVar[dict[str, str]] = {
+        "rmse": "rad",
+        "ise": "rad^2 s",
+        "iae": "rad s",
+        "itae": "rad s^2",
+        "peak_error": "rad",
+    }
 
     def init(self, sample: Sample) -> _TrackingSums:
         """Zeros."""
@@ -89,7 +102,13 @@ class Tracking:
         # The root is guarded so that its gradient is finite on a run without any error.
         mean = acc.ise / acc.time
         rmse = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
-        return {"rmse": rmse, "ise": acc.ise, "iae": acc.iae, "itae": acc.itae, "peak_error": acc.peak}
+        return {
+            "rmse": rmse,
+            "ise": acc.ise,
+            "iae": acc.iae,
+            "itae": acc.itae,
+            "peak_error": acc.peak,
+        }
 
 
 class _SettlingState(NamedTuple):
@@ -104,7 +123,8 @@ class _SettlingState(NamedTuple):
 class Settling:
     """When |e1| falls under a tolerance for good, and how far e1 goes past zero.
 
-    settling_time: the first sample time from which on |e1| < tolerance; infinite if the run ends outside.
+    settling_time: the first sample time from which on |e1| < tolerance; infinite if the run ends
+      outside.
     overshoot: the largest |e1| on the side of zero opposite to the start's.
 
     Args:
@@ -123,17 +143,24 @@ class Settling:
         """Adds one sample."""
         outside = ~(jnp.abs(sample.e1) < self.tolerance)
         since = jnp.where(acc.outside & ~outside, sample.t, acc.since)
-        return _SettlingState(outside, since, jnp.maximum(acc.overshoot, -acc.side * sample.e1), acc.side)
+        return _SettlingState(
+            outside, since, jnp.maximum(acc.overshoot, -acc.side * sample.e1), acc.side
+        )
 
     def finish(self, acc: _SettlingState) -> dict[str, jax.Array]:
         """settling_time and overshoot, each (n,)."""
-        return {"settling_time": jnp.where(acc.outside, jnp.inf, acc.since), "overshoot": acc.overshoot}
+        return {
+            "settling_time": jnp.where(acc.outside, jnp.inf, acc.since),
+            "overshoot": acc.overshoot,
+        }
 
 
 def _first_outside(acc: Any, margin: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Time and joint, or region, of the first violation, after an instant with these margins."""
     first = jnp.any(~(margin > 0)) & (acc.first < 0)
-    return jnp.where(first, t, acc.time), jnp.where(first, jnp.argmin(margin).astype(jnp.int32), acc.first)
+    return jnp.where(first, t, acc.time), jnp.where(
+        first, jnp.argmin(margin).astype(jnp.int32), acc.first
+    )
 
 
 class _MarginState(NamedTuple):
@@ -147,8 +174,8 @@ class _MarginState(NamedTuple):
 class Margin:
     """How near the joints came to their bounds, and the first violation.
 
-    margin = min(q - lower, upper - q), continuous through zero; xi_margin = 1 - max |xi|; first_violation_time is infinite and
-    first_violation_joint -1 on a run that keeps its bounds.
+    margin = min(q - lower, upper - q), continuous through zero; xi_margin = 1 - max |xi|;
+    first_violation_time is infinite and first_violation_joint -1 on a run that keeps its bounds.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -191,12 +218,14 @@ class _SpeedState(NamedTuple):
 
 @component
 class VelocityMargin:
-    """How near the velocities, and the virtual velocity alpha, came to the bounds of the velocities, and the first violation.
+    """How near the velocities, and the virtual velocity alpha, came to the bounds of the
+    velocities, and the first violation.
 
-    velocity_margin = min(q' - v_l, v_u - q') and alpha_margin = min(alpha - v_l, v_u - alpha), both continuous through zero: alpha outside
-    means that a law which follows it cannot keep the bounds.  first_velocity_violation_time is infinite and
-    first_velocity_violation_joint -1 on a run that keeps them.  For scenarios with `velocity_bounds` alone, whose runs carry it unless told
-    otherwise.
+    velocity_margin = min(q' - v_l, v_u - q') and alpha_margin = min(alpha - v_l, v_u - alpha), both
+    continuous through zero: alpha outside means that a law which follows it cannot keep the bounds.
+      first_velocity_violation_time is infinite and
+    first_velocity_violation_joint -1 on a run that keeps them.  For scenarios with
+    `velocity_bounds` alone, whose runs carry it unless told otherwise.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -222,7 +251,9 @@ class VelocityMargin:
         )
 
     def finish(self, acc: _SpeedState) -> dict[str, jax.Array]:
-        """velocity_margin and alpha_margin, each (n,); first_velocity_violation_time and first_velocity_violation_joint, ()."""
+        """velocity_margin and alpha_margin, each (n,); first_velocity_violation_time and
+        first_velocity_violation_joint, ().
+        """
         return {
             "velocity_margin": acc.margin,
             "alpha_margin": acc.alpha,
@@ -241,9 +272,10 @@ class _RegionState(NamedTuple):
 class RegionMargin:
     """How near the points of the robot came to the walls of their regions, and the first violation.
 
-    region_margin = min over time of the distance to the wall, region by region, continuous through zero.  first_region_violation_time is
-    infinite and first_region_violation_region -1 on a run that stays in all of them.  For scenarios with `regions` alone, whose runs
-    carry it unless told otherwise.
+    region_margin = min over time of the distance to the wall, region by region, continuous through
+    zero.  first_region_violation_time is infinite and first_region_violation_region -1 on a run
+    that stays in all of them.  For scenarios with `regions` alone, whose runs carry it unless told
+    otherwise.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -255,7 +287,11 @@ class RegionMargin:
 
     def init(self, sample: Sample) -> _RegionState:
         """Infinitely far from the walls."""
-        return _RegionState(jnp.full_like(sample.region_margin, jnp.inf), jnp.full_like(sample.t, jnp.inf), jnp.int32(-1))
+        return _RegionState(
+            jnp.full_like(sample.region_margin, jnp.inf),
+            jnp.full_like(sample.t, jnp.inf),
+            jnp.int32(-1),
+        )
 
     def update(self, acc: _RegionState, sample: Sample) -> _RegionState:
         """Adds one sample."""
@@ -263,7 +299,9 @@ class RegionMargin:
         return _RegionState(jnp.minimum(acc.margin, margin), *_first_outside(acc, margin, sample.t))
 
     def finish(self, acc: _RegionState) -> dict[str, jax.Array]:
-        """region_margin, (m,) for m regions; first_region_violation_time and first_region_violation_region, ()."""
+        """region_margin, (m,) for m regions; first_region_violation_time and
+        first_region_violation_region, ().
+        """
         return {
             "region_margin": acc.margin,
             "first_region_violation_time": acc.time,
@@ -275,7 +313,8 @@ class RegionMargin:
 class Slack:
     """By how much a filter had to break its conditions on the joints at most: largest_slack.
 
-    For laws with a filter (`controllers.SafetyFilter`) alone, whose runs carry it unless told otherwise.
+    For laws with a filter (`controllers.SafetyFilter`) alone, whose runs carry it unless told
+    otherwise.
     """
 
     units: ClassVar[dict[str, str]] = {"largest_slack": "rad/s^2"}
@@ -296,7 +335,9 @@ class Slack:
 
 @component
 class RegionSlack:
-    """The same of its conditions on the regions, largest_region_slack; for laws with a filter in scenarios with regions."""
+    """The same of its conditions on the regions, largest_region_slack; for laws with a filter in
+    scenarios with regions.
+    """
 
     units: ClassVar[dict[str, str]] = {"largest_region_slack": "m/s^2"}
     needs: ClassVar[str] = "region_slack"
@@ -327,8 +368,9 @@ class _TorqueSums(NamedTuple):
 class Torque:
     """What the actuators had to do.
 
-    effort = int |tau|^2 over all joints; torque_rms, peak_torque, torque_variation = sum |tau_k+1 - tau_k| (chatter), and
-    saturated_share, the part of the time in which the torque was cut, joint by joint.
+    effort = int |tau|^2 over all joints; torque_rms, peak_torque, torque_variation = sum |tau_k+1 -
+    tau_k| (chatter), and saturated_share, the part of the time in which the torque was cut, joint
+    by joint.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -375,7 +417,8 @@ class _AboveGravitySums(NamedTuple):
 
 @component
 class AboveGravity:
-    """What the law did beyond holding the arm up: effort_above_gravity = sqrt(mean |tau - G0(q)|^2) over all joints.
+    """What the law did beyond holding the arm up: effort_above_gravity = sqrt(mean |tau - G0(q)|^2)
+    over all joints.
 
     `compare` holds it equal between laws.
     """
@@ -388,12 +431,19 @@ class AboveGravity:
 
     def update(self, acc: _AboveGravitySums, sample: Sample) -> _AboveGravitySums:
         """Adds one sample."""
-        return _AboveGravitySums(acc.time + sample.dt, acc.square + sample.dt * jnp.sum((sample.tau - sample.gravity) ** 2))
+        return _AboveGravitySums(
+            acc.time + sample.dt,
+            acc.square + sample.dt * jnp.sum((sample.tau - sample.gravity) ** 2),
+        )
 
     def finish(self, acc: _AboveGravitySums) -> dict[str, jax.Array]:
         """The effort above gravity, ()."""
         mean = acc.square / acc.time
-        return {"effort_above_gravity": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
+        return {
+            "effort_above_gravity": jnp.where(
+                mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0
+            )
+        }
 
 
 class _EstimateSums(NamedTuple):
@@ -403,7 +453,9 @@ class _EstimateSums(NamedTuple):
 
 @component
 class Estimation:
-    """How well the observer knew the uncertain term: estimate_rmse = sqrt(mean f_tilde^2), f_tilde = f - f_hat."""
+    """How well the observer knew the uncertain term: estimate_rmse = sqrt(mean f_tilde^2), f_tilde
+    = f - f_hat.
+    """
 
     units: ClassVar[dict[str, str]] = {"estimate_rmse": "N m"}
 
@@ -423,10 +475,19 @@ class Estimation:
 
 
 OF_SCENARIO = {
-    "dq_lower": ("velocity_bounds", "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."),
-    "region_margin": ("regions", "Such as regions=(ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)."),
+    "dq_lower": (
+        "velocity_bounds",
+        "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0)).",
+    ),
+    "region_margin": (
+        "regions",
+        "Such as regions=(ij.regions.HalfSpace(normal=[0, 1], offset=0.1),).",
+    ),
     "slack": ("a law with a filter", "Such as ij.controllers.SafetyFilter(law)."),
-    "region_slack": ("regions and a law with a filter", "Such as ij.controllers.SafetyFilter(law), and regions=(...)."),
+    "region_slack": (
+        "regions and a law with a filter",
+        "Such as ij.controllers.SafetyFilter(law), and regions=(...).",
+    ),
 }
 """Optional signal -> what of a scenario gives it, and how."""
 
@@ -435,12 +496,16 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     """Whether runs of a scenario have an optional signal, one of `OF_SCENARIO`."""
     if signal == "dq_lower":
         return scenario.velocity_bounds is not None
-    filters = signal == "region_margin" or any(getattr(law, "filters", False) for law in layers(scenario.controller))
+    filters = signal == "region_margin" or any(
+        getattr(law, "filters", False) for law in layers(scenario.controller)
+    )
     return filters and (signal == "slack" or len(scenario.regions) > 0)
 
 
 def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
-    """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of the scenario do not have."""
+    """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of
+    the scenario do not have.
+    """
     needs = getattr(fold, "needs", None)
     if needs is None:
         return
@@ -451,8 +516,11 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
         raise checks.fail(field, got, f"a scenario with {words}", remedy)
 
 
-def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenario: Scenario | None = None) -> tuple[Fold, ...]:
-    """The folds that a user asked for (None: the standard ones), checked, their numbers in one floating-point type.
+def as_folds(
+    metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenario: Scenario | None = None
+) -> tuple[Fold, ...]:
+    """The folds that a user asked for (None: the standard ones), checked, their numbers in one
+    floating-point type.
 
     Args:
       metrics: the folds, or None.
@@ -460,23 +528,36 @@ def as_folds(metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenar
       scenario: that they are for, if it is known.
 
     Raises:
-      ValueError: something that is not a fold, one that needs what the scenario does not have (bounds on the velocities, regions), units
-        that are no words, fields that are no numbers, or two folds that return the same name.
+      ValueError: something that is not a fold, one that needs what the scenario does not have
+        (bounds on the velocities, regions), units that are no words, fields that are no numbers, or
+        two folds that return the same name.
     """
     if metrics is None:
-        return tuple(_in_type("metrics", fold, dtype) for fold in (*standard(), *(() if scenario is None else watched(scenario))))
+        return tuple(
+            _in_type("metrics", fold, dtype)
+            for fold in (*standard(), *(() if scenario is None else watched(scenario)))
+        )
     if not isinstance(metrics, tuple | list):
-        raise checks.fail("metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,).")
+        raise checks.fail(
+            "metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,)."
+        )
     owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
     for i, fold in enumerate(metrics):
         checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
         if scenario is not None:
             fit_joints(fold, scenario.n, f"metrics[{i}]")
             check_needs(f"metrics[{i}]", fold, scenario)
-        for name, unit in checks.mapping(f"metrics[{i}].units", fold.units, '{"rmse": "rad"}').items():
+        for name, unit in checks.mapping(
+            f"metrics[{i}].units", fold.units, '{"rmse": "rad"}'
+        ).items():
             checks.word(f"metrics[{i}].units[{name!r}]", unit, "a unit in words")
             if name in owner:
-                raise checks.fail(f"metrics[{i}]", fold, "names that no other fold returns", f"{owner[name]} returns {name!r} too.")
+                raise checks.fail(
+                    f"metrics[{i}]",
+                    fold,
+                    "names that no other fold returns",
+                    f"{owner[name]} returns {name!r} too.",
+                )
             owner[name] = f"metrics[{i}]"
     return tuple(_in_type(f"metrics[{i}]", fold, dtype) for i, fold in enumerate(metrics))
 
@@ -486,7 +567,9 @@ def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
     try:
         return jax.tree.map(lambda x: jnp.asarray(x, dtype), fold)
     except Exception as error:
-        raise checks.fail(name, fold, "a fold whose fields are numbers", "Other things belong in a static field.") from error
+        raise checks.fail(
+            name, fold, "a fold whose fields are numbers", "Other things belong in a static field."
+        ) from error
 
 
 def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
@@ -495,16 +578,24 @@ def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
 
 
 def standard() -> tuple[Fold, ...]:
-    """The folds that every run carries unless told otherwise; some scenarios' carry more (`watched`).
+    """The folds that every run carries unless told otherwise; some scenarios' carry more
+    (`watched`).
 
-    Made on the call: an array made at import would start JAX's backend and fix its precision before a user can choose.
+    Made on the call: an array made at import would start JAX's backend and fix its precision before
+      a user can choose.
     """
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
 
 
 def watched(scenario: Scenario) -> tuple[Fold, ...]:
-    """The folds that runs of a scenario carry besides the standard ones: of bounds on velocities, of regions, of a filter."""
-    return tuple(fold for fold in (VelocityMargin(), RegionMargin(), Slack(), RegionSlack()) if has_signal(scenario, fold.needs))
+    """The folds that runs of a scenario carry besides the standard ones: of bounds on velocities,
+    of regions, of a filter.
+    """
+    return tuple(
+        fold
+        for fold in (VelocityMargin(), RegionMargin(), Slack(), RegionSlack())
+        if has_signal(scenario, fold.needs)
+    )
 
 
 MEMBERS = {

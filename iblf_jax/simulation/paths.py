@@ -1,11 +1,14 @@
-"""One path language for every leaf of a scenario: "controller.K2", "plant.mass[1]", "initial.q", "disturbance.phase".
+"""One path language for every leaf of a scenario: "controller.K2", "plant.mass[1]", "initial.q",
+"disturbance.phase".
 
-Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow the fields of the components;
-`[i]` selects a part of a `Sum` or one entry of an array.  A component with rows that have names (class attribute `rows`, such as
-`robots.Arm`) can be addressed by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names.
-A name without a letter, or with a bracket, a line break or the like, is written as a JSON string: 'plant.link["a]b"].mass'.
-`robot.` stands for `plant.` and `model.` together: use it to change the robot that is simulated and the one that the law knows alike.
-A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is looked through: "controller.K2" is the
+Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow
+the fields of the components; `[i]` selects a part of a `Sum` or one entry of an array.  A component
+with rows that have names (class attribute `rows`, such as `robots.Arm`) can be addressed by them:
+"plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names. A name
+without a letter, or with a bracket, a line break or the like, is written as a JSON string:
+'plant.link["a]b"].mass'. `robot.` stands for `plant.` and `model.` together: use it to change the
+robot that is simulated and the one that the law knows alike. A component that wraps another (class
+attribute `wraps`, such as `controllers.Saturated`) is looked through: "controller.K2" is the
 wrapped law's K2, and "controller.law.K2" works too.
 """
 
@@ -27,7 +30,9 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
-_TOKEN = re.compile(rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({_BARE})\]""")
+_TOKEN = re.compile(
+    rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({_BARE})\]"""
+)
 
 
 class RowName(str):
@@ -50,7 +55,11 @@ class ParameterTable(tuple[Parameter, ...]):
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         def shown(value):
-            return np.array2string(np.asarray(value), precision=6, threshold=8) if checks.is_concrete(value) else "traced"
+            return (
+                np.array2string(np.asarray(value), precision=6, threshold=8)
+                if checks.is_concrete(value)
+                else "traced"
+            )
 
         return [(p.path, str(p.shape), p.unit, shown(p.value)) for p in self]
 
@@ -66,7 +75,8 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
 
     Args:
       scenario: any Scenario.
-      named: rows of leaves by their names too, "plant.link[forearm].mass" besides "plant.mass"; without them every number is there once.
+      named: rows of leaves by their names too, "plant.link[forearm].mass" besides "plant.mass";
+        without them every number is there once.
 
     Returns:
       A tuple of `Parameter`, which prints as a table.
@@ -77,10 +87,14 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
 
 def _need_component(scenario: Any) -> None:
     if not dataclasses.is_dataclass(scenario) or isinstance(scenario, type):
-        raise checks.fail("scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario.")
+        raise checks.fail(
+            "scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario."
+        )
 
 
-def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = None) -> Iterator[Parameter]:
+def _walk(
+    part: Any, path: str, named: bool, units: Mapping[str, str] | None = None
+) -> Iterator[Parameter]:
     units = units or {}
     if isinstance(part, tuple | list):
         for i, x in enumerate(part):
@@ -96,7 +110,11 @@ def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = N
                 # As a user would type them, unless the wrapper has a field of that name.
                 for inner in _walk(value, path, named):
                     rest = inner.path[len(path) :].lstrip(".")
-                    yield inner if parse(rest)[0] not in own else inner._replace(path=f"{name}.{rest}")
+                    yield (
+                        inner
+                        if parse(rest)[0] not in own
+                        else inner._replace(path=f"{name}.{rest}")
+                    )
                 continue
             if isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
                 yield Parameter(name, jnp.shape(value), _unit(field, of_leaves), value)
@@ -107,7 +125,9 @@ def _walk(part: Any, path: str, named: bool, units: Mapping[str, str] | None = N
 
 
 def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
-    """The unit of a leaf: its own, unless what holds it says otherwise (`units` among the metadata of its field)."""
+    """The unit of a leaf: its own, unless what holds it says otherwise (`units` among the metadata
+    of its field).
+    """
     return str(units.get(field.name, field.metadata.get("unit", "")))
 
 
@@ -125,12 +145,18 @@ def _rows(part: Any, path: str) -> Iterator[Parameter]:
                 value = getattr(part, field)
                 row = value[..., i] if jnp.ndim(value) == 1 else value[i]
                 place = f"{word}[{_quoted(name)}].{field}"
-                yield Parameter(f"{path}.{place}" if path else place, jnp.shape(row), units[field], row)
+                yield Parameter(
+                    f"{path}.{place}" if path else place, jnp.shape(row), units[field], row
+                )
 
 
 def _quoted(name: str) -> str:
     """The name of a row as a path spells it."""
-    return name if re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"') else json.dumps(name)
+    return (
+        name
+        if re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"')
+        else json.dumps(name)
+    )
 
 
 def _unquoted(text: str) -> str | None:
@@ -152,15 +178,25 @@ def parse(path: str) -> list[str | int]:
         name = match[4] if match[3] is None else _unquoted(match[3])
         if match[1] is None and match[2] is None and name is None:
             break
-        tokens.append(match[1] if match[1] is not None else int(match[2]) if match[2] is not None else RowName(name))
+        tokens.append(
+            match[1]
+            if match[1] is not None
+            else int(match[2])
+            if match[2] is not None
+            else RowName(name)
+        )
         position = match.end()
     if not isinstance(path, str) or not path or position < len(path):
-        raise checks.fail("path", path, 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"')
+        raise checks.fail(
+            "path", path, 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
+        )
     return tokens
 
 
 def expand(path: str) -> list[str]:
-    """The full paths that one path stands for: two for `robot.`, else itself.  ValueError if it is not a path."""
+    """The full paths that one path stands for: two for `robot.`, else itself.  ValueError if it is
+    not a path.
+    """
     parse(path)
     if path == "robot" or path.startswith(("robot.", "robot[")):
         return ["plant" + path[5:], "model" + path[5:]]
@@ -180,7 +216,9 @@ def get(scenario: Scenario, path: str) -> Any:
 
 
 def places(scenario: Scenario, path: str) -> list[list[str | int]]:
-    """Where the numbers at a path are: fields and indices alone, for each full path that it stands for."""
+    """Where the numbers at a path are: fields and indices alone, for each full path that it stands
+    for.
+    """
     return [_resolved(scenario, path, full)[0] for full in expand(path)]
 
 
@@ -190,7 +228,9 @@ def leaves(scenario: Scenario, path: str) -> list[str]:
     def joined(tokens):
         while isinstance(tokens[-1], int):
             tokens = tokens[:-1]
-        return "".join(f"[{token}]" if isinstance(token, int) else f".{token}" for token in tokens).lstrip(".")
+        return "".join(
+            f"[{token}]" if isinstance(token, int) else f".{token}" for token in tokens
+        ).lstrip(".")
 
     return [joined(tokens) for tokens in places(scenario, path)]
 
@@ -237,7 +277,11 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
                 value = _entry(value, step) if isinstance(step, int) else _field(value, step)
         except (AttributeError, IndexError, TypeError, KeyError, ValueError):
             raise _unknown(scenario, path) from None
-        if isinstance(steps[-1], int) and not isinstance(value, jax.Array | np.ndarray | float) and not dataclasses.is_dataclass(value):
+        if (
+            isinstance(steps[-1], int)
+            and not isinstance(value, jax.Array | np.ndarray | float)
+            and not dataclasses.is_dataclass(value)
+        ):
             raise _unknown(scenario, path)
         place += steps
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
@@ -246,7 +290,9 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
 
 
 def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
-    """The fields and indices that the first tokens stand for in a component, and the tokens that are left."""
+    """The fields and indices that the first tokens stand for in a component, and the tokens that
+    are left.
+    """
     token = tokens[0]
     if isinstance(token, int):
         return [token], tokens[1:]
@@ -270,7 +316,9 @@ def _has_field(part: Any, name: str) -> bool:
 
 
 def _entry(part: Any, index: int) -> Any:
-    """Part or entry `index`; unlike an array of JAX, which takes the nearest entry, it raises IndexError beyond the ends."""
+    """Part or entry `index`; unlike an array of JAX, which takes the nearest entry, it raises
+    IndexError beyond the ends.
+    """
     if not isinstance(part, tuple | list | jax.Array | np.ndarray):
         raise TypeError(part)
     size = len(part) if isinstance(part, tuple | list) else part.shape[0]
@@ -295,23 +343,34 @@ def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: s
         return _new_value(part, tokens, value, path, sign)
     head, rest = tokens[0], tokens[1:]
     if isinstance(head, int):
-        return tuple(_replaced(x, rest, value, path, sign) if i == head % len(part) else x for i, x in enumerate(part))
+        return tuple(
+            _replaced(x, rest, value, path, sign) if i == head % len(part) else x
+            for i, x in enumerate(part)
+        )
     copy = object.__new__(type(part))
     for field in dataclasses.fields(part):
         old = getattr(part, field.name)
-        new = _replaced(old, rest, value, path, field.metadata.get("sign")) if field.name == head else old
+        new = (
+            _replaced(old, rest, value, path, field.metadata.get("sign"))
+            if field.name == head
+            else old
+        )
         object.__setattr__(copy, field.name, new)
     return copy
 
 
-def _new_value(old: Any, tokens: list[str | int], value: Any, path: str, sign: str | None) -> jax.Array:
+def _new_value(
+    old: Any, tokens: list[str | int], value: Any, path: str, sign: str | None
+) -> jax.Array:
     """The new array in place of a leaf, or of one of its entries."""
     old = jnp.asarray(old)
     index = tuple(t for t in tokens if isinstance(t, int))
     target = old[index] if index else old
     new = checks.as_floats(path, value)
     if new.shape not in ((), target.shape):
-        raise checks.fail(path, value, f"one number or shape {target.shape}", f"Its shape is {new.shape}.")
+        raise checks.fail(
+            path, value, f"one number or shape {target.shape}", f"Its shape is {new.shape}."
+        )
     checks.check_values(path, new, sign)
     new = jnp.broadcast_to(new, target.shape).astype(old.dtype)
     return old.at[index].set(new) if index else new
@@ -322,17 +381,22 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
 
     Args:
       scenario: what to change; it stays as it is.
-      values: path -> number or array; a scalar fills every entry of its leaf.  Traced values are fine: differentiate by them.
+      values: path -> number or array; a scalar fills every entry of its leaf.  Traced values are
+        fine: differentiate by them.
 
     Returns:
-      A new Scenario of the same structure: nothing recompiles, unless a zero, one or equality of an arm's geometry comes or goes.
+      A new Scenario of the same structure: nothing recompiles, unless a zero, one or equality of an
+        arm's geometry comes or goes.
 
     Raises:
-      ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the remedy.
+      ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the
+        remedy.
     """
     _need_component(scenario)
     if not isinstance(values, Mapping):
-        raise checks.fail("values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}')
+        raise checks.fail(
+            "values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}'
+        )
     for path, value in values.items():
         for full in expand(path):
             scenario = _replaced(scenario, _resolved(scenario, path, full)[0], value, full, None)
@@ -340,7 +404,9 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
 
 
 def why_inadmissible(scenario: Scenario, values: Mapping[str, Any]) -> str:
-    """Why the scenario with these leaves replaced cannot be run, in words (a start outside its bounds, a negative mass); "" if it can."""
+    """Why the scenario with these leaves replaced cannot be run, in words (a start outside its
+    bounds, a negative mass); "" if it can.
+    """
     with notices.muted():  # advice on gains
         try:
             canonical(with_parameters(scenario, values))

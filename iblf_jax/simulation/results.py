@@ -1,6 +1,7 @@
 """What a run gives back: `Rollout`, and the named `Metrics` in it.
 
-Both are pytrees, so `jax.vmap(ij.simulate...)` gives a Rollout of many runs, time axis after the run axis; an index selects a run.
+Both are pytrees, so `jax.vmap(ij.simulate...)` gives a Rollout of many runs, time axis after the
+run axis; an index selects a run.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from iblf_jax.simulation.signals import Signals
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Metrics(Mapping):
-    """Named results of the folds: `metrics.rmse` or `metrics["rmse"]`; `list(metrics)` names them, `units` has their units."""
+    """Named results of the folds: `metrics.rmse` or `metrics["rmse"]`; `list(metrics)` names them,
+    `units` has their units.
+    """
 
     values_by_name: dict[str, jax.Array]
     unit_pairs: tuple[tuple[str, str], ...] = dataclasses.field(metadata={"static": True})
@@ -36,7 +39,9 @@ class Metrics(Mapping):
         try:
             return self.values_by_name[name]
         except KeyError:
-            raise KeyError(f"no metric {name!r}; there are {', '.join(self.values_by_name)}") from None
+            raise KeyError(
+                f"no metric {name!r}; there are {', '.join(self.values_by_name)}"
+            ) from None
 
     def __getattr__(self, name: str) -> jax.Array:
         if name.startswith("_") or name in ("values_by_name", "unit_pairs"):
@@ -44,7 +49,9 @@ class Metrics(Mapping):
         try:
             return self.values_by_name[name]
         except KeyError:
-            raise AttributeError(f"no metric {name!r}; there are {', '.join(self.values_by_name)}") from None
+            raise AttributeError(
+                f"no metric {name!r}; there are {', '.join(self.values_by_name)}"
+            ) from None
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self.values_by_name]
@@ -58,7 +65,11 @@ class Metrics(Mapping):
     def __repr__(self) -> str:
         rows = []
         for name, value in self.values_by_name.items():
-            shown = np.array2string(np.asarray(value), precision=4, threshold=8) if checks.is_concrete(value) else str(value)
+            shown = (
+                np.array2string(np.asarray(value), precision=4, threshold=8)
+                if checks.is_concrete(value)
+                else str(value)
+            )
             rows.append(f"  {name:22s} {shown} {self.units.get(name, '')}".rstrip())
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 
@@ -68,9 +79,10 @@ class Metrics(Mapping):
 class Rollout(Signals):
     """One run of a scenario, or many: every array below has a leading run axis then.
 
-    Its signals, `run.t`, `run.q`, `run.tau` ..., are those of `simulation.signals`, (T,) or (T, n) for T recorded samples and n joints;
-    those that the scenario does not have (bounds of the velocities) are `()`.  Recorded samples are every `record_every`-th step from
-    t = 0; metrics and status cover every step.
+    Its signals, `run.t`, `run.q`, `run.tau` ..., are those of `simulation.signals`, (T,) or (T, n)
+    for T recorded samples and n joints; those that the scenario does not have (bounds of the
+    velocities) are `()`.  Recorded samples are every `record_every`-th step from t = 0; metrics and
+    status cover every step.
     """
 
     scenario: Scenario
@@ -80,22 +92,26 @@ class Rollout(Signals):
     observer_state: Any
     """State of the observer, time axis first; `()` if it has none."""
     metrics: Metrics
-    """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, () [1]: the estimated error of the
-    positions that the time step is to blame for, as it is and relative to the width of the tube (`accuracy`)."""
+    """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, ()
+    [1]: the estimated error of the positions that the time step is to blame for, as it is and
+    relative to the width of the tube (`accuracy`)."""
     status: jax.Array
     """Bit flags of `Status`, () int32; 0 is ok."""
     fastest_mode: jax.Array
-    """Largest measured mode of the closed loop, () [1/s]; dt times this decides whether the step was too large."""
+    """Largest measured mode of the closed loop, () [1/s]; dt times this decides whether the step
+    was too large."""
     dt: jax.Array
     """Time step, () [s]."""
     method: str = dataclasses.field(metadata={"static": True})
     """The integrator."""
     steps: int | None = dataclasses.field(default=None, metadata={"static": True})
-    """Steps that were made, recorded or not; None if it is not known whether there were more than up to the last sample."""
+    """Steps that were made, recorded or not; None if it is not known whether there were more than
+    up to the last sample."""
     actuator_state: Any = ()
     """State of the actuator, time axis first; `()` if it has none."""
     measured: Any = ()
-    """What the sensor told last, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where the law is not sampled."""
+    """What the sensor told last, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where
+    the law is not sampled."""
 
     @property
     def ok(self) -> bool:
@@ -120,17 +136,26 @@ class Rollout(Signals):
     def __getitem__(self, index) -> Rollout:
         """The run (or runs) with this index."""
         if not self.is_batch:
-            raise TypeError("this Rollout is one run and cannot be indexed; index its arrays, run.q[0]")
+            raise TypeError(
+                "this Rollout is one run and cannot be indexed; index its arrays, run.q[0]"
+            )
         return jax.tree.map(lambda x: x[index], self)
 
     def __repr__(self) -> str:
         if not checks.is_concrete(self):
             return "Rollout(being traced)"
-        shape = f"{self.q.shape[-2]} samples, {self.n} joints, dt = {float(np.ravel(self.dt)[0]):g} s, {self.method}"
+        shape = (
+            f"{self.q.shape[-2]} samples, {self.n} joints, dt = {float(np.ravel(self.dt)[0]):g} s,"
+            f" {self.method}"
+        )
         if self.is_batch:
             bad = int(np.sum(np.asarray(self.status) != 0))
             return f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"
-        accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube" if RELATIVE in self.metrics else ""
+        accuracy = (
+            f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube"
+            if RELATIVE in self.metrics
+            else ""
+        )
         return f"Rollout({shape}; status: {describe(int(self.status))}{accuracy})"
 
     def _repr_html_(self) -> str:
@@ -139,13 +164,17 @@ class Rollout(Signals):
         return reports.card(self)
 
     def to_xarray(self):
-        """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its attributes."""
+        """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its
+        attributes.
+        """
         from iblf_jax.files.rollouts import rollout_to_xarray
 
         return rollout_to_xarray(self)
 
     def plot(self, **options):
-        """Overview figure: tube, errors, torque, estimate, phase portrait.  Options as `plotting.overview`."""
+        """Overview figure: tube, errors, torque, estimate, phase portrait.  Options as
+        `plotting.overview`.
+        """
         from iblf_jax import plotting
 
         return plotting.overview(self, **options)

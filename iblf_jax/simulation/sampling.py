@@ -1,7 +1,9 @@
-"""When a law runs that is sampled: its period, when its torque arrives, and the noise of what it is told.
+"""When a law runs that is sampled: its period, when its torque arrives, and the noise of what it is
+told.
 
-Time goes in steps dt, of which a period holds m.  Instant k is the start of a sample where k is a multiple of m.  A command arrives `delay`
-after its sample's start, wherever that lies in a step: the integrator makes two of that step.
+Time goes in steps dt, of which a period holds m.  Instant k is the start of a sample where k is a
+multiple of m.  A command arrives `delay` after its sample's start, wherever that lies in a step:
+the integrator makes two of that step.
 """
 
 from __future__ import annotations
@@ -31,23 +33,29 @@ WORD = 1 << 16
 
 @component
 class Sampling:
-    """Law and observer run once a period on what was measured at its start; their torque is held, and arrives `delay` later.
+    """Law and observer run once a period on what was measured at its start; their torque is held,
+    and arrives `delay` later.
 
-        y_k = sensor(x(t_k)),   (tau_k, z_(k+1)) = law(t_k, y_k, z_k),   tau(t) = tau_k for t_k + delay <= t < t_(k+1) + delay
+        y_k = sensor(x(t_k)),   (tau_k, z_(k+1)) = law(t_k, y_k, z_k),   tau(t) = tau_k for t_k +
+        delay <= t < t_(k+1) + delay
 
-    Until the first command arrives the torque is G0(q(0)) of the model.  Which instants are samples has no derivative by the period, the
-    torque has one by the delay, unless that is 0.
+    Until the first command arrives the torque is G0(q(0)) of the model.  Which instants are samples
+    has no derivative by the period, the torque has one by the delay, unless that is 0.
 
     Args:
       period: () [s], > 0; a whole number of steps dt.
       delay: () [s], >= 0, of any length; 0 if not given.
-      observer: how an observer goes to the next period; "exact" if not given.  "exact": (3.11) integrated over the period with what was
-        measured and commanded at its start; as the robot moves on meanwhile, f_hat is off by about kf period / 2 times the torque that
-        accelerates it.  "poles": a step of Euler with gains that forget in a period what the observer does, without that bias.  "euler":
-        one with the observer's own gains, unstable from kf period = 2 on.
-      queue: how many commands may be under way at once; as many as the delay needs if not given.  A study that makes it longer needs more.
+      observer: how an observer goes to the next period; "exact" if not given.  "exact": (3.11)
+        integrated over the period with what was measured and commanded at its start; as the robot
+        moves on meanwhile, f_hat is off by about kf period / 2 times the torque that accelerates
+        it.  "poles": a step of Euler with gains that forget in a period what the observer does,
+        without that bias.  "euler": one with the observer's own gains, unstable from kf period = 2
+        on.
+      queue: how many commands may be under way at once; as many as the delay needs if not given.  A
+        study that makes it longer needs more.
 
-    Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 2 and 3.
+    Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 2 and
+      3.
     """
 
     period: Leaf = leaf("s", sign="positive", shape="scalar")
@@ -65,11 +73,22 @@ class Sampling:
         least = self.needed if concrete else 0
         if self.queue is None:
             if not concrete:
-                raise checks.fail("Sampling.queue", None, "a whole number, where period or delay is traced", "Such as queue=1.")
+                raise checks.fail(
+                    "Sampling.queue",
+                    None,
+                    "a whole number, where period or delay is traced",
+                    "Such as queue=1.",
+                )
             object.__setattr__(self, "queue", least)
-        object.__setattr__(self, "queue", checks.positive_integer("Sampling.queue", self.queue, least=0))
+        object.__setattr__(
+            self, "queue", checks.positive_integer("Sampling.queue", self.queue, least=0)
+        )
         if self.queue < least:
-            raise checks.fail("Sampling.queue", self.queue, f"at least {least}, for a delay of {float(self.delay):g} s")
+            raise checks.fail(
+                "Sampling.queue",
+                self.queue,
+                f"at least {least}, for a delay of {float(self.delay):g} s",
+            )
 
     @property
     def needed(self) -> int:
@@ -119,7 +138,8 @@ class Arriving(NamedTuple):
 def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array) -> Arriving:
     """The torque of a step that may change once within it.
 
-    A command that arrives with the end of a step is its own: then the step's torque has a derivative by the delay there too.
+    A command that arrives with the end of a step is its own: then the step's torque has a
+      derivative by the delay there too.
 
     Args:
       sampling: the period and the delay.
@@ -129,28 +149,41 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
     """
     if sampling.queue == 0:
         one = jnp.ones_like(dt)
-        return Arriving(_if_possible(sampling, dt, sampling.delay, commands[0]), commands[0], one, one < 0)
+        return Arriving(
+            _if_possible(sampling, dt, sampling.delay, commands[0]), commands[0], one, one < 0
+        )
     age, place, changes = _arrival(sampling, dt, now.phase)
     old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
-    return Arriving(_if_possible(sampling, dt, age, old), new, jnp.where(changes, place, 1.0), changes)
+    return Arriving(
+        _if_possible(sampling, dt, age, old), new, jnp.where(changes, place, 1.0), changes
+    )
 
 
-def _arrival(sampling: Sampling, dt: jax.Array, phase: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of a step so many steps after a sample: the age of the command at work at its start, counted from the newest, in samples; where the
-    one after it arrives [steps]; and whether that is within the step.
+def _arrival(
+    sampling: Sampling, dt: jax.Array, phase: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of a step so many steps after a sample: the age of the command at work at its start, counted
+    from the newest, in samples; where the one after it arrives [steps]; and whether that is within
+    the step.
     """
     delay = sampling.delay / dt
     whole = jnp.round(delay)
     near = NEARLY + 4.0 * jnp.finfo(dt.dtype).eps * delay
-    delay = delay + jax.lax.stop_gradient(jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0))
+    delay = delay + jax.lax.stop_gradient(
+        jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0)
+    )
     steps, phase = _steps(sampling, dt), phase.astype(dt.dtype)
     age = jnp.maximum(jnp.ceil(jax.lax.stop_gradient(delay - phase) / steps), 0.0)
     place = delay - phase - (age - 1.0) * steps
     return age, place, (age > 0) & (place <= 1.0)
 
 
-def arrival_before(sampling: Sampling, dt: jax.Array, now: Instant) -> tuple[jax.Array, jax.Array] | None:
-    """When a command arrived in the step before an instant, counted from that step's start, () [s], and whether one did."""
+def arrival_before(
+    sampling: Sampling, dt: jax.Array, now: Instant
+) -> tuple[jax.Array, jax.Array] | None:
+    """When a command arrived in the step before an instant, counted from that step's start, () [s],
+    and whether one did.
+    """
     if sampling.queue == 0:
         return None
     steps = _steps(sampling, dt).astype(now.phase.dtype)
@@ -158,7 +191,9 @@ def arrival_before(sampling: Sampling, dt: jax.Array, now: Instant) -> tuple[jax
     return place * dt, changes
 
 
-def torque_before(sampling: Sampling, dt: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:
+def torque_before(
+    sampling: Sampling, dt: jax.Array, before: jax.Array, after: jax.Array
+) -> jax.Array:
     """The torque that is at work just before a sample, (n,) [N m].
 
     Args:
@@ -169,15 +204,22 @@ def torque_before(sampling: Sampling, dt: jax.Array, before: jax.Array, after: j
     """
     if sampling.queue == 0:
         return before[0]
-    # A command that arrives with the sample is that of the step before, so what is at work is at least one sample old.
+    # A command that arrives with the sample is that of the step before, so what is at work is at
+    # least one sample old.
     age, _, _ = _arrival(sampling, dt, jnp.zeros((), jnp.int32))
     return _chosen(after, jnp.maximum(age, 1.0))
 
 
 def _if_possible(sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array) -> jax.Array:
-    """The torque; no number where a command has left the queue before it arrived, or a period is no whole number of steps."""
+    """The torque; no number where a command has left the queue before it arrived, or a period is no
+    whole number of steps.
+    """
     steps = sampling.period / dt
-    return jnp.where((age <= sampling.queue) & (jnp.abs(steps - _steps(sampling, dt)) <= WHOLE * steps), torque, jnp.nan)
+    return jnp.where(
+        (age <= sampling.queue) & (jnp.abs(steps - _steps(sampling, dt)) <= WHOLE * steps),
+        torque,
+        jnp.nan,
+    )
 
 
 def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:
@@ -189,11 +231,15 @@ def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:
 
 
 def with_room(scenario: Scenario) -> Scenario:
-    """The scenario with a queue that is long enough for its delay, whatever it was when the sampling was made."""
+    """The scenario with a queue that is long enough for its delay, whatever it was when the
+    sampling was made.
+    """
     sampling = scenario.sampling
     if sampling is None or not checks.is_concrete(sampling) or sampling.queue >= sampling.needed:
         return scenario
-    return dataclasses.replace(scenario, sampling=dataclasses.replace(sampling, queue=sampling.needed))
+    return dataclasses.replace(
+        scenario, sampling=dataclasses.replace(sampling, queue=sampling.needed)
+    )
 
 
 def check_step(scenario: Scenario, dt: float) -> None:
@@ -205,14 +251,21 @@ def check_step(scenario: Scenario, dt: float) -> None:
     steps = period / dt
     if round(steps) < 1 or abs(steps - round(steps)) > WHOLE * steps:
         fitting = period / max(math.ceil(steps - 1e-9), 1)
-        raise checks.fail("dt", dt, f"a whole number of steps in sampling.period = {period:g} s", f"Take dt={fitting:.6g}.")
+        raise checks.fail(
+            "dt",
+            dt,
+            f"a whole number of steps in sampling.period = {period:g} s",
+            f"Take dt={fitting:.6g}.",
+        )
 
 
 # ------------------------------------------------------------------------------------------------------------------- noise
 
 
 def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
-    """Four words of 16 bits, as floats, for the noise of one run of a study whose seed gave `key`; (4,) float32."""
+    """Four words of 16 bits, as floats, for the noise of one run of a study whose seed gave `key`;
+    (4,) float32.
+    """
     own = jax.random.fold_in(jax.random.fold_in(key, run), NOISE)
     return jax.random.bits(own, (4,), jnp.uint16).astype(jnp.float32)
 
@@ -238,9 +291,11 @@ WEYL = (0x9E37, 0xBB67)
 
 
 def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
-    """Independent standard normal numbers of one sample, (draws, n): they depend on nothing but key, sample and place.
+    """Independent standard normal numbers of one sample, (draws, n): they depend on nothing but
+    key, sample and place.
 
-    A counter-based generator: ten rounds of products, their halves crossed and joined with the key, as in Philox; then Box and Muller.
+    A counter-based generator: ten rounds of products, their halves crossed and joined with the key,
+      as in Philox; then Box and Muller.
     JAX's own does not lower to scalar programs.
 
     Args:
@@ -266,7 +321,9 @@ def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax
         a, b = MULTIPLIERS[0] * x[0], MULTIPLIERS[1] * x[2]
         x = [_upper(b) ^ x[1] ^ k[0], b & low, _upper(a) ^ x[3] ^ k[1], a & low]
         k = [(k[0] + WEYL[0]) & low, (k[1] + WEYL[1]) & low]
-    first, second = ((x[i].astype(dtype) * WORD + x[i + 1].astype(dtype) + 0.5) / (WORD * WORD) for i in (0, 2))
+    first, second = (
+        (x[i].astype(dtype) * WORD + x[i + 1].astype(dtype) + 0.5) / (WORD * WORD) for i in (0, 2)
+    )
     size, angle = jnp.sqrt(-2.0 * jnp.log(first)), 2.0 * np.pi * second
     return [size * jnp.cos(angle), size * jnp.sin(angle)]
 

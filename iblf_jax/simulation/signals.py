@@ -1,4 +1,6 @@
-"""What can be seen of a loop: every signal with its unit and its meaning, listed here and nowhere else."""
+"""What can be seen of a loop: every signal with its unit and its meaning, listed here and nowhere
+else.
+"""
 
 from __future__ import annotations
 
@@ -39,20 +41,24 @@ class Signals:
     disturbance_estimate: Annotated[Array, Recorded("N m", "estimate of the uncertain term")]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
-    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = dataclasses.field(default=(), kw_only=True)
+    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = dataclasses.field(
+        default=(), kw_only=True
+    )
     """`()` where velocities have no bounds."""
-    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = dataclasses.field(default=(), kw_only=True)
-    slack: Annotated[Any, Recorded("rad/s^2", "how far the law's filter broke its own conditions")] = dataclasses.field(
+    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = dataclasses.field(
         default=(), kw_only=True
     )
+    slack: Annotated[
+        Any, Recorded("rad/s^2", "how far the law's filter broke its own conditions")
+    ] = dataclasses.field(default=(), kw_only=True)
     """`()` under laws without a filter."""
-    region_margin: Annotated[Any, Recorded("m", "distance of the regions' points to their walls")] = dataclasses.field(
-        default=(), kw_only=True
-    )
+    region_margin: Annotated[
+        Any, Recorded("m", "distance of the regions' points to their walls")
+    ] = dataclasses.field(default=(), kw_only=True)
     """One number a region; `()` where there are none."""
-    region_slack: Annotated[Any, Recorded("m/s^2", "how far the law's filter broke its own conditions on the regions")] = dataclasses.field(
-        default=(), kw_only=True
-    )
+    region_slack: Annotated[
+        Any, Recorded("m/s^2", "how far the law's filter broke its own conditions on the regions")
+    ] = dataclasses.field(default=(), kw_only=True)
     """`()` without regions or without a filter."""
 
 
@@ -64,7 +70,8 @@ class Sample(Signals):
     dt: Array
     """Weight of this sample in an integral over time, sum dt g, () [s].
 
-    The weights are those of the trapezoidal rule: the step, half of it for the first and the last sample.  Where signals jump there are two
+    The weights are those of the trapezoidal rule: the step, half of it for the first and the last
+      sample.  Where signals jump there are two
     samples of one time, the limits from either side, each with half of the time to its neighbour.
     """
     gravity: Array
@@ -72,11 +79,14 @@ class Sample(Signals):
     guard_active: Array
     saturated: Array
     step: Any = dataclasses.field(default=0.0, kw_only=True)
-    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples beside a jump."""
+    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples
+    beside a jump."""
 
 
 def has(sample: Signals, signal: str) -> bool:
-    """Whether there is an optional signal: bounds of the velocities, a slack, margins of regions."""
+    """Whether there is an optional signal: bounds of the velocities, a slack, margins of
+    regions.
+    """
     return not isinstance(getattr(sample, signal), tuple)
 
 
@@ -90,11 +100,18 @@ OF_REGIONS = ("region_margin", "region_slack", "largest_region_slack")
 
 
 def own_dims(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
-    """Dimensions of a signal or metric at one instant or of one run: joint for (n,), region, else its own."""
+    """Dimensions of a signal or metric at one instant or of one run: joint for (n,), region, else
+    its own.
+    """
     if name in OF_REGIONS:
         return ("region",)
-    return ("joint",) if shape == (joints,) else tuple(f"{name}_axis_{i}" for i in range(len(shape)))
+    return (
+        ("joint",) if shape == (joints,) else tuple(f"{name}_axis_{i}" for i in range(len(shape)))
+    )
 
 
-SIGNALS: dict[str, Recorded] = {name: hint.__metadata__[0] for name, hint in get_type_hints(Signals, include_extras=True).items()}
+SIGNALS: dict[str, Recorded] = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(Signals, include_extras=True).items()
+}
 """Name of a recorded signal -> its unit and meaning, time first."""

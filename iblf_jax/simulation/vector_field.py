@@ -1,7 +1,9 @@
-"""The closed loop as x' = field(t, x) over one flat vector x, for solvers of other libraries: diffrax, SciPy, optimistix.
+"""The closed loop as x' = field(t, x) over one flat vector x, for solvers of other libraries:
+diffrax, SciPy, optimistix.
 
-The loop's own state is a pytree, and holds an empty tuple for a law without memory, which some solvers cannot carry (diffrax: "Only arrays
-can be treated as buffers").  Here its numbers stand one after the other, in the order of `iblf_jax.simulation.closed_loop.LoopState`:
+The loop's own state is a pytree, and holds an empty tuple for a law without memory, which some
+solvers cannot carry (diffrax: "Only arrays can be treated as buffers").  Here its numbers stand one
+  after the other, in the order of `iblf_jax.simulation.closed_loop.LoopState`:
 
     x = (q, q', state of the law, state of the observer),   (m,)
 
@@ -26,9 +28,11 @@ from iblf_jax.simulation.signals import Sample
 
 @component
 class VectorField:
-    """x' = field(t, x), the closed loop of a scenario over a flat state x, (m,); made by `vector_field`.
+    """x' = field(t, x), the closed loop of a scenario over a flat state x, (m,); made by
+    `vector_field`.
 
-    It is a pytree whose leaves are the scenario's: pass it through `jit`, `vmap` and `grad` like one.
+    It is a pytree whose leaves are the scenario's: pass it through `jit`, `vmap` and `grad` like
+    one.
 
     Args:
       scenario: what runs, a `Scenario`; canonical, as `vector_field` makes it.
@@ -39,12 +43,18 @@ class VectorField:
     def check(self) -> None:
         """Raises ValueError for something that is not a scenario."""
         if not isinstance(self.scenario, Scenario):
-            raise checks.fail("VectorField.scenario", self.scenario, "a Scenario", "Make the field with ij.vector_field(scenario).")
+            raise checks.fail(
+                "VectorField.scenario",
+                self.scenario,
+                "a Scenario",
+                "Make the field with ij.vector_field(scenario).",
+            )
 
     def __call__(self, t: Any, x: Any, args: Any = None) -> jax.Array:
         """The rate of the state.
 
-            x' = (q', q", rate of the law's state, rate of the observer's)                                      (2.1), (3.14), (3.11)
+            x' = (q', q", rate of the law's state, rate of the observer's)
+            (2.1), (3.14), (3.11)
 
         Args:
           t: time, () [s].
@@ -61,23 +71,31 @@ class VectorField:
 
     @property
     def start(self) -> jax.Array:
-        """The state at t = 0, (m,): `scenario.initial`, and the states of law and observer that belong to it."""
+        """The state at t = 0, (m,): `scenario.initial`, and the states of law and observer that
+        belong to it.
+        """
         return _start(self.scenario)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each entry of x is, m names: "q[0]" [rad], "dq[0]" [rad/s], then "controller..." and "observer..." in units of their own."""
+        """What each entry of x is, m names: "q[0]" [rad], "dq[0]" [rad/s], then "controller..." and
+        "observer..." in units of their own.
+        """
         found = []
         for path, leaf in jax.tree_util.tree_leaves_with_path(_layout(self.scenario)):
             name = jax.tree_util.keystr(path).lstrip(".")
-            found += [f"{name}[{', '.join(map(str, index))}]" if index else name for index in np.ndindex(leaf.shape)]
+            found += [
+                f"{name}[{', '.join(map(str, index))}]" if index else name
+                for index in np.ndindex(leaf.shape)
+            ]
         return tuple(found)
 
     def pack(self, state: LoopState) -> jax.Array:
         """The flat vector of a state.
 
         Args:
-          state: q [rad], dq [rad/s], and the states of law and observer, with the same leading axes each, or none.
+          state: q [rad], dq [rad/s], and the states of law and observer, with the same leading axes
+            each, or none.
 
         Returns:
           (..., m).
@@ -88,13 +106,15 @@ class VectorField:
         return _pack(self.scenario, state)
 
     def unpack(self, x: Any) -> LoopState:
-        """Position, velocity and the states of law and observer from flat vectors: of one instant, or of a trajectory.
+        """Position, velocity and the states of law and observer from flat vectors: of one instant,
+        or of a trajectory.
 
         Args:
           x: (..., m); SciPy's `solution.y` has time last, so give `solution.y.T`.
 
         Returns:
-          `iblf_jax.simulation.closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s], controller and observer as these make
+          `iblf_jax.simulation.closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s],
+            controller and observer as these make
           them, leading axes first.
 
         Raises:
@@ -103,7 +123,8 @@ class VectorField:
         return _unpack(self.scenario, checks.as_floats("x", x))
 
     def sample(self, t: Any, x: Any) -> Sample:
-        """Everything that can be looked at in one instant: tau, e1, xi, the bounds, f and f_hat, V ...; a trajectory by `jax.vmap`.
+        """Everything that can be looked at in one instant: tau, e1, xi, the bounds, f and f_hat, V
+        ...; a trajectory by `jax.vmap`.
 
         Args:
           t: time, () [s].
@@ -119,30 +140,39 @@ class VectorField:
 
 
 def vector_field(scenario: Scenario) -> VectorField:
-    """The closed loop of a scenario for solvers of other libraries: a function of time and of one flat state.
+    """The closed loop of a scenario for solvers of other libraries: a function of time and of one
+    flat state.
 
-        x' = field(t, x),   x(0) = field.start,   x = (q, q', state of the law, state of the observer)
+        x' = field(t, x),   x(0) = field.start,   x = (q, q', state of the law, state of the
+        observer)
 
-    It takes (t, x) for SciPy and (t, x, args) for diffrax, works under `jit`, `vmap`, `grad` and `jacfwd`, and is differentiable by
-    every leaf of the scenario: make it inside the function that you differentiate.  Nothing stops or freezes a run that leaves its
-    bounds: metrics, status and warnings belong to `simulate`.  An adaptive solver has to know where the right-hand side
-    jumps: `scenario.jump_times()`.
+    It takes (t, x) for SciPy and (t, x, args) for diffrax, works under `jit`, `vmap`, `grad` and
+    `jacfwd`, and is differentiable by every leaf of the scenario: make it inside the function that
+    you differentiate.  Nothing stops or freezes a run that leaves its bounds: metrics, status and
+    warnings belong to `simulate`.  An adaptive solver has to know where the right-hand side jumps:
+    `scenario.jump_times()`.
 
     Args:
       scenario: what runs, of n joints.
 
     Returns:
-      A `VectorField`: called for the rate; `start`, `names`, `pack`, `unpack` and `sample` for the rest.
+      A `VectorField`: called for the rate; `start`, `names`, `pack`, `unpack` and `sample` for the
+        rest.
 
     Raises:
-      ValueError: as `simulate`, for a scenario that cannot run, or a law that is sampled; the message names the field, the value and the
-        remedy.
+      ValueError: as `simulate`, for a scenario that cannot run, or a law that is sampled; the
+        message names the field, the value and the remedy.
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
     field = VectorField(canonical(scenario))
     if field.scenario.sampling is not None:
-        raise checks.fail("scenario.sampling", "a sampled law", "a law that runs at every instant", "Its torque jumps: use ij.simulate.")
+        raise checks.fail(
+            "scenario.sampling",
+            "a sampled law",
+            "a law that runs at every instant",
+            "Its torque jumps: use ij.simulate.",
+        )
     return field
 
 
@@ -154,24 +184,37 @@ def _layout(scenario: Scenario) -> LoopState:
 def _pack(scenario: Scenario, state: LoopState) -> jax.Array:
     leaves, structure = jax.tree.flatten(_layout(scenario))
     shapes, of = [x.shape for x in leaves], jax.tree.structure(state)
-    expected = f"a LoopState whose arrays have the shapes {shapes}, behind leading axes that all share"
+    expected = (
+        f"a LoopState whose arrays have the shapes {shapes}, behind leading axes that all share"
+    )
     if of != structure:  # type: ignore[operator]
         raise checks.fail("state", state, expected)
     given = [checks.as_floats("state", x) for x in jax.tree.leaves(state)]
     lead = given[0].shape[: given[0].ndim - len(shapes[0])]
     if [x.shape for x in given] != [(*lead, *shape) for shape in shapes]:
         raise checks.fail("state", [x.shape for x in given], expected)
-    return jnp.concatenate([x.reshape(*lead, math.prod(shape)) for x, shape in zip(given, shapes, strict=True)], axis=-1)
+    return jnp.concatenate(
+        [x.reshape(*lead, math.prod(shape)) for x, shape in zip(given, shapes, strict=True)],
+        axis=-1,
+    )
 
 
 def _unpack(scenario: Scenario, x: jax.Array) -> LoopState:
     leaves, structure = jax.tree.flatten(_layout(scenario))
     ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])
     if x.ndim < 1 or x.shape[-1] != ends[-1]:
-        remedy = "VectorField.names says what its entries are; of a SciPy solution give solution.y.T."
+        remedy = (
+            "VectorField.names says what its entries are; of a SciPy solution give solution.y.T."
+        )
         raise checks.fail("x", x, f"shape (..., {ends[-1]})", f"Its shape is {x.shape}. {remedy}")
     parts = jnp.split(x, ends[:-1], axis=-1)
-    return jax.tree.unflatten(structure, [part.reshape(*x.shape[:-1], *leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
+    return jax.tree.unflatten(
+        structure,
+        [
+            part.reshape(*x.shape[:-1], *leaf.shape)
+            for part, leaf in zip(parts, leaves, strict=True)
+        ],
+    )
 
 
 def _numbers(t: Any, x: Any) -> tuple[jax.Array, jax.Array]:

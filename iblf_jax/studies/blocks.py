@@ -1,10 +1,13 @@
 """Blocks: the one compiled shape in which studies run, whatever their size.
 
-XLA rounds differently at different batch sizes, so every device always runs a block of the same number of runs: run i sits in block
-i // B at place i % B, whether a study has ten runs or a million, one device or eight, one process or many, and however many blocks are
-in flight.  The last block is filled up with repetitions, which are cut off.  Blocks are dealt to the devices of this process in turn,
-each with its own copy of the same program: runs are independent, so devices never talk to each other.  (`shard_map` would do the same
-with one program for all, but XLA compiles that one otherwise for one device than for two, and the last digits differ.)
+XLA rounds differently at different batch sizes, so every device always runs a block of the same
+number of runs: run i sits in block i // B at place i % B, whether a study has ten runs or a
+  million, one device or eight, one process or many, and however many blocks are
+in flight.  The last block is filled up with repetitions, which are cut off.  Blocks are dealt to
+the devices of this process in turn, each with its own copy of the same program: runs are
+independent, so devices never talk to each other.  (`shard_map` would do the same with one program
+for all, but XLA compiles that one otherwise for one device than for two, and the last digits
+differ.)
 
 Memory does not grow with time: a block returns its folds' results, its status and its draws.
 """
@@ -70,8 +73,12 @@ MOST_MEMORY = 2.0**60
 
 
 def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
-    """A user's arguments of `run_blocks` that say how and change no number, checked; they may be None (all devices, `memory` rules)."""
-    chunk = None if chunk is None else checks.positive_integer("chunk", chunk, most=checks.MOST_STEPS)
+    """A user's arguments of `run_blocks` that say how and change no number, checked; they may be
+    None (all devices, `memory` rules).
+    """
+    chunk = (
+        None if chunk is None else checks.positive_integer("chunk", chunk, most=checks.MOST_STEPS)
+    )
     remedy = "Such as memory=4e9."
     memory = checks.number_between("memory", memory, 1.0, MOST_MEMORY, "bytes", remedy)
     return {"chunk": chunk, "memory": memory, "devices": checks.devices("devices", devices)}
@@ -80,30 +87,44 @@ def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     """`x` where the draws were admissible, else NaN (-1 for whole numbers)."""
     mark = jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else -1
-    return jnp.where(admissible.reshape(admissible.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(mark, x.dtype))
+    return jnp.where(
+        admissible.reshape(admissible.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(mark, x.dtype)
+    )
 
 
 def _draws(study_run: StudyRun, shared: StudyInputs, lanes: Lanes):
     """The leaves that a block's runs replace, the draws, and whether they were admissible."""
 
     def one(lane: Lanes):
-        made, drawn, admissible = draw(shared.cases, study_run.targets, lane.index, lane.points, lane.u)
-        varied = merge(shared.cases.scenario, lane.points, made) | noise_of(shared.cases.scenario, shared.cases.key, lane.index)
+        made, drawn, admissible = draw(
+            shared.cases, study_run.targets, lane.index, lane.points, lane.u
+        )
+        varied = merge(shared.cases.scenario, lane.points, made) | noise_of(
+            shared.cases.scenario, shared.cases.key, lane.index
+        )
         return varied, drawn, admissible
 
-    # Without the barrier XLA works the random numbers into every operation of the run: 18 s to compile instead of 5.
+    # Without the barrier XLA works the random numbers into every operation of the run: 18 s to
+    # compile instead of 5.
     return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
 
 
 def with_chosen_backend(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> StudyRun:
-    """The study's run with the backend that its blocks will run on in place of "auto" or one that is not available.
+    """The study's run with the backend that its blocks will run on in place of "auto" or one that
+    is not available.
 
     Raises:
       ValueError: an unknown backend.
     """
     varied, _, _ = jax.eval_shape(partial(_draws, study_run), shared, lanes)
     backend = chosen_backend(
-        study_run.backend, shared.cases.scenario, varied, shared.folds, shared.dt, method=study_run.method, mechanism=study_run.mechanism
+        study_run.backend,
+        shared.cases.scenario,
+        varied,
+        shared.folds,
+        shared.dt,
+        method=study_run.method,
+        mechanism=study_run.mechanism,
     )
     return study_run._replace(backend=backend)
 
@@ -112,7 +133,9 @@ def _block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
     """Draws and runs one block."""
     varied, drawn, admissible = _draws(study_run, shared, lanes)
     run = Run(study_run.steps, study_run.method, mechanism=study_run.mechanism)
-    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend)
+    outcome = run_batch(
+        shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend
+    )
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
     return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
@@ -122,13 +145,22 @@ def _record_block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes, record
     """Positions of a block's runs, (B, T, n), and their status."""
     varied, _, admissible = _draws(study_run, shared, lanes)
     run = Run(study_run.steps, study_run.method, record_every, study_run.mechanism)
-    outcome = run_batch(shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend)
+    outcome = run_batch(
+        shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend
+    )
     arrays = outcome.records[0]
-    return {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}, arrays["t"], outcome.status, admissible
+    return (
+        {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")},
+        arrays["t"],
+        outcome.status,
+        admissible,
+    )
 
 
 @partial(jax.jit, static_argnames=("study_run", "record_every"))
-def _execute(shared: StudyInputs, lanes: Lanes, *, study_run: StudyRun, record_every: int | None = None):
+def _execute(
+    shared: StudyInputs, lanes: Lanes, *, study_run: StudyRun, record_every: int | None = None
+):
     if record_every is None:
         return _block(study_run, shared, lanes)
     return _record_block(study_run, shared, lanes, record_every)
@@ -149,7 +181,8 @@ def run_blocks(
 
     Args:
       study_run, shared: what to run.
-      lanes_of: cases (m,) -> what differs between them; it must accept cases past the last one and repeat there.
+      lanes_of: cases (m,) -> what differs between them; it must accept cases past the last one and
+        repeat there.
       blocks: numbers of the blocks to run.
       chunk: runs in flight; from `memory` if not given.
       memory: bytes that runs in flight may take.
@@ -163,18 +196,27 @@ def run_blocks(
     call = partial(_execute, study_run=study_run, record_every=record_every)
     copies = [jax.device_put(shared, place) for place in places]
     if len(places) > 1:
-        _compile(study_run, record_every, copies, [jax.device_put(lanes_of(np.arange(size)), place) for place in places])
+        _compile(
+            study_run,
+            record_every,
+            copies,
+            [jax.device_put(lanes_of(np.arange(size)), place) for place in places],
+        )
 
     def results(k: int) -> tuple[Any, int]:
         """Those of block `blocks[k]`, on the host, and how many bytes it took."""
         place = k % len(places)
-        lanes = jax.device_put(lanes_of(np.arange(blocks[k] * size, (blocks[k] + 1) * size)), places[place])
+        lanes = jax.device_put(
+            lanes_of(np.arange(blocks[k] * size, (blocks[k] + 1) * size)), places[place]
+        )
         with jax.default_device(chosen_device):  # which is a thread's own
             out = call(copies[place], lanes)
         wait_until_ready(out)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
 
-    first, each = results(0)  # alone: what is compiled is compiled once, and what a block takes is known after it
+    first, each = results(
+        0
+    )  # alone: what is compiled is compiled once, and what a block takes is known after it
     yield blocks[0], first
     in_flight = plan.blocks_in_flight(chunk, memory, each, size, len(places))
     # A thread a block in flight: draws, start and results of one are made while another is stepped.
@@ -196,7 +238,9 @@ def _first_of(waiting: deque[tuple[int, Future]]) -> tuple[int, Any]:
     return block, future.result()[0]
 
 
-def _compile(study_run: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]) -> None:
+def _compile(
+    study_run: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]
+) -> None:
     """Compiles the block for several devices at the same time; tracing is done once and shared."""
     _execute.trace(copies[0], lanes[0], study_run=study_run, record_every=record_every)
 

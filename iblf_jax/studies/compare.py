@@ -1,11 +1,14 @@
 """`compare`: several laws on one scenario, at the gains they have and at equal effort.
 
-Two questions hide in "which law is better".  At equal gains k1 and K2, a law whose barrier term is larger works harder and looks
-better: the integral form's is twice the logarithmic one's (p = 1), identically.  So each law is also run at **equal effort**: its gains
-are scaled by one factor at which the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2), is the first law's.
+Two questions hide in "which law is better".  At equal gains k1 and K2, a law whose barrier term is
+larger works harder and looks better: the integral form's is twice the logarithmic one's (p = 1),
+  identically.  So each law is also run at **equal effort**: its gains
+are scaled by one factor at which the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2), is the
+first law's.
 
-The factor is looked for on a grid from 1/32 to 32 whose runs are one batch, and every crossing is refined (`equal_effort`): the effort
-need not grow with the factor, and trials may fail.  Of several crossings the one nearest to 1, by |ln factor|, is taken.  What was
+The factor is looked for on a grid from 1/32 to 32 whose runs are one batch, and every crossing is
+refined (`equal_effort`): the effort need not grow with the factor, and trials may fail.  Of several
+  crossings the one nearest to 1, by |ln factor|, is taken.  What was
 searched, and which trials failed, is in the result.
 """
 
@@ -61,15 +64,17 @@ def compare(
                    rms|tau - G0(q)| of law i at gains c k1, c K2  =  that of the first law
 
     Args:
-      scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; the k1, K2, o and reading of its own law
-        are those of the laws that are given by name, and a torque limit around its law is put around them too.
-      laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the name to show.  The first one sets the
-        effort.
+      scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; the
+        k1, K2, o and reading of its own law are those of the laws that are given by name, and a
+        torque limit around its law is put around them too.
+      laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the
+        name to show.  The first one sets the effort.
       duration, dt, method, record_every: as `simulate`.
       equal_effort: whether to look for the factors; a few batches of 89 further runs a law.
 
     Returns:
-      A `Comparison`: prints as two tables and says what was held equal; `rollouts`, `equal_effort`, `factors`, `searches` (which
+      A `Comparison`: prints as two tables and says what was held equal; `rollouts`, `equal_effort`,
+        `factors`, `searches` (which
       factors were tried, and which failed), `plot()`, `to_pandas()`.
 
     Raises:
@@ -80,14 +85,22 @@ def compare(
     scenario, equal_effort = canonical(scenario), checks.flag("equal_effort", equal_effort)
     named = _named_laws(laws)
     scenarios = {name: _with_law(scenario, law) for name, law in named.items()}
-    options: dict[str, Any] = {"duration": duration, "dt": dt, "method": method, "record_every": record_every}
+    options: dict[str, Any] = {
+        "duration": duration,
+        "dt": dt,
+        "method": method,
+        "record_every": record_every,
+    }
     rollouts = {name: _run(one, options) for name, one in scenarios.items()}
     gains = {name: _gains_in_words(one.controller) for name, one in scenarios.items()}
     if not equal_effort:
         return Comparison(rollouts, {}, {}, {}, gains)
     first = next(iter(rollouts))
     others = {name: one for name, one in scenarios.items() if name != first}
-    found = {name: _at_effort_of(first, rollouts[first], rollouts[name], one, options) for name, one in others.items()}
+    found = {
+        name: _at_effort_of(first, rollouts[first], rollouts[name], one, options)
+        for name, one in others.items()
+    }
     found[first] = _Equal(1.0, rollouts[first])
     ordered = {name: found[name] for name in rollouts}
     return Comparison(
@@ -103,7 +116,12 @@ def compare(
 def _named_laws(laws: Laws) -> dict[str, str | Controller]:
     """The laws by the name to show."""
     if isinstance(laws, str) or not isinstance(laws, Mapping | Sequence) or len(laws) == 0:
-        raise checks.fail("laws", laws, "a list of names and laws, or a dict of them", f"Names are {', '.join(NAMES)}.")
+        raise checks.fail(
+            "laws",
+            laws,
+            "a list of names and laws, or a dict of them",
+            f"Names are {', '.join(NAMES)}.",
+        )
     if isinstance(laws, Mapping):
         pairs = [(str(name), law) for name, law in laws.items()]
     else:
@@ -133,13 +151,19 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
     """The scenario under another law, with the observer that belongs to it."""
     if isinstance(law, str):
         own = unwrapped(scenario.controller)
-        kept = {name: getattr(own, name) for name in ("k1", "K2", "o", "reading") if getattr(own, name, None) is not None}
+        kept = {
+            name: getattr(own, name)
+            for name in ("k1", "K2", "o", "reading")
+            if getattr(own, name, None) is not None
+        }
         p = getattr(getattr(own, "barrier", None), "p", 1)
         controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
         observer = observer_of(law, scenario.observer)
     else:
         controller = law
-        observer = scenario.observer if getattr(unwrapped(law), "uses_observer", True) else NoObserver()
+        observer = (
+            scenario.observer if getattr(unwrapped(law), "uses_observer", True) else NoObserver()
+        )
     return dataclasses.replace(scenario, controller=controller, observer=observer)
 
 
@@ -153,13 +177,20 @@ def _limited_as(controller: Controller, law: Controller) -> Controller:
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; a failure is named in the table, not warned of."""
     with notices.muted(UserWarning):
-        return simulate(scenario, metrics=(*standard(), *watched(scenario), AboveGravity()), **options)
+        return simulate(
+            scenario, metrics=(*standard(), *watched(scenario), AboveGravity()), **options
+        )
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
-    """The leaves of a law that are scaled together: its class attribute `gains`, else those of k1 and K2 that it has."""
+    """The leaves of a law that are scaled together: its class attribute `gains`, else those of k1
+    and K2 that it has.
+    """
     inner = unwrapped(law)
-    return tuple(getattr(inner, "gains", None) or (name for name in ("k1", "K2") if getattr(inner, name, None) is not None))
+    return tuple(
+        getattr(inner, "gains", None)
+        or (name for name in ("k1", "K2") if getattr(inner, name, None) is not None)
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -172,13 +203,20 @@ class _Equal:
     search: EffortSearch | None = None
 
 
-def _at_effort_of(title: str, reference: Rollout, own: Rollout, scenario: Scenario, options: Mapping[str, Any]) -> _Equal:
+def _at_effort_of(
+    title: str, reference: Rollout, own: Rollout, scenario: Scenario, options: Mapping[str, Any]
+) -> _Equal:
     """A law with gains scaled so that it has the first one's effort."""
     if int(reference.status) & NO_EFFORT:
-        return _Equal(float("nan"), reason=f"the first law, {title}, failed itself, so it sets no effort")
+        return _Equal(
+            float("nan"), reason=f"the first law, {title}, failed itself, so it sets no effort"
+        )
     names = gain_names(scenario.controller)
     if not names:
-        return _Equal(float("nan"), reason="it has no gains to scale: no k1, K2, and no class attribute `gains`")
+        return _Equal(
+            float("nan"),
+            reason="it has no gains to scale: no k1, K2, and no class attribute `gains`",
+        )
     target = float(reference.metrics.effort_above_gravity)
     dt_for = partial(_dt_for, dt=options["dt"], method=options["method"])
     inaccurate = bool((int(reference.status) | int(own.status)) & Status.INACCURATE)
@@ -196,7 +234,10 @@ def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, 
     gains = {f"controller.{name}": np.asarray(getattr(inner, name)) for name in names}
     if np.ndim(factor) == 0:
         return {path: gain * factor for path, gain in gains.items()}
-    return {path: np.asarray(factor).reshape(-1, *(1,) * gain.ndim) * gain for path, gain in gains.items()}
+    return {
+        path: np.asarray(factor).reshape(-1, *(1,) * gain.ndim) * gain
+        for path, gain in gains.items()
+    }
 
 
 def _dt_for(trials: Trials, *, dt: float, method: str) -> float | None:
@@ -204,8 +245,12 @@ def _dt_for(trials: Trials, *, dt: float, method: str) -> float | None:
     return needed_dt(trials.status, trials.mode, trials.error, dt, method)
 
 
-def _trials_of(scenario: Scenario, names: Sequence[str], options: Mapping[str, Any]) -> Callable[[np.ndarray], Trials]:
-    """A function of factors (N,) that runs all of them in one batch, of one size, so that it is compiled once."""
+def _trials_of(
+    scenario: Scenario, names: Sequence[str], options: Mapping[str, Any]
+) -> Callable[[np.ndarray], Trials]:
+    """A function of factors (N,) that runs all of them in one batch, of one size, so that it is
+    compiled once.
+    """
     with notices.muted(UserWarning):
         scenario = canonical(scenario)
     dtype, size = scenario.initial.q.dtype, len(grid())
@@ -216,22 +261,32 @@ def _trials_of(scenario: Scenario, names: Sequence[str], options: Mapping[str, A
 
     def trials(factors: np.ndarray) -> Trials:
         padded = np.resize(factors, size)
-        varied = {path: jnp.asarray(x, dtype) for path, x in _scaled(scenario, names, padded).items()}
+        varied = {
+            path: jnp.asarray(x, dtype) for path, x in _scaled(scenario, names, padded).items()
+        }
         varied |= {name: jnp.broadcast_to(x, (size, *x.shape)) for name, x in noise.items()}
         found = _batch(scenario, varied, folds, jnp.asarray(options["dt"], dtype), run=run)
-        columns = (found.metrics["effort_above_gravity"], found.status, found.fastest_mode, found.metrics[RELATIVE])
+        columns = (
+            found.metrics["effort_above_gravity"],
+            found.status,
+            found.fastest_mode,
+            found.metrics[RELATIVE],
+        )
         return Trials(*(np.asarray(x)[: len(factors)] for x in columns))
 
     return trials
 
 
 @partial(jax.jit, static_argnames="run")
-def _batch(scenario: Scenario, varied: dict[str, jax.Array], folds: Any, dt: jax.Array, *, run: Run):
+def _batch(
+    scenario: Scenario, varied: dict[str, jax.Array], folds: Any, dt: jax.Array, *, run: Run
+):
     return run_batch(scenario, varied, folds, dt, run)
 
 
 def factor_nearest_one(effort: Callable[[float], float], target: float) -> float:
-    """The factor of [1/32, 32] nearest to 1, by |ln|, at which effort(factor) = target, or NaN if none was found.
+    """The factor of [1/32, 32] nearest to 1, by |ln|, at which effort(factor) = target, or NaN if
+    none was found.
 
     Args:
       effort: factor -> effort [N m], NaN for a run that failed.
@@ -248,7 +303,10 @@ def factor_nearest_one(effort: Callable[[float], float], target: float) -> float
 
 def _gains_in_words(law: Controller) -> str:
     inner = unwrapped(law)
-    return ", ".join(f"{name} = {_shown(getattr(inner, name))}" for name in gain_names(law)) or "no gains"
+    return (
+        ", ".join(f"{name} = {_shown(getattr(inner, name))}" for name in gain_names(law))
+        or "no gains"
+    )
 
 
 def _shown(value: Any) -> str:

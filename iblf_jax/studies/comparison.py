@@ -1,4 +1,6 @@
-"""What `compare` gives back: runs by law, at their gains and at equal effort, and the table of both."""
+"""What `compare` gives back: runs by law, at their gains and at equal effort, and the table of
+both.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,16 @@ from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch
 HELD = {"gains": "Gains as given", "effort": "Equal effort"}
 
 FACTOR_TWO = (
-    "Equal gains favour the integral form: V_integral = 2 V_log (p = 1) identically, so its barrier term is twice the logarithmic "
-    "one's at the same k1 and K2. Compare at equal effort."
+    "Equal gains favour the integral form: V_integral = 2 V_log (p = 1) identically, so its barrier"
+    " term is twice the logarithmic one's at the same k1 and K2. Compare at equal effort."
 )
 OWN_GAINS = "Laws whose gains differ are comparable at equal effort only."
 
 
 class Row(NamedTuple):
-    """One law's line.  Of several joints, the worst one's; efforts and chatter are over all joints."""
+    """One law's line.  Of several joints, the worst one's; efforts and chatter are over all
+    joints.
+    """
 
     law: str
     factor: float
@@ -113,24 +117,37 @@ class Comparison:
     gains: dict[str, str]
     """Law -> its gains in words."""
     searches: dict[str, EffortSearch] = dataclasses.field(default_factory=dict)
-    """Law -> the search for its factor: all trials, with those that failed; without the first law."""
+    """Law -> the search for its factor: all trials, with those that failed; without the first
+    law."""
 
     @property
     def nearest(self) -> dict[str, tuple[float, float]]:
-        """Law without a factor -> factor and effort [N m] of the trial whose effort is nearest to the first law's."""
-        return {name: found.nearest for name, found in self.searches.items() if name not in self.equal_effort}
+        """Law without a factor -> factor and effort [N m] of the trial whose effort is nearest to
+        the first law's.
+        """
+        return {
+            name: found.nearest
+            for name, found in self.searches.items()
+            if name not in self.equal_effort
+        }
 
     @property
     def table(self) -> dict[str, tuple[Row, ...]]:
         """The lines of both tables: "gains" and "effort"."""
         as_given = tuple(row_of(name, 1.0, run) for name, run in self.rollouts.items())
-        effort = tuple(row_of(name, self.factors[name], run) for name, run in self.equal_effort.items())
+        effort = tuple(
+            row_of(name, self.factors[name], run) for name, run in self.equal_effort.items()
+        )
         return {"gains": as_given, "effort": effort} if self.factors else {"gains": as_given}
 
     @property
     def failed(self) -> dict[str, str]:
         """Law -> what went wrong, for the runs at given gains that failed."""
-        return {name: describe(int(run.status) & FAILED) for name, run in self.rollouts.items() if int(run.status) & FAILED}
+        return {
+            name: describe(int(run.status) & FAILED)
+            for name, run in self.rollouts.items()
+            if int(run.status) & FAILED
+        }
 
     @property
     def notes(self) -> dict[str, list[str]]:
@@ -140,25 +157,40 @@ class Comparison:
         for name, gains in self.gains.items():
             groups.setdefault(gains, []).append(name)
         in_words = "; ".join(f"{gains} ({', '.join(names)})" for gains, names in groups.items())
-        barriers = [getattr(unwrapped(run.scenario.controller), "barrier", None) for run in self.rollouts.values()]
-        notes = {"gains": [f"Held equal: the scenario. Gains: {in_words}.", *([OWN_GAINS] if len(groups) > 1 else [])]}
-        notes["gains"] += [FACTOR_TWO] if any(isinstance(barrier, Integral) for barrier in barriers) else []
+        barriers = [
+            getattr(unwrapped(run.scenario.controller), "barrier", None)
+            for run in self.rollouts.values()
+        ]
+        notes = {
+            "gains": [
+                f"Held equal: the scenario. Gains: {in_words}.",
+                *([OWN_GAINS] if len(groups) > 1 else []),
+            ]
+        }
+        notes["gains"] += (
+            [FACTOR_TWO] if any(isinstance(barrier, Integral) for barrier in barriers) else []
+        )
         notes["gains"] += [f"{name} FAILED: {why}." for name, why in self.failed.items()]
         if self.factors:
             if int(self.rollouts[first].status) & NO_EFFORT:
                 held = "Nothing could be held equal."
             else:
                 effort = float(self.rollouts[first].metrics.effort_above_gravity)
-                held = f"Held equal: the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2) = {effort:.4g} N m, that of {first}."
+                held = (
+                    "Held equal: the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2) ="
+                    f" {effort:.4g} N m, that of {first}."
+                )
             scaled = (
-                "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found from 1/32 to 32 that do it, the one "
-                "nearest to 1 (by |ln factor|)."
+                "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found"
+                " from 1/32 to 32 that do it, the one nearest to 1 (by |ln factor|)."
             )
             notes["effort"] = [f"{held} {scaled}", *self._searches_in_words()]
         return notes
 
     def _searches_in_words(self) -> list[str]:
-        """Why a law has no factor, and for the others what was searched where that says more than the factor."""
+        """Why a law has no factor, and for the others what was searched where that says more than
+        the factor.
+        """
         lines = [f"{name}: no factor; {why}." for name, why in self.reasons.items()]
         for name, found in self.searches.items():
             if name not in self.reasons and (found.failed or len(found.crossings) > 1):
@@ -167,10 +199,18 @@ class Comparison:
 
     def __repr__(self) -> str:
         run = next(iter(self.rollouts.values()))
-        parts = [f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt = {float(run.dt):g} s, {run.method}; worst joint"]
+        parts = [
+            f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt ="
+            f" {float(run.dt):g} s, {run.method}; worst joint"
+        ]
         for held, rows in self.table.items():
             lines = _columns(rows)
-            parts += ["", HELD[held], *tables.as_text(lines, left=(0, len(lines[0]) - 1)), *self.notes[held]]
+            parts += [
+                "",
+                HELD[held],
+                *tables.as_text(lines, left=(0, len(lines[0]) - 1)),
+                *self.notes[held],
+            ]
         return "\n".join(parts)
 
     def _repr_html_(self) -> str:
@@ -188,15 +228,21 @@ class Comparison:
         return found
 
     def to_pandas(self):
-        """A `pandas.DataFrame` (pandas comes with xarray), one line a law and table, columns as `Row`."""
+        """A `pandas.DataFrame` (pandas comes with xarray), one line a law and table, columns as
+        `Row`.
+        """
         import pandas as pd
 
-        lines = [{"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows]
+        lines = [
+            {"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows
+        ]
         frame = pd.DataFrame(lines).set_index(["held", "law"])
         return frame.drop(columns=[name for name in OPTIONAL if frame[name].isna().all()])
 
     def plot(self, joint: int = 0, **options):
-        """Overlaid figure of all laws, at their gains and at equal effort.  Options as `plotting.comparison`."""
+        """Overlaid figure of all laws, at their gains and at equal effort.  Options as
+        `plotting.comparison`.
+        """
         from iblf_jax import plotting
 
         return plotting.comparison(self, joint, **options)
@@ -204,9 +250,16 @@ class Comparison:
 
 def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
     """Headings and lines, without the margins of constraints that there are none of."""
-    shown = [i for i, name in enumerate(Row._fields) if name not in OPTIONAL or any(math.isfinite(getattr(row, name)) for row in rows)]
+    shown = [
+        i
+        for i, name in enumerate(Row._fields)
+        if name not in OPTIONAL or any(math.isfinite(getattr(row, name)) for row in rows)
+    ]
     return [tuple(line[i] for i in shown) for line in [HEADINGS, *map(_cells, rows)]]
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    return tuple(x if isinstance(x, str) else f"{x:.4g}" if math.isfinite(x) else "never" if x > 0 else "-" for x in row)
+    return tuple(
+        x if isinstance(x, str) else f"{x:.4g}" if math.isfinite(x) else "never" if x > 0 else "-"
+        for x in row
+    )

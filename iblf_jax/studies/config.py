@@ -1,4 +1,6 @@
-"""What defines the data of a sweep, as JSON: written into its attributes, and compared before a store is continued."""
+"""What defines the data of a sweep, as JSON: written into its attributes, and compared before a
+store is continued.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +25,16 @@ def describe_component(part: Any) -> Any:
     """A component as JSON: its class, its structural fields and its numbers, all the way down."""
     if isinstance(part, tuple | list):
         return [describe_component(x) for x in part]
-    if isinstance(part, jax.Array | np.ndarray | np.generic | float | int) and not isinstance(part, bool):
+    if isinstance(part, jax.Array | np.ndarray | np.generic | float | int) and not isinstance(
+        part, bool
+    ):
         return np.asarray(part).tolist()
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return part if isinstance(part, str | bool | None) else repr(part)
-    fields = {field.name: describe_component(getattr(part, field.name)) for field in dataclasses.fields(part)}
+    fields = {
+        field.name: describe_component(getattr(part, field.name))
+        for field in dataclasses.fields(part)
+    }
     return {"class": type(part).__qualname__, **fields}
 
 
@@ -41,15 +48,21 @@ def structure(part: Any) -> Any:
     for field in dataclasses.fields(part):
         inner = getattr(part, field.name)
         if field.metadata.get("static"):
-            found[field.name] = inner if isinstance(inner, str | bool | int | float) else repr(inner)
+            found[field.name] = (
+                inner if isinstance(inner, str | bool | int | float) else repr(inner)
+            )
         elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):
             found[field.name] = structure(inner)
     return found
 
 
 def program_digest(setup: StudySetup) -> str:
-    """A digest of what a run computes: it tells when the code of a law, a robot or a metric has changed."""
-    traced = _execute.trace(setup.shared, setup.lanes(np.arange(block_size())), study_run=setup.study_run)
+    """A digest of what a run computes: it tells when the code of a law, a robot or a metric has
+    changed.
+    """
+    traced = _execute.trace(
+        setup.shared, setup.lanes(np.arange(block_size())), study_run=setup.study_run
+    )
     text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -76,7 +89,10 @@ def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[
         "dims": dict(points.dims),
         "points": {path: place(path) for path in points.values},
         "perturbations": {path: describe_component(p) for path, p in setup.perturbations.items()},
-        "perturbed": {t.path: {"unit": unit_at(scenario, t.path), "source": t.source} for t in study_run.targets},
+        "perturbed": {
+            t.path: {"unit": unit_at(scenario, t.path), "source": t.source}
+            for t in study_run.targets
+        },
         "runs": setup.runs,
         "seed": setup.seed,
         "sampler": setup.sampler,
@@ -85,7 +101,9 @@ def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[
         "dt": dt,
         "method": study_run.method,
         "metrics": describe_component(setup.shared.folds),
-        "scenario": {p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)},
+        "scenario": {
+            p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)
+        },
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
@@ -93,6 +111,10 @@ def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[
         "platform": devices.platform(),
         **({"kernel": built_for()} if study_run.backend == "native" else {}),
         "block": block_size(),
-        "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__, "jaxlib": jaxlib.__version__},
+        "versions": {
+            "iblf_jax": iblf_jax.__version__,
+            "jax": jax.__version__,
+            "jaxlib": jaxlib.__version__,
+        },
         "program": program_digest(setup),
     }

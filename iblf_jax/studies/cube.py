@@ -1,7 +1,9 @@
-"""The unit cube behind bounded perturbations: where `ij.falsify` and `ij.certificates.counterexample` look for the worst.
+"""The unit cube behind bounded perturbations: where `ij.falsify` and
+`ij.certificates.counterexample` look for the worst.
 
-Run i of a study draws u and has the values F^-1(u); a search takes the u itself, in [0, 1]^d, as its unknown.  So a search looks at the
-same perturbations as a study, within the ends of their distributions.
+Run i of a study draws u and has the values F^-1(u); a search takes the u itself, in [0, 1]^d, as
+its unknown.  So a search looks at the same perturbations as a study, within the ends of their
+distributions.
 """
 
 from __future__ import annotations
@@ -50,14 +52,19 @@ class Cube:
 
     def refused(self, u: np.ndarray) -> str:
         """Why a point cannot be run, in words; "" if it can."""
-        return why_inadmissible(self.cases.scenario, _values(self, jnp.asarray(u, self.cases.scenario.initial.q.dtype)))
+        return why_inadmissible(
+            self.cases.scenario, _values(self, jnp.asarray(u, self.cases.scenario.initial.q.dtype))
+        )
 
-    def admissible_points(self, count: int, seed: Any, refused: Callable[[np.ndarray], str] | None = None) -> np.ndarray:
+    def admissible_points(
+        self, count: int, seed: Any, refused: Callable[[np.ndarray], str] | None = None
+    ) -> np.ndarray:
         """Random points at which nothing is refused, (count, d); repeated where few were found.
 
         Args:
           count, seed: of the points.
-          refused: why a point is no answer, in words; "" if it is one.  `Cube.refused` if not given.
+          refused: why a point is no answer, in words; "" if it is one.  `Cube.refused` if not
+            given.
 
         Raises:
           ValueError: no such point was found.
@@ -71,13 +78,22 @@ class Cube:
             if len(found) >= count:
                 break
         if not found:
-            raise self.nothing(f"None of {BATCHES * count} random points is; the last: {reason} Narrow or move the ranges.")
+            raise self.nothing(
+                f"None of {BATCHES * count} random points is; the last: {reason} Narrow or move the"
+                " ranges."
+            )
         return np.resize(np.array(found), (count, self.size))
 
     def nothing(self, remedy: str) -> ValueError:
         """The error for perturbations in which there is nothing to look at."""
-        ranges = {path: p.range(np.asarray(get(self.cases.scenario, path))) for path, p in self.cases.perturbations.items()}
-        shown = {path: (np.asarray(low).tolist(), np.asarray(high).tolist()) for path, (low, high) in ranges.items()}
+        ranges = {
+            path: p.range(np.asarray(get(self.cases.scenario, path)))
+            for path, p in self.cases.perturbations.items()
+        }
+        shown = {
+            path: (np.asarray(low).tolist(), np.asarray(high).tolist())
+            for path, (low, high) in ranges.items()
+        }
         return checks.fail("perturbations", shown, "ranges with admissible values in them", remedy)
 
 
@@ -90,17 +106,32 @@ def bounded(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cu
     Args:
       scenario: canonical.
       perturbations: path -> `factor`, `offset` or `value` of a distribution that has two ends.
-      signs: whether ranges that reach beyond what a leaf may be are refused; their points are, in either case.
+      signs: whether ranges that reach beyond what a leaf may be are refused; their points are, in
+        either case.
 
     Raises:
       ValueError: nothing that varies, a distribution without ends, or as `draws.targets_of`.
     """
     targets, by_path = targets_of(scenario, perturbations, signs=signs)
     if not targets:
-        raise checks.fail("perturbations", perturbations, "at least one perturbation", "Say what may vary, and between which limits.")
+        raise checks.fail(
+            "perturbations",
+            perturbations,
+            "at least one perturbation",
+            "Say what may vary, and between which limits.",
+        )
     for target in targets:
         distribution = by_path[target.path].distribution
         if not all(np.all(np.isfinite(end)) for end in distribution.support()):
-            raise checks.fail(f"perturbations[{target.source!r}]", distribution, "a bounded distribution", "Use ij.uniform(low, high).")
+            raise checks.fail(
+                f"perturbations[{target.source!r}]",
+                distribution,
+                "a bounded distribution",
+                "Use ij.uniform(low, high).",
+            )
     by_path = jax.tree.map(lambda x: jnp.asarray(x, scenario.initial.q.dtype), by_path)
-    return Cube(Cases(scenario, by_path, jax.random.PRNGKey(0)), targets, tuple(sample_size(targets, by_path).items()))
+    return Cube(
+        Cases(scenario, by_path, jax.random.PRNGKey(0)),
+        targets,
+        tuple(sample_size(targets, by_path).items()),
+    )

@@ -1,4 +1,6 @@
-"""The data of a sweep as an `xarray.Dataset`: named dimensions, units, coordinates, and the whole configuration."""
+"""The data of a sweep as an `xarray.Dataset`: named dimensions, units, coordinates, and the whole
+configuration.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,12 @@ FIRST_TIMES = {
 """Metric that says when a constraint was violated first -> the flag that says that it was."""
 
 
-def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Mapping[str, str], done: np.ndarray) -> xarray.Dataset:
+def to_dataset(
+    config: dict[str, Any],
+    flat: Mapping[str, np.ndarray],
+    units: Mapping[str, str],
+    done: np.ndarray,
+) -> xarray.Dataset:
     """The Dataset from flat data.
 
     Args:
@@ -51,7 +58,9 @@ def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Ma
         if name.startswith(DRAWN):
             path = name.removeprefix(DRAWN)
             same = values.reshape(-1, config["runs"], *values.shape[1:]) if len(values) else values
-            if np.all(done) and np.array_equal(same, np.broadcast_to(same[:1], same.shape), equal_nan=True):
+            if np.all(done) and np.array_equal(
+                same, np.broadcast_to(same[:1], same.shape), equal_nan=True
+            ):
                 coordinates[path] = ((RUN, *dims[len(outer) :]), same[0], attributes)
             else:
                 variables[name] = (dims, shaped, attributes)
@@ -70,21 +79,39 @@ def to_dataset(config: dict[str, Any], flat: Mapping[str, np.ndarray], units: Ma
         },
     )
     if "first_violation_time" in flat:
-        violated = {flag: (flat["status"] >= 0) & (flat["status"] & int(flag) != 0) for flag in FIRST_TIMES.values()}
-        at_start = [violated[flag] & (np.asarray(flat[name]) <= 0) for name, flag in FIRST_TIMES.items() if name in flat]
+        violated = {
+            flag: (flat["status"] >= 0) & (flat["status"] & int(flag) != 0)
+            for flag in FIRST_TIMES.values()
+        }
+        at_start = [
+            violated[flag] & (np.asarray(flat[name]) <= 0)
+            for name, flag in FIRST_TIMES.items()
+            if name in flat
+        ]
         outside = np.any(at_start, axis=0)
         words = (
-            "whether the run violated a bound, or was outside a region, at t = 0 already: it was started there, and no law could keep it"
+            "whether the run violated a bound, or was outside a region, at t = 0 already: it was"
+            " started there, and no law could keep it"
         )
-        variables["started_outside"] = (dims, outside.reshape(status.shape), {"units": "1", "description": words})
+        variables["started_outside"] = (
+            dims,
+            outside.reshape(status.shape),
+            {"units": "1", "description": words},
+        )
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
 
 
 def _coordinates(config: dict[str, Any]) -> dict[str, Any]:
     dtype = config["dtype"]
-    found: dict[str, Any] = {"joint": ("joint", np.arange(config["joints"]), {"description": "joint, from 0"})}
+    found: dict[str, Any] = {
+        "joint": ("joint", np.arange(config["joints"]), {"description": "joint, from 0"})
+    }
     if config["perturbations"]:
-        found[RUN] = (RUN, np.arange(config["runs"]), {"description": "run, from 0; the same draws at every point"})
+        found[RUN] = (
+            RUN,
+            np.arange(config["runs"]),
+            {"description": "run, from 0; the same draws at every point"},
+        )
     for dim, size in config["dims"].items():
         if dim not in config["points"]:
             found[dim] = (dim, np.arange(size), {"description": "point of the design"})
@@ -94,14 +121,33 @@ def _coordinates(config: dict[str, Any]) -> dict[str, Any]:
             found[path] = (place["along"], values, attributes)
             continue
         if path == place["along"]:
-            found[path] = (path, np.arange(len(values)), {"description": f"number of the value, see '{path}_values'"})
+            found[path] = (
+                path,
+                np.arange(len(values)),
+                {"description": f"number of the value, see '{path}_values'"},
+            )
             path = f"{path}_values"
-        found[path] = ((place["along"], *own_dims(path, values.shape[1:], config["joints"])), values, attributes)
+        found[path] = (
+            (place["along"], *own_dims(path, values.shape[1:], config["joints"])),
+            values,
+            attributes,
+        )
     return found
 
 
 def _attributes(config: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
-    shown = ("design", "runs", "seed", "sampler", "duration", "dt", "method", "dtype", "backend", "platform")
+    shown = (
+        "design",
+        "runs",
+        "seed",
+        "sampler",
+        "duration",
+        "dt",
+        "method",
+        "dtype",
+        "backend",
+        "platform",
+    )
     attributes = {key: config[key] for key in shown}
     attributes |= {f"{name}_version": version for name, version in config["versions"].items()}
     attributes["computed_cases"] = int(done.sum())

@@ -1,10 +1,13 @@
-"""Where the uniform numbers of a study come from: independent draws, a Latin hypercube or Sobol points.
+"""Where the uniform numbers of a study come from: independent draws, a Latin hypercube or Sobol
+points.
 
-Independent draws are made run by run inside the compiled block (`draws`).  A design covers the unit cube more evenly, so means
-converge faster, but its points are not independent: no Clopper-Pearson interval holds.  So a designed study is made of
-`replicates` designs, scrambled independently, and its intervals come from the spread between them.
+Independent draws are made run by run inside the compiled block (`draws`).  A design covers the unit
+cube more evenly, so means converge faster, but its points are not independent: no Clopper-Pearson
+interval holds.  So a designed study is made of `replicates` designs, scrambled independently, and
+its intervals come from the spread between them.
 
-Source: A. B. Owen, Monte Carlo theory, methods and examples, chapters 10 and 17; SciPy's `stats.qmc` makes the points.
+Source: A. B. Owen, Monte Carlo theory, methods and examples, chapters 10 and 17; SciPy's
+  `stats.qmc` makes the points.
 """
 
 from __future__ import annotations
@@ -23,24 +26,42 @@ MOST_SOBOL = (21201, 2**30)
 
 
 def check_sampler(sampler: str, runs: int, replicates: Any) -> int:
-    """The number of replicates; ValueError for a sampler, a number of runs and replicates that do not fit together."""
+    """The number of replicates; ValueError for a sampler, a number of runs and replicates that do
+    not fit together.
+    """
     checks.one_of("sampler", sampler, SAMPLERS)
     replicates = checks.positive_integer("replicates", replicates, most=runs)
     if sampler == "independent" and replicates != 1:
         raise checks.fail(
-            "replicates", replicates, "1 with independent draws", 'Replicates belong to sampler="latin_hypercube" or "sobol".'
+            "replicates",
+            replicates,
+            "1 with independent draws",
+            'Replicates belong to sampler="latin_hypercube" or "sobol".',
         )
     if runs % replicates:
-        raise checks.fail("runs", runs, f"a multiple of replicates = {replicates}", f"Take runs={replicates * max(1, runs // replicates)}.")
+        raise checks.fail(
+            "runs",
+            runs,
+            f"a multiple of replicates = {replicates}",
+            f"Take runs={replicates * max(1, runs // replicates)}.",
+        )
     each = runs // replicates
     if sampler == "sobol" and each & (each - 1):
         near = 1 << max(0, round(np.log2(each)))
-        raise checks.fail("runs", runs, "a power of two for each replicate of Sobol points", f"Take runs={near * replicates}.")
+        raise checks.fail(
+            "runs",
+            runs,
+            "a power of two for each replicate of Sobol points",
+            f"Take runs={near * replicates}.",
+        )
     return replicates
 
 
-def unit_points(sampler: str, dimension: int, runs: int, replicates: int, seed: int, salt: int = 0) -> np.ndarray:
-    """Points in the open unit cube, (runs, dimension): `replicates` independent designs, one after another.
+def unit_points(
+    sampler: str, dimension: int, runs: int, replicates: int, seed: int, salt: int = 0
+) -> np.ndarray:
+    """Points in the open unit cube, (runs, dimension): `replicates` independent designs, one after
+    another.
 
     Raises:
       ValueError: more than the memory holds, or than the sequence has.
@@ -48,7 +69,11 @@ def unit_points(sampler: str, dimension: int, runs: int, replicates: int, seed: 
     checks.fits("runs" if not salt else "points", runs, 3 * 8.0 * dimension)
     if sampler == "sobol" and (dimension > MOST_SOBOL[0] or runs // replicates > MOST_SOBOL[1]):
         came = f"{runs // replicates} of {dimension} numbers"
-        raise checks.fail("sampler", sampler, f"at most {MOST_SOBOL[1]} points of {MOST_SOBOL[0]} numbers in a design, not {came}")
+        raise checks.fail(
+            "sampler",
+            sampler,
+            f"at most {MOST_SOBOL[1]} points of {MOST_SOBOL[0]} numbers in a design, not {came}",
+        )
     from scipy.stats import qmc  # a second to import
 
     designs = []
@@ -61,7 +86,9 @@ def unit_points(sampler: str, dimension: int, runs: int, replicates: int, seed: 
     return np.concatenate(designs)
 
 
-def split(points: np.ndarray, shapes: dict[str, tuple[int, ...]], dtype: Any) -> dict[str, np.ndarray]:
+def split(
+    points: np.ndarray, shapes: dict[str, tuple[int, ...]], dtype: Any
+) -> dict[str, np.ndarray]:
     """The columns of `points` by path, each with its leaf's shape, kept off 0 and 1 in `dtype`."""
     edge = np.finfo(dtype).eps / 2
     inside = np.clip(points.astype(dtype), edge, 1 - edge)

@@ -1,19 +1,23 @@
 """What an uncertain parameter may be: distributions, and how a draw acts on a leaf.
 
-A distribution is known by its quantile function F^-1, which turns a uniform number u in (0, 1) into a draw:
+A distribution is known by its quantile function F^-1, which turns a uniform number u in (0, 1) into
+a draw:
 
     uniform       low + u (high - low)
     normal        mean + std Phi^-1(u)
     log_uniform   low (high / low)^u
     choice        the first value whose cumulative weight reaches u
-    joint_normal  mean + sum_k rows_k Phi^-1(u_k), with the same u_1 ... u_d for all leaves of a group: so leaves may vary together
+    joint_normal  mean + sum_k rows_k Phi^-1(u_k), with the same u_1 ... u_d for all leaves of a
+    group: so leaves may vary together
 
-so that independent draws, Latin hypercubes and Sobol points differ in their u only.  A draw z changes a leaf that holds x0 to
+so that independent draws, Latin hypercubes and Sobol points differ in their u only.  A draw z
+changes a leaf that holds x0 to
 
     factor   x0 z        offset   x0 + z        value   z
 
-`factor(uniform(0.7, 1.3))` is thirty per cent around nominal.  A vector leaf gets an independent draw for each entry, unless
-`shared=True`.  All of these are pytrees whose numbers are leaves: new numbers do not recompile a study.
+`factor(uniform(0.7, 1.3))` is thirty per cent around nominal.  A vector leaf gets an independent
+draw for each entry, unless `shared=True`.  All of these are pytrees whose numbers are leaves: new
+numbers do not recompile a study.
 """
 
 from __future__ import annotations
@@ -34,8 +38,8 @@ KINDS = ("factor", "offset", "value")
 class Distribution(Protocol):
     """What the package asks of a distribution: a component with these two methods.
 
-    One whose leaves vary together has, as `group`, the name of the draws that they share, and, as `draws`, how many uniform numbers these
-    are: its `quantile` is given all of them.
+    One whose leaves vary together has, as `group`, the name of the draws that they share, and, as
+    `draws`, how many uniform numbers these are: its `quantile` is given all of them.
     """
 
     def quantile(self, u: jax.Array) -> jax.Array:
@@ -139,7 +143,12 @@ class Choice:
     def check(self) -> None:
         """Raises ValueError unless there is one weight a value and one that is not zero."""
         if self.values.ndim != 1 or self.values.size == 0:
-            raise checks.fail("choice: values", self.values, "a list of numbers", "Give a vector leaf one choice for each entry's path.")
+            raise checks.fail(
+                "choice: values",
+                self.values,
+                "a list of numbers",
+                "Give a vector leaf one choice for each entry's path.",
+            )
         checks.shape_is("choice: weights", self.weights, self.values.shape)
         if checks.is_concrete(self.weights) and not np.sum(np.asarray(self.weights)) > 0:
             raise checks.fail("choice: weights", self.weights, "at least one weight > 0")
@@ -162,8 +171,9 @@ class JointNormal:
 
     Args:
       mean: centre of the draws, () or as the leaf, in its unit.
-      rows: what each draw of the group adds per standard deviation, (d,) or, for m numbers, (m, d), in the leaf's unit: with the rows of
-        all leaves of the group as a matrix L, L L^T is their covariance.
+      rows: what each draw of the group adds per standard deviation, (d,) or, for m numbers, (m, d),
+        in the leaf's unit: with the rows of all leaves of the group as a matrix L, L L^T is their
+        covariance.
       group: name of the draws, d of them, that the leaves share.
     """
 
@@ -174,7 +184,11 @@ class JointNormal:
     def check(self) -> None:
         """Raises ValueError for rows that do not fit the mean, or a group without a name."""
         if self.rows.ndim != self.mean.ndim + 1 or self.rows.shape[:-1] != self.mean.shape:
-            raise checks.fail("joint_normal: rows", self.rows, f"shape {(*self.mean.shape, 'd')}: d numbers for each of the mean's")
+            raise checks.fail(
+                "joint_normal: rows",
+                self.rows,
+                f"shape {(*self.mean.shape, 'd')}: d numbers for each of the mean's",
+            )
         if not isinstance(self.group, str) or not self.group:
             raise checks.fail("joint_normal: group", self.group, "a name")
 
@@ -214,7 +228,9 @@ class Perturbation:
         object.__setattr__(self, "shared", checks.flag("Perturbation.shared", self.shared))
 
     def apply(self, nominal: jax.Array, u: jax.Array) -> jax.Array:
-        """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the shape of `nominal`."""
+        """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the
+        shape of `nominal`.
+        """
         draw = jnp.broadcast_to(self.distribution.quantile(u).astype(nominal.dtype), nominal.shape)
         if self.kind == "factor":
             return nominal * draw
@@ -225,7 +241,12 @@ class Perturbation:
         low, high = self.distribution.support()
         if self.kind == "factor":
             with np.errstate(invalid="ignore"):
-                ends = np.nan_to_num(np.stack([nominal * low, nominal * high]), nan=0.0, posinf=np.inf, neginf=-np.inf)
+                ends = np.nan_to_num(
+                    np.stack([nominal * low, nominal * high]),
+                    nan=0.0,
+                    posinf=np.inf,
+                    neginf=-np.inf,
+                )
             return ends.min(0), ends.max(0)
         if self.kind == "offset":
             return nominal + low, nominal + high
@@ -235,7 +256,10 @@ class Perturbation:
 def _increasing(name: str, low: jax.Array, high: jax.Array) -> None:
     if checks.is_concrete((low, high)) and not np.all(np.asarray(low) < np.asarray(high)):
         raise checks.fail(
-            f"{name}(low, high)", (np.asarray(low).tolist(), np.asarray(high).tolist()), "low < high", "Exchange or widen them."
+            f"{name}(low, high)",
+            (np.asarray(low).tolist(), np.asarray(high).tolist()),
+            "low < high",
+            "Exchange or widen them.",
         )
 
 
@@ -261,8 +285,8 @@ def normal(mean: Any = 0.0, std: Any = 1.0) -> Normal:
 
         z = mean + std Phi^-1(u),   u uniform on (0, 1)
 
-    On a leaf that must be positive, a run that draws an inadmissible value is not made and is flagged
-    `Status.INADMISSIBLE_DRAW`; `log_uniform` and `uniform` avoid that.
+    On a leaf that must be positive, a run that draws an inadmissible value is not made and is
+    flagged `Status.INADMISSIBLE_DRAW`; `log_uniform` and `uniform` avoid that.
 
     Args:
       mean, std: mean and standard deviation, numbers or arrays that fit the perturbed leaf.
@@ -300,7 +324,8 @@ def joint_normal(mean: Any, rows: Any, group: str) -> JointNormal:
 
     Args:
       mean: as the perturbed leaf.
-      rows: (..., d), as the leaf with one number more for each of its entries: L of the covariance L L^T of all leaves of the group.
+      rows: (..., d), as the leaf with one number more for each of its entries: L of the covariance
+        L L^T of all leaves of the group.
       group: name of the draws that they share.
 
     Returns:
@@ -329,11 +354,16 @@ def choice(values: Any, weights: Any = None) -> Choice:
     Raises:
       ValueError: an empty list, or weights that do not fit it.
     """
-    return Choice(values, jnp.ones(checks.as_floats("choice: values", values).shape) if weights is None else weights)
+    return Choice(
+        values,
+        jnp.ones(checks.as_floats("choice: values", values).shape) if weights is None else weights,
+    )
 
 
 def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
-    """A perturbation; what is no distribution is refused before the fields of the component are read."""
+    """A perturbation; what is no distribution is refused before the fields of the component are
+    read.
+    """
     if not is_distribution(distribution):
         raise _no_distribution(kind, distribution)
     return Perturbation(distribution, kind, shared)
@@ -404,5 +434,11 @@ def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
     return _perturbation("value", distribution, shared)
 
 
-MEMBERS = {"uniform": Uniform, "normal": Normal, "log_uniform": LogUniform, "choice": Choice, "joint_normal": JointNormal}
+MEMBERS = {
+    "uniform": Uniform,
+    "normal": Normal,
+    "log_uniform": LogUniform,
+    "choice": Choice,
+    "joint_normal": JointNormal,
+}
 """Every distribution by the name that files give it."""

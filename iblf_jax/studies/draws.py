@@ -2,12 +2,14 @@
 
 Run i draws, for the leaf that is addressed by `path`,
 
-    u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),    value = perturbation(nominal, F^-1(u))
+    u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),    value = perturbation(nominal,
+    F^-1(u))
 
-so a draw depends on seed, run and path only: not on the chunk, the device, the number of runs or the other perturbations.  u lies in
-the open interval (0, 1), in the middle of the cells that the generator's uniform numbers start; leaves that vary together share it, under
-the name of their group.  `robot.` perturbs plant and model
-with the same u, each around its own nominal value.
+so a draw depends on seed, run and path only: not on the chunk, the device, the number of runs or
+  the other perturbations.  u lies in
+the open interval (0, 1), in the middle of the cells that the generator's uniform numbers start;
+leaves that vary together share it, under the name of their group.  `robot.` perturbs plant and
+model with the same u, each around its own nominal value.
 """
 
 from __future__ import annotations
@@ -75,7 +77,12 @@ def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
                 raise checks.fail(f"{what}: path", path, "an index >= 0", "Count from the front.")
         for other in seen:
             if same_place(scenario, path, other):
-                raise checks.fail(what, (other, path), "paths that do not overlap", "Both would set the same number: keep one of them.")
+                raise checks.fail(
+                    what,
+                    (other, path),
+                    "paths that do not overlap",
+                    "Both would set the same number: keep one of them.",
+                )
         seen.append(path)
 
 
@@ -91,31 +98,48 @@ def targets_of(
       signs: whether distributions that can leave the admissible range by design are refused.
 
     Raises:
-      ValueError: not a mapping of perturbations, an unknown or overlapping path, a distribution that does not fit the leaf or can
-        only leave its admissible range by design (a factor from -1 to 1 on a mass).
+      ValueError: not a mapping of perturbations, an unknown or overlapping path, a distribution
+        that does not fit the leaf or can only leave its admissible range by design (a factor from
+        -1 to 1 on a mass).
     """
     if not isinstance(perturbations, Mapping):
-        raise checks.fail(what, perturbations, 'a mapping such as {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
+        raise checks.fail(
+            what,
+            perturbations,
+            'a mapping such as {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}',
+        )
     check_paths(scenario, perturbations, what)
     targets, by_path = [], {}
     for source, perturbation in perturbations.items():
         if not isinstance(perturbation, Perturbation):
             expected = "ij.factor(...), ij.offset(...) or ij.value(...)"
-            raise checks.fail(f"{what}[{source!r}]", perturbation, expected, _said_properly(perturbation))
+            raise checks.fail(
+                f"{what}[{source!r}]", perturbation, expected, _said_properly(perturbation)
+            )
         for path in _targets(scenario, source, perturbation):
             nominal = np.asarray(paths.get(scenario, path))
             target = Target(path, source, nominal.shape, paths.sign_at(scenario, path))
-            _check_fit(target._replace(sign=target.sign if signs else None), perturbation, nominal, what)
+            _check_fit(
+                target._replace(sign=target.sign if signs else None), perturbation, nominal, what
+            )
             targets.append(target)
             by_path[path] = perturbation
     return tuple(targets), by_path
 
 
 def _said_properly(given: Any) -> str:
-    """The remedy for a range or a distribution in the place of a perturbation, with the user's numbers."""
+    """The remedy for a range or a distribution in the place of a perturbation, with the user's
+    numbers.
+    """
     if isinstance(given, tuple | list) and len(given) == 2 and checks.is_concrete(given):
-        low, high = (checks.shown(np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x) for x in given)
-        return f"Say how the draw acts on the leaf: for values between two ends ij.value(ij.uniform({low}, {high}))."
+        low, high = (
+            checks.shown(np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x)
+            for x in given
+        )
+        return (
+            "Say how the draw acts on the leaf: for values between two ends"
+            f" ij.value(ij.uniform({low}, {high}))."
+        )
     return "Say how the draw acts on the leaf: ij.value(ij.uniform(low, high)), for example."
 
 
@@ -135,11 +159,20 @@ def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, 
     except ValueError:
         fits = False
     if not fits:
-        raise checks.fail(name, perturbation.distribution, f"numbers that fit the leaf's shape {nominal.shape}")
+        raise checks.fail(
+            name, perturbation.distribution, f"numbers that fit the leaf's shape {nominal.shape}"
+        )
     if perturbation.kind == "factor" and not np.any(nominal):
-        raise checks.fail(name, "a factor of a leaf that is 0", "a nominal value that is not 0", "Use ij.offset or ij.value.")
+        raise checks.fail(
+            name,
+            "a factor of a leaf that is 0",
+            "a nominal value that is not 0",
+            "Use ij.offset or ij.value.",
+        )
     bounded = np.isfinite(low)
-    bad = {"positive": low <= 0, "nonnegative": low < 0}.get(target.sign or "", np.zeros(nominal.shape, bool))
+    bad = {"positive": low <= 0, "nonnegative": low < 0}.get(
+        target.sign or "", np.zeros(nominal.shape, bool)
+    )
     if np.any(bad & bounded):
         worst = float(np.min(np.where(bounded, low, np.inf)))
         raise checks.fail(
@@ -150,13 +183,21 @@ def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, 
         )
 
 
-def sample_size(targets: tuple[Target, ...], perturbations: Mapping[str, Perturbation]) -> dict[str, tuple[int, ...]]:
-    """Name of the draws -> shape of their u: path of the user, the leaf's or () where one draw is shared; or a group, and its size."""
-    return {drawn_as(t, perturbations[t.path]): _shape_of_u(t, perturbations[t.path]) for t in targets}
+def sample_size(
+    targets: tuple[Target, ...], perturbations: Mapping[str, Perturbation]
+) -> dict[str, tuple[int, ...]]:
+    """Name of the draws -> shape of their u: path of the user, the leaf's or () where one draw is
+    shared; or a group, and its size.
+    """
+    return {
+        drawn_as(t, perturbations[t.path]): _shape_of_u(t, perturbations[t.path]) for t in targets
+    }
 
 
 def drawn_as(target: Target, perturbation: Perturbation) -> str:
-    """The name of a target's draws: the path that the user wrote, or the group of leaves that vary together."""
+    """The name of a target's draws: the path that the user wrote, or the group of leaves that vary
+    together.
+    """
     return getattr(perturbation.distribution, "group", "") or target.source
 
 
@@ -166,13 +207,21 @@ def _shape_of_u(target: Target, perturbation: Perturbation) -> tuple[int, ...]:
     return () if perturbation.shared else target.shape
 
 
-def uniform_numbers(key: jax.Array, index: jax.Array, source: str, shape: tuple[int, ...], dtype) -> jax.Array:
+def uniform_numbers(
+    key: jax.Array, index: jax.Array, source: str, shape: tuple[int, ...], dtype
+) -> jax.Array:
     """The u of one run and one path, in (0, 1)."""
     own = jax.random.fold_in(jax.random.fold_in(key, index), zlib.crc32(source.encode()))
     return jax.random.uniform(own, shape, dtype) + jnp.finfo(dtype).eps / 2
 
 
-def draw(cases: Cases, targets: tuple[Target, ...], index: jax.Array, point: Mapping[str, Any], u: Mapping[str, Any]):
+def draw(
+    cases: Cases,
+    targets: tuple[Target, ...],
+    index: jax.Array,
+    point: Mapping[str, Any],
+    u: Mapping[str, Any],
+):
     """The perturbed leaves of one run.
 
     Args:
@@ -183,8 +232,8 @@ def draw(cases: Cases, targets: tuple[Target, ...], index: jax.Array, point: Map
       u: designed uniform numbers, or empty.
 
     Returns:
-      Path -> value for the targets, with the nominal value where the draw was inadmissible; path -> value as drawn; and whether all
-      draws were admissible.
+      Path -> value for the targets, with the nominal value where the draw was inadmissible; path ->
+      value as drawn; and whether all draws were admissible.
     """
     scenario = paths.with_parameters(cases.scenario, point)
     dtype = scenario.initial.q.dtype
@@ -207,12 +256,21 @@ def draw(cases: Cases, targets: tuple[Target, ...], index: jax.Array, point: Map
 
 
 def merge(scenario: Scenario, point: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run replaces, from its point and its draws: each place once, whole leaves where the two overlap."""
+    """What a run replaces, from its point and its draws: each place once, whole leaves where the
+    two overlap.
+    """
     overlapping = [p for p in point if any(same_place(scenario, p, m) for m in made)]
     if not overlapping:
         return {**point, **made}
     changed = paths.with_parameters(paths.with_parameters(scenario, point), made)
-    meeting = [*overlapping, *(m for m in made if any(same_place(scenario, m, p) for p in overlapping))]
+    meeting = [
+        *overlapping,
+        *(m for m in made if any(same_place(scenario, m, p) for p in overlapping)),
+    ]
     touched = {leaf for p in meeting for leaf in paths.leaves(scenario, p)}
-    rest = {p: v for p, v in {**point, **made}.items() if not any(same_place(scenario, p, leaf) for leaf in touched)}
+    rest = {
+        p: v
+        for p, v in {**point, **made}.items()
+        if not any(same_place(scenario, p, leaf) for leaf in touched)
+    }
     return {**rest, **{leaf: paths.get(changed, leaf) for leaf in touched}}

@@ -1,15 +1,19 @@
 """The factor at which a law has a given effort, looked for among all factors of a range.
 
-The effort need not grow with the factor, and trials may fail, so nothing is concluded from a few of them:
+The effort need not grow with the factor, and trials may fail, so nothing is concluded from a few of
+them:
 
-1. A grid of factors is run in one batch: 2^(i / 16) from 1/4 to 4, and 2^(i / 4) beyond, to 1/32 and 32.
-2. Between neighbours that are both valid and have the target between them there is a crossing; it is refined by further batches until
-   the factor is known to 1e-6, and rejected if the effort jumps over the target there.  Refined too are the places where a crossing may
-   hide: next to failed trials, and around an effort that turns back just before the target.
+1. A grid of factors is run in one batch: 2^(i / 16) from 1/4 to 4, and 2^(i / 4) beyond, to 1/32
+  and 32.
+2. Between neighbours that are both valid and have the target between them there is a crossing; it
+   is refined by further batches until the factor is known to 1e-6, and rejected if the effort jumps
+   over the target there.  Refined too are the places where a crossing may hide: next to failed
+   trials, and around an effort that turns back just before the target.
 3. Of all crossings the one nearest to 1, by |ln factor|, is chosen.
 
-A trial is valid if its run did not fail and is accurate.  Where the law's own run, or the one that sets the target, is flagged inaccurate
-itself, inaccurate trials count as well, and the result says so.
+A trial is valid if its run did not fail and is accurate.  Where the law's own run, or the one that
+sets the target, is flagged inaccurate itself, inaccurate trials count as well, and the result says
+so.
 """
 
 from __future__ import annotations
@@ -40,7 +44,8 @@ MOST_NAMED = 4
 """Crossings, and groups of failed trials, that the text names."""
 
 NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
-"""Flags of runs whose effort is not to be compared; constraints that a law does not know of are no obstacle."""
+"""Flags of runs whose effort is not to be compared; constraints that a law does not know of are no
+obstacle."""
 OF_STEP = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags for which the time step is to blame."""
 
@@ -74,7 +79,8 @@ class EffortSearch:
     accepts_inaccurate: bool
     """Whether trials flagged INACCURATE count as valid, as the runs at the gains given are."""
     smaller_dt: float | None = None
-    """A step [s] for the failed trials that may hide a better factor, where nothing but the step is to blame; None without such."""
+    """A step [s] for the failed trials that may hide a better factor, where nothing but the step is
+    to blame; None without such."""
 
     @property
     def factor(self) -> float:
@@ -88,7 +94,9 @@ class EffortSearch:
 
     @property
     def nearest(self) -> tuple[float, float]:
-        """Factor and effort [N m] of the valid trial whose effort is nearest to the target; NaN where no trial is valid."""
+        """Factor and effort [N m] of the valid trial whose effort is nearest to the target; NaN
+        where no trial is valid.
+        """
         if not np.any(self.valid):
             return math.nan, math.nan
         away = np.where(self.valid, np.abs(self.efforts - self.target), np.inf)
@@ -99,7 +107,9 @@ class EffortSearch:
     def failed(self) -> dict[float, str]:
         """Factor -> why its run is not valid, in words."""
         why = NO_EFFORT if self.accepts_inaccurate else NO_EFFORT | Status.INACCURATE
-        bad = zip(self.factors[~self.valid].tolist(), self.status[~self.valid].tolist(), strict=True)
+        bad = zip(
+            self.factors[~self.valid].tolist(), self.status[~self.valid].tolist(), strict=True
+        )
         return {factor: describe(int(status) & int(why)) for factor, status in bad}
 
     def in_words(self) -> str:
@@ -111,10 +121,16 @@ class EffortSearch:
     def _found(self) -> str:
         if not self.crossings:
             return self._nothing_found()
-        text = f"the effort is {self.target:.4g} N m at {_few([f'{x:.4g}' for x in self.crossings])}"
+        text = (
+            f"the effort is {self.target:.4g} N m at {_few([f'{x:.4g}' for x in self.crossings])}"
+        )
         if len(self.crossings) > 1:
             text += f", of which {self.factor:.4g} is the nearest to 1"
-        return text + (" (inaccurate runs count, as those at the gains given are inaccurate)" if self.accepts_inaccurate else "")
+        return text + (
+            " (inaccurate runs count, as those at the gains given are inaccurate)"
+            if self.accepts_inaccurate
+            else ""
+        )
 
     def _nothing_found(self) -> str:
         efforts = self.efforts[self.valid]
@@ -127,26 +143,37 @@ class EffortSearch:
         else:
             side = "does not pass through"
         factor, effort = self.nearest
-        where = f"its effort {side} {self.target:.4g} N m ({efforts.min():.4g} to {efforts.max():.4g})"
+        where = (
+            f"its effort {side} {self.target:.4g} N m ({efforts.min():.4g} to {efforts.max():.4g})"
+        )
         return f"{where}; the nearest of them has {effort:.4g} N m, at {factor:.4g}"
 
     def _failures(self) -> list[str]:
         """Each group of neighbouring trials that failed for one reason."""
         if not self.failed:
             return []
-        nearest = sorted(self.failed_groups(), key=lambda group: min(abs(math.log(x)) for x in group[0]))
+        nearest = sorted(
+            self.failed_groups(), key=lambda group: min(abs(math.log(x)) for x in group[0])
+        )
         groups = [f"{_range(factors)} ({_reasons(status)})" for factors, status in nearest]
         words = [f"{len(self.failed)} of them fail: {_few(groups)}"]
         if self.smaller_dt is not None:
-            words.append(f"nearest to 1 only the time step is to blame: with dt={self.smaller_dt:g} these trials may be valid")
+            words.append(
+                f"nearest to 1 only the time step is to blame: with dt={self.smaller_dt:g} these"
+                " trials may be valid"
+            )
         return words
 
     def failed_groups(self) -> list[tuple[list[float], list[int]]]:
-        """Neighbouring trials that failed, from the smallest factor on: their factors, and the flags for which they count as failed."""
+        """Neighbouring trials that failed, from the smallest factor on: their factors, and the
+        flags for which they count as failed.
+        """
         why = int(NO_EFFORT if self.accepts_inaccurate else NO_EFFORT | Status.INACCURATE)
         groups: list[tuple[list[float], list[int]]] = []
         after_valid = True
-        for factor, status, fine in zip(self.factors.tolist(), self.status.tolist(), self.valid.tolist(), strict=True):
+        for factor, status, fine in zip(
+            self.factors.tolist(), self.status.tolist(), self.valid.tolist(), strict=True
+        ):
             if not fine and after_valid:
                 groups.append(([], []))
             if not fine:
@@ -187,7 +214,9 @@ def is_valid(efforts: np.ndarray, status: np.ndarray, inaccurate: bool) -> np.nd
 
 
 def grid() -> np.ndarray:
-    """Powers of two of the factors that are tried first, growing; 0, the factor 1, is among them."""
+    """Powers of two of the factors that are tried first, growing; 0, the factor 1, is among
+    them.
+    """
     fine = np.arange(-FINE * FINE_END, FINE * FINE_END + 1) / FINE
     outer = np.arange(COARSE * FINE_END + 1, COARSE * END + 1) / COARSE
     return np.concatenate([-outer[::-1], fine, outer])
@@ -202,7 +231,8 @@ def search(
     """Looks for all factors at which an effort is the target.
 
     Args:
-      run: factors (N,) -> what their runs gave; called with at most as many factors as the grid has.
+      run: factors (N,) -> what their runs gave; called with at most as many factors as the grid
+        has.
       target: the effort to reach [N m].
       needed_dt: trials whose step is too large -> one that would do [s].
       inaccurate: whether trials flagged INACCURATE count as valid.
@@ -217,14 +247,19 @@ def search(
     return EffortSearch(target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt)
 
 
-def _hidden(powers: np.ndarray, trials: Trials, valid: np.ndarray, crossings: Sequence[float]) -> np.ndarray:
-    """The failed trials that may hide a crossing nearer to 1, with nothing but their step known to be to blame, (N,) bool.
+def _hidden(
+    powers: np.ndarray, trials: Trials, valid: np.ndarray, crossings: Sequence[float]
+) -> np.ndarray:
+    """The failed trials that may hide a crossing nearer to 1, with nothing but their step known to
+    be to blame, (N,) bool.
 
-    Where the step is beyond its stability limit the other flags say nothing.  Where no crossing was found the trials are those
-    nearest to 1 on each side.
+    Where the step is beyond its stability limit the other flags say nothing.  Where no crossing was
+    found the trials are those nearest to 1 on each side.
     """
     unstable = trials.status & int(Status.STEP_TOO_LARGE) != 0
-    only_inaccurate = (trials.status & int(Status.INACCURATE) != 0) & (trials.status & int(NO_EFFORT) == 0)
+    only_inaccurate = (trials.status & int(Status.INACCURATE) != 0) & (
+        trials.status & int(NO_EFFORT) == 0
+    )
     blamed = ~valid & (unstable | only_inaccurate)
     if crossings:
         return blamed & (np.abs(powers) < min(map(abs, crossings)))
@@ -243,7 +278,9 @@ def _refined(
     trials: Trials,
     inaccurate: bool,
 ) -> tuple[np.ndarray, Trials, list[float]]:
-    """The trials with those of the refinement among them, growing, and the powers of the crossings."""
+    """The trials with those of the refinement among them, growing, and the powers of the
+    crossings.
+    """
     for count in range(ROUNDS):
         excess = _excess(trials, target, inaccurate)
         places = _open_brackets(powers, excess)
@@ -266,13 +303,17 @@ def _excess(trials: Trials, target: float, inaccurate: bool) -> np.ndarray:
 
 
 def _open_brackets(powers: np.ndarray, excess: np.ndarray) -> list[int]:
-    """The intervals, by the number of their lower end, with a crossing that is not yet known well enough."""
+    """The intervals, by the number of their lower end, with a crossing that is not yet known well
+    enough.
+    """
     opposite = excess[:-1] * excess[1:] < 0.0
     return np.flatnonzero(opposite & (np.diff(powers) > CLOSE)).tolist()
 
 
 def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
-    """The intervals in which a crossing may hide: at the edge of what is valid, and where the effort turns back before the target."""
+    """The intervals in which a crossing may hide: at the edge of what is valid, and where the
+    effort turns back before the target.
+    """
     finite = np.isfinite(excess)
     found = set(np.flatnonzero(finite[:-1] != finite[1:]).tolist())
     for i in range(1, len(powers) - 1):
@@ -282,14 +323,18 @@ def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
             found |= {i - 1, i}
     valid = np.flatnonzero(finite)
     for a, b in zip(valid[:-1].tolist(), valid[1:].tolist(), strict=True):
-        if excess[a] * excess[b] < 0.0 and b > a + 1:  # the crossing is somewhere among failed trials
+        if (
+            excess[a] * excess[b] < 0.0 and b > a + 1
+        ):  # the crossing is somewhere among failed trials
             found |= set(range(a, b))
     brackets = set(_open_brackets(powers, excess))
     return sorted(found - brackets)
 
 
 def _between(powers: np.ndarray, places: list[int], most: int) -> np.ndarray:
-    """Powers inside these intervals, equally many in each, of those nearest to 1 if there are too many."""
+    """Powers inside these intervals, equally many in each, of those nearest to 1 if there are too
+    many.
+    """
     chosen = sorted(places, key=lambda i: min(abs(powers[i]), abs(powers[i + 1])))[:most]
     each = max(1, most // len(chosen))
     share = np.arange(1, each + 1) / (each + 1)
@@ -297,7 +342,9 @@ def _between(powers: np.ndarray, places: list[int], most: int) -> np.ndarray:
 
 
 def _crossings(powers: np.ndarray, excess: np.ndarray, target: float) -> list[float]:
-    """The powers at which the excess is zero, by straight lines between neighbours of opposite sign."""
+    """The powers at which the excess is zero, by straight lines between neighbours of opposite
+    sign.
+    """
     found = powers[excess == 0.0].tolist()
     for i in np.flatnonzero(excess[:-1] * excess[1:] < 0.0).tolist():
         a, b = excess[i], excess[i + 1]
@@ -329,7 +376,9 @@ def _range(factors: Sequence[float]) -> str:
 
 
 def _reasons(status: Sequence[int]) -> str:
-    """Why some trials failed, each reason with the number of trials if not all of them failed for it."""
+    """Why some trials failed, each reason with the number of trials if not all of them failed for
+    it.
+    """
     words = []
     for flag, text in WORDS.items():
         count = sum(bool(x & flag) for x in status)

@@ -1,9 +1,10 @@
 """Monte-Carlo studies: many runs of one scenario with parameters drawn at random.
 
-Only the results of the metrics are kept of each run, so memory does not grow with the length of a run; any run can be looked
-at again in full with `study.replay(i)`.
+Only the results of the metrics are kept of each run, so memory does not grow with the length of a
+run; any run can be looked at again in full with `study.replay(i)`.
 
-Workers of one's own (`multiprocessing`) are to be started by `spawn` or `forkserver`: a `fork` of a process in which JAX has run hangs.
+Workers of one's own (`multiprocessing`) are to be started by `spawn` or `forkserver`: a `fork` of a
+process in which JAX has run hangs.
 """
 
 from __future__ import annotations
@@ -52,16 +53,20 @@ def monte_carlo(
 ) -> Study:
     """Runs a scenario many times with parameters drawn at random.
 
-        run i:  u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),   leaf = perturbation(nominal, F^-1(u))
+        run i:  u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),   leaf =
+          perturbation(nominal, F^-1(u))
 
-    The results of run i depend on the seed and on i only: not on `runs`, `chunk`, the devices or the processes.  They are
-    bit-identical on one backend and one version of JAX.  A perturbed run whose start or reference lies outside its bounds is no
-    error: its status says so.  In a job of several processes (`iblf_jax.distributed`) each computes its share and all get the study.
+    The results of run i depend on the seed and on i only: not on `runs`, `chunk`, the devices or
+      the processes.  They are
+    bit-identical on one backend and one version of JAX.  A perturbed run whose start or reference
+    lies outside its bounds is no error: its status says so.  In a job of several processes
+      (`iblf_jax.distributed`) each computes its share and all get the study.
 
     Args:
       scenario: what to run, of n joints.
-      perturbations: path -> `factor`, `offset` or `value` of a distribution; there may be none where a sensor has noise.  A vector leaf
-        gets an independent draw for each entry; `robot.` paths change plant and model alike.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution; there may be none
+        where a sensor has noise.  A vector leaf gets an independent draw for each entry; `robot.`
+        paths change plant and model alike.
       runs: number of runs N.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s]; `recommended_dt(scenario, perturbations=...)` says which will do.
@@ -71,7 +76,8 @@ def monte_carlo(
       sampler: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
       backend: "auto", "native", "gpu", "xla" or "vmap".
-      chunk: runs in flight on the devices at a time; from `memory` if not given.  It changes no result.
+      chunk: runs in flight on the devices at a time; from `memory` if not given.  It changes no
+        result.
       memory: bytes that runs in flight may take.
       devices: devices to use; all of this process if not given.
       progress: a progress bar; shown where somebody watches if not given.
@@ -87,12 +93,29 @@ def monte_carlo(
     how = checked_how(chunk, memory, devices)
     runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
     replicates = check_sampler(sampler, runs, replicates)
-    if isinstance(perturbations, Mapping) and not perturbations and not (isinstance(scenario, Scenario) and has_noise(scenario)):
+    if (
+        isinstance(perturbations, Mapping)
+        and not perturbations
+        and not (isinstance(scenario, Scenario) and has_noise(scenario))
+    ):
         raise checks.fail(
-            "perturbations", perturbations, "at least one perturbation", "Without any all runs are the same: use ij.simulate."
+            "perturbations",
+            perturbations,
+            "at least one perturbation",
+            "Without any all runs are the same: use ij.simulate.",
         )
     timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
-    setup = prepare(scenario, perturbations, runs, seed, metrics=metrics, backend=backend, sampler=sampler, replicates=replicates, **timing)
+    setup = prepare(
+        scenario,
+        perturbations,
+        runs,
+        seed,
+        metrics=metrics,
+        backend=backend,
+        sampler=sampler,
+        replicates=replicates,
+        **timing,
+    )
     checks.fits("runs", runs, setup.bytes_a_case)
     results, blocks = None, range(-(-runs // block_size()))
     mine = distributed.share(blocks) or [0]
@@ -102,7 +125,9 @@ def monte_carlo(
         for block, part in run_blocks(setup.study_run, setup.shared, setup.lanes, mine, **how):
             results = _stored(results, part, block, runs)
             shown.update(sizes[block])
-    results = distributed.gather_rows(results, blocks, block_size(), (time.monotonic() - begin) / len(mine))
+    results = distributed.gather_rows(
+        results, blocks, block_size(), (time.monotonic() - begin) / len(mine)
+    )
     tell_of_step(results.status, results.fastest_mode, results.metrics[RELATIVE], float(dt), method)
     return Study.of(setup, results)
 

@@ -1,7 +1,9 @@
-"""The points of a sweep: a full grid of values, or a random or Latin-hypercube design over distributions.
+"""The points of a sweep: a full grid of values, or a random or Latin-hypercube design over
+distributions.
 
-A grid has one dimension a path, and its points are numbered with the last path running fastest.  A design has the one dimension
-"point"; point j draws as run j of a study does (`draws`), from a key of its own.
+A grid has one dimension a path, and its points are numbered with the last path running fastest.  A
+design has the one dimension "point"; point j draws as run j of a study does (`draws`), from a key
+of its own.
 """
 
 from __future__ import annotations
@@ -46,11 +48,14 @@ class Points(NamedTuple):
         return int(np.prod(list(self.dims.values()), dtype=int))
 
 
-def make_points(scenario: Scenario, grid: Any, design: str, points: int | None, seed: int) -> Points:
+def make_points(
+    scenario: Scenario, grid: Any, design: str, points: int | None, seed: int
+) -> Points:
     """The points of a sweep, checked against the scenario.
 
     Raises:
-      ValueError: an unknown or overlapping path, values of a wrong shape, type or sign, a design that does not fit the grid.
+      ValueError: an unknown or overlapping path, values of a wrong shape, type or sign, a design
+        that does not fit the grid.
     """
     checks.one_of("design", design, DESIGNS)
     if not isinstance(grid, Mapping):
@@ -58,42 +63,67 @@ def make_points(scenario: Scenario, grid: Any, design: str, points: int | None, 
     check_paths(scenario, grid, "grid")
     if design == "grid":
         if points is not None:
-            raise checks.fail("points", points, "none with a grid", 'A grid has as many as it has; or take design="latin_hypercube".')
+            raise checks.fail(
+                "points",
+                points,
+                "none with a grid",
+                'A grid has as many as it has; or take design="latin_hypercube".',
+            )
         return _grid(scenario, grid)
-    return _design(scenario, grid, design, checks.positive_integer("points", points, most=MOST_RUNS), seed)
+    return _design(
+        scenario, grid, design, checks.positive_integer("points", points, most=MOST_RUNS), seed
+    )
 
 
 def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
     ticks = {path: _ticks(scenario, path, values) for path, values in grid.items()}
     dims = {path: len(values) for path, values in ticks.items()}
     if len(dims) > MOST_DIMS:
-        raise checks.fail("grid", f"{len(dims)} paths", f"at most {MOST_DIMS}, as many dimensions as an array has")
+        raise checks.fail(
+            "grid", f"{len(dims)} paths", f"at most {MOST_DIMS}, as many dimensions as an array has"
+        )
     total = math.prod(dims.values())
-    checks.fits("points of the grid", total, sum(8.0 * (2 + values[0].size) for values in ticks.values()))
+    checks.fits(
+        "points of the grid", total, sum(8.0 * (2 + values[0].size) for values in ticks.values())
+    )
     places = np.indices(tuple(dims.values())).reshape(len(dims), total)
     values = {path: ticks[path][place] for path, place in zip(dims, places, strict=True)}
     return Points(dims, {path: path for path in grid}, ticks, values)
 
 
 def _ticks(scenario: Scenario, path: str, values: Any) -> np.ndarray:
-    """The values of one path of a grid, (m,) for numbers that fill the leaf, or (m, ...) for whole leaves."""
+    """The values of one path of a grid, (m,) for numbers that fill the leaf, or (m, ...) for whole
+    leaves.
+    """
     name = f"grid[{path!r}]"
     if isinstance(values, Perturbation) or is_distribution(values):
-        raise checks.fail(name, values, "a list of values", 'Distributions go with design="random" or "latin_hypercube".')
+        raise checks.fail(
+            name,
+            values,
+            "a list of values",
+            'Distributions go with design="random" or "latin_hypercube".',
+        )
     shape = np.shape(paths.get(scenario, path))
     array = np.asarray(checks.as_floats(name, values)).astype(scenario.initial.q.dtype)
     if array.ndim == 0 or array.shape[1:] not in ((), shape) or len(array) == 0:
-        raise checks.fail(name, array, f"a list of numbers{f' or of arrays of shape {shape}' if shape else ''}")
+        raise checks.fail(
+            name, array, f"a list of numbers{f' or of arrays of shape {shape}' if shape else ''}"
+        )
     checks.check_values(name, array, paths.sign_at(scenario, path))
     if len(np.unique(array, axis=0)) < len(array):
         raise checks.fail(name, array, "values that differ", "Remove the repeated ones.")
     return array
 
 
-def _design(scenario: Scenario, grid: Mapping[str, Any], design: str, count: int, seed: int) -> Points:
+def _design(
+    scenario: Scenario, grid: Mapping[str, Any], design: str, count: int, seed: int
+) -> Points:
     if not grid:
         raise checks.fail("grid", dict(grid), f'at least one distribution for design="{design}"')
-    ways = {path: way if isinstance(way, Perturbation) else value(_distribution(path, way)) for path, way in grid.items()}
+    ways = {
+        path: way if isinstance(way, Perturbation) else value(_distribution(path, way))
+        for path, way in grid.items()
+    }
     targets, by_path = targets_of(scenario, ways, "grid")
     dtype = scenario.initial.q.dtype
     by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
@@ -102,23 +132,51 @@ def _design(scenario: Scenario, grid: Mapping[str, Any], design: str, count: int
     if design == "latin_hypercube":
         shapes = sample_size(targets, by_path)
         designed = split(
-            unit_points(design, sum(int(np.prod(s, dtype=int)) for s in shapes.values()), count, 1, seed, _SALT), shapes, dtype
+            unit_points(
+                design,
+                sum(int(np.prod(s, dtype=int)) for s in shapes.values()),
+                count,
+                1,
+                seed,
+                _SALT,
+            ),
+            shapes,
+            dtype,
         )
-    values = _draw_points(Cases(scenario, by_path, jax.random.fold_in(jax.random.PRNGKey(seed), _SALT)), targets, count, designed)
+    values = _draw_points(
+        Cases(scenario, by_path, jax.random.fold_in(jax.random.PRNGKey(seed), _SALT)),
+        targets,
+        count,
+        designed,
+    )
     return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
 
 
 def _distribution(path: str, way: Any) -> Any:
     if not is_distribution(way):
-        raise checks.fail(f"grid[{path!r}]", way, "a distribution, such as ij.uniform(10, 40)", 'Lists of values go with design="grid".')
+        raise checks.fail(
+            f"grid[{path!r}]",
+            way,
+            "a distribution, such as ij.uniform(10, 40)",
+            'Lists of values go with design="grid".',
+        )
     return way
 
 
-def _draw_points(cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _draw_points(
+    cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     lanes = Lanes(np.arange(count, dtype=np.uint32), {}, designed)
-    drawn, fine = jax.jit(jax.vmap(lambda lane: draw(cases, targets, lane.index, lane.points, lane.u)[1:]))(lanes)
+    drawn, fine = jax.jit(
+        jax.vmap(lambda lane: draw(cases, targets, lane.index, lane.points, lane.u)[1:])
+    )(lanes)
     if not np.all(fine):
         bad = int(np.argmin(np.asarray(fine)))
         shown = {path: np.asarray(x[bad]).tolist() for path, x in drawn.items()}
-        raise checks.fail(f"grid: point {bad}", shown, "admissible values", "Choose distributions that stay inside the leaf's range.")
+        raise checks.fail(
+            f"grid: point {bad}",
+            shown,
+            "admissible values",
+            "Choose distributions that stay inside the leaf's range.",
+        )
     return {path: np.asarray(x) for path, x in drawn.items()}

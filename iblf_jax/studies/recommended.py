@@ -1,4 +1,6 @@
-"""Which time step will do for a study: for every run that is drawn, not for the nominal one alone."""
+"""Which time step will do for a study: for every run that is drawn, not for the nominal one
+alone.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +34,17 @@ def recommended_dt(
     perturbations: Mapping[str, Perturbation] | None = None,
     seed: int = 0,
 ) -> float:
-    """A round time step [s] with which `simulate`, or a study, is stable and accurate on this scenario.
+    """A round time step [s] with which `simulate`, or a study, is stable and accurate on this
+    scenario.
 
-    For one run: at most dt = 1.5 / max |eigenvalue of the closed loop's Jacobian|, at the start, along the reference and where the run
-    comes nearest to a bound; and so small that the run agrees with one in steps of about a third to 0.1 % of the tube, and its own
-    estimate of its error is below 0.5 %.  Rounded down to 1, 2 or 5 times a power of ten.
+    For one run: at most dt = 1.5 / max |eigenvalue of the closed loop's Jacobian|, at the start,
+      along the reference and where the run
+    comes nearest to a bound; and so small that the run agrees with one in steps of about a third to
+    0.1 % of the tube, and its own estimate of its error is below 0.5 %.  Rounded down to 1, 2 or 5
+    times a power of ten.
 
-    With perturbations: so small that no run of a first block of the study (256 runs on CPU) is flagged STEP_TOO_LARGE or INACCURATE.
+    With perturbations: so small that no run of a first block of the study (256 runs on CPU) is
+      flagged STEP_TOO_LARGE or INACCURATE.
 
     Args:
       scenario: what is to run.
@@ -48,7 +54,8 @@ def recommended_dt(
       seed: of the draws.
 
     Returns:
-      The step [s].  Where none will do (a loop that magnifies every error, say), the one for the modes alone, with a warning.
+      The step [s].  Where none will do (a loop that magnifies every error, say), the one for the
+      modes alone, with a warning.
 
     Raises:
       ValueError: bad scenario, duration, method, perturbations or seed.
@@ -65,21 +72,33 @@ def recommended_dt(
         return dt
     for _ in range(MOST_TRIES):
         steps = max(round(duration / dt), 1)
-        options: dict[str, Any] = {"duration": steps * dt, "dt": dt, "method": method, "metrics": (), "backend": "auto"}
+        options: dict[str, Any] = {
+            "duration": steps * dt,
+            "dt": dt,
+            "method": method,
+            "metrics": (),
+            "backend": "auto",
+        }
         setup = prepare(scenario, perturbations, block_size(), seed, **options)
         ((_, results),) = run_blocks(setup.study_run, setup.shared, setup.lanes, [0])
-        needed = needed_dt(results.status, results.fastest_mode, results.metrics[RELATIVE], dt, method)
+        needed = needed_dt(
+            results.status, results.fastest_mode, results.metrics[RELATIVE], dt, method
+        )
         if needed is None:
             return dt
         dt = needed
     return dt
 
 
-def needed_dt(status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str) -> float | None:
-    """A smaller step for the runs that were flagged because of theirs; None if there is no such run.
+def needed_dt(
+    status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
+) -> float | None:
+    """A smaller step for the runs that were flagged because of theirs; None if there is no such
+    run.
 
     Args:
-      status, modes, errors: flags, fastest mode [1/s] and estimated error relative to the tube of each run.
+      status, modes, errors: flags, fastest mode [1/s] and estimated error relative to the tube of
+        each run.
       dt: their time step [s].
       method: the integrator.
     """
@@ -89,16 +108,25 @@ def needed_dt(status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: flo
     if np.any(stiff):
         needed.append(step_size.comfortable_dt(float(np.max(modes[stiff]))))
     if np.any(inaccurate):
-        needed.append(step_size.smaller(dt, float(np.max(errors[inaccurate])) / TOLERANCE, tableau(method).order))
+        needed.append(
+            step_size.smaller(
+                dt, float(np.max(errors[inaccurate])) / TOLERANCE, tableau(method).order
+            )
+        )
     return min(needed, default=None)
 
 
-def tell_of_step(status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str) -> None:
-    """Warns if runs of a study were flagged because of their step, with one that would do; arguments as `needed_dt`."""
+def tell_of_step(
+    status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
+) -> None:
+    """Warns if runs of a study were flagged because of their step, with one that would do;
+    arguments as `needed_dt`.
+    """
     needed = needed_dt(status, modes, errors, dt, method)
     if needed is not None:
         late = int(np.sum(status & int(TOO_LARGE) != 0))
         notices.warn(
-            f"The time step dt = {dt:g} s is too large for {late} of {status.size} runs, which are unstable or inaccurate. "
-            f"Take dt={needed:g}; ij.recommended_dt(scenario, perturbations=..., duration=...) looks for one beforehand."
+            f"The time step dt = {dt:g} s is too large for {late} of {status.size} runs, which are"
+            f" unstable or inaccurate. Take dt={needed:g}; ij.recommended_dt(scenario,"
+            " perturbations=..., duration=...) looks for one beforehand."
         )

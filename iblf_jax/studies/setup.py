@@ -34,7 +34,9 @@ from iblf_jax.studies.draws import Cases, Lanes, sample_size, targets_of
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class StudySetup:
-    """A study's arguments.  Cases are numbered: case = point * runs + run, with one point unless it is a sweep."""
+    """A study's arguments.  Cases are numbered: case = point * runs + run, with one point unless it
+    is a sweep.
+    """
 
     study_run: StudyRun = dataclasses.field(metadata={"static": True})
     shared: StudyInputs
@@ -58,7 +60,9 @@ class StudySetup:
     @cached_property
     def shapes(self) -> Results:
         """Shapes and types of what a block leaves."""
-        block = partial(_execute, study_run=self.study_run, record_every=None)  # as `run_blocks` calls it, so that it is traced once
+        block = partial(
+            _execute, study_run=self.study_run, record_every=None
+        )  # as `run_blocks` calls it, so that it is traced once
         return jax.eval_shape(block, self.shared, self.lanes(np.arange(block_size())))
 
     @property
@@ -70,7 +74,9 @@ class StudySetup:
         """What differs between these cases; cases past the last one repeat it."""
         point, run = np.divmod(np.minimum(cases, self.cases - 1), self.runs)
         points = {path: values[point] for path, values in self.points.items()}
-        return Lanes(run.astype(np.uint32), points, {path: u[run] for path, u in self.designed.items()})
+        return Lanes(
+            run.astype(np.uint32), points, {path: u[run] for path, u in self.designed.items()}
+        )
 
 
 def prepare(
@@ -105,5 +111,18 @@ def prepare(
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
     study_run = StudyRun(targets, steps, method, backend, known_of(scenario))
     shared = StudyInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), folds, step)
-    setup = StudySetup(study_run, shared, dict(perturbations), seed, runs, sampler, replicates, designed, dict(points or {}))
-    return dataclasses.replace(setup, study_run=with_chosen_backend(study_run, shared, setup.lanes(np.arange(block_size()))))
+    setup = StudySetup(
+        study_run,
+        shared,
+        dict(perturbations),
+        seed,
+        runs,
+        sampler,
+        replicates,
+        designed,
+        dict(points or {}),
+    )
+    return dataclasses.replace(
+        setup,
+        study_run=with_chosen_backend(study_run, shared, setup.lanes(np.arange(block_size()))),
+    )

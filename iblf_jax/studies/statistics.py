@@ -1,7 +1,9 @@
 """Statistics of runs: probabilities with intervals, one number a run, rank correlations.
 
-Clopper-Pearson: with k events in N independent runs, the interval of the probability p that holds for every p with at least
-the confidence asked for is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)], B the quantile of the beta distribution.
+Clopper-Pearson: with k events in N independent runs, the interval of the probability p that holds
+  for every p with at least
+the confidence asked for is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)], B the quantile of the
+beta distribution.
 
 Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
 """
@@ -41,7 +43,11 @@ class Probability:
     """How the interval was made, or why there is none."""
 
     def __str__(self) -> str:
-        ends = f"no interval ({self.method})" if self.low is None else f"{self.confidence:.0%} interval {self.low:.3g} to {self.high:.3g}"
+        ends = (
+            f"no interval ({self.method})"
+            if self.low is None
+            else f"{self.confidence:.0%} interval {self.low:.3g} to {self.high:.3g}"
+        )
         return f"{self.estimate:.4g} ({self.count} of {self.runs} runs; {ends})"
 
 
@@ -49,11 +55,15 @@ def check_confidence(confidence: Any) -> float:
     """A confidence in (0, 1), or a ValueError."""
     number = checks.positive_number("confidence", confidence, "1")
     if number >= 1:
-        raise checks.fail("confidence", confidence, "a number between 0 and 1", "0.95, for example.")
+        raise checks.fail(
+            "confidence", confidence, "a number between 0 and 1", "0.95, for example."
+        )
     return number
 
 
-def probability(events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int) -> Probability:
+def probability(
+    events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int
+) -> Probability:
     """The probability of an event over the valid runs.
 
     Args:
@@ -67,25 +77,42 @@ def probability(events: np.ndarray, valid: np.ndarray, confidence: float, sample
     estimate = count / runs if runs else float("nan")
     low, high, method = None, None, "no run was made"
     if runs and sampler == "independent":
-        ends = stats.binomtest(count, runs).proportion_ci(confidence_level=confidence, method="exact")
+        ends = stats.binomtest(count, runs).proportion_ci(
+            confidence_level=confidence, method="exact"
+        )
         low, high, method = float(ends.low), float(ends.high), "Clopper-Pearson"
     elif runs:
-        low, high, method = _between_replicates(events & valid, valid, confidence, sampler, replicates)
+        low, high, method = _between_replicates(
+            events & valid, valid, confidence, sampler, replicates
+        )
     return Probability(estimate, low, high, confidence, count, runs, method)
 
 
-def _between_replicates(events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int):
+def _between_replicates(
+    events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int
+):
     if replicates < 2:
         return None, None, f"runs of one {sampler} design are not independent; ask for replicates"
     counts, sizes = events.reshape(replicates, -1).sum(1), valid.reshape(replicates, -1).sum(1)
     means = counts / np.maximum(sizes, 1)
     spread = means.std(ddof=1) / np.sqrt(replicates)
     if spread == 0:
-        return None, None, "all replicates agree, so their spread says nothing; ask for more runs or independent draws"
+        return (
+            None,
+            None,
+            (
+                "all replicates agree, so their spread says nothing; ask for more runs or"
+                " independent draws"
+            ),
+        )
     from scipy import stats
 
     half = stats.t.ppf(0.5 + confidence / 2, replicates - 1) * spread
-    return float(max(0.0, means.mean() - half)), float(min(1.0, means.mean() + half)), f"Student t over {replicates} replicates"
+    return (
+        float(max(0.0, means.mean() - half)),
+        float(min(1.0, means.mean() + half)),
+        f"Student t over {replicates} replicates",
+    )
 
 
 def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
@@ -109,7 +136,9 @@ def columns(samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Spearman's rank correlation and its two-sided p-value; (nan, nan) where one of the two is constant."""
+    """Spearman's rank correlation and its two-sided p-value; (nan, nan) where one of the two is
+    constant.
+    """
     if len(x) < 3 or np.all(x == x[0]) or np.all(y == y[0]):
         return float("nan"), float("nan")
     from scipy import stats

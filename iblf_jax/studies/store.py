@@ -1,15 +1,22 @@
 """A store of runs on disk (zarr) that survives a kill at any moment.
 
 - It is made in a draft and renamed in: there is never half a store.
-- A **unit** is a number of consecutive cases, and one whole chunk of every array, so processes that write different units never touch the
-  same file, and two that write the same unit write the same bytes.  zarr writes a chunk to a temporary file and renames it.
-- A unit's data are written first, its mark in `done` after them, one unit a chunk.  The mark holds a checksum of the unit's data and of
-  the configuration: data that are torn, missing, or of another store do not fit their mark and are not read.
-- The attributes hold the whole configuration.  A store that was made with another one is refused, naming the difference.
-- Only arrays of numbers in zarr's format 3 are opened: the older format, and objects, can make the reader run code.
-- What describes the store is looked at again around every write: one that was deleted or replaced meanwhile is not written on.
+- A **unit** is a number of consecutive cases, and one whole chunk of every array, so processes that
+  write different units never touch the same file, and two that write the same unit write the same
+  bytes.  zarr writes a chunk to a temporary file and renames it.
+- A unit's data are written first, its mark in `done` after them, one unit a chunk.  The mark holds
+  a checksum of the unit's data and of
+  the configuration: data that are torn, missing, or of another store do not fit their mark and are
+    not read.
+- The attributes hold the whole configuration.  A store that was made with another one is refused,
+  naming the difference.
+- Only arrays of numbers in zarr's format 3 are opened: the older format, and objects, can make the
+  reader run code.
+- What describes the store is looked at again around every write: one that was deleted or replaced
+  meanwhile is not written on.
 
-zarr does not force data to the disk's surface: a kill cannot tear a store, a power failure can, and then the checksum tells.
+zarr does not force data to the disk's surface: a kill cannot tear a store, a power failure can, and
+then the checksum tells.
 """
 
 from __future__ import annotations
@@ -43,7 +50,9 @@ class StoreError(RuntimeError):
 
 
 class StoreWriteError(StoreError):
-    """A write that failed: a full disk, a path that may not be written to.  What was written before stays valid."""
+    """A write that failed: a full disk, a path that may not be written to.  What was written before
+    stays valid.
+    """
 
 
 class Variable(NamedTuple):
@@ -59,7 +68,10 @@ def _zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise StoreError("A store needs zarr, which is not installed: pip install zarr, or '.[sweep]' in a clone.") from None
+        raise StoreError(
+            "A store needs zarr, which is not installed: pip install zarr, or '.[sweep]' in a"
+            " clone."
+        ) from None
     return zarr
 
 
@@ -68,13 +80,22 @@ def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
     if isinstance(theirs, dict) and isinstance(ours, dict):
         keys = [*theirs, *(key for key in ours if key not in theirs)]
         absent = object()
-        found = [differences(theirs.get(k, absent), ours.get(k, absent), f"{name}.{k}" if name else str(k)) for k in keys]
+        found = [
+            differences(
+                theirs.get(k, absent), ours.get(k, absent), f"{name}.{k}" if name else str(k)
+            )
+            for k in keys
+        ]
         return [text for texts in found for text in texts]
     if type(theirs) is type(ours) and theirs == ours:
         return []
 
     def shown(value):
-        text = json.dumps(value) if isinstance(value, str | int | float | list | dict | bool | None) else "nothing"
+        text = (
+            json.dumps(value)
+            if isinstance(value, str | int | float | list | dict | bool | None)
+            else "nothing"
+        )
         return text if len(text) <= 80 else text[:77] + "..."
 
     return [f"{name}: the store has {shown(theirs)}, this call {shown(ours)}"]
@@ -90,11 +111,15 @@ class Store:
         self.config: dict[str, Any] = attributes["config"]
         self.cases: int = attributes["cases"]
         self.unit: int = attributes["unit"]
-        if any(isinstance(x, bool) or not isinstance(x, int) or x < 1 for x in (self.cases, self.unit)):
+        if any(
+            isinstance(x, bool) or not isinstance(x, int) or x < 1 for x in (self.cases, self.unit)
+        ):
             raise ValueError(f"{self.cases!r} cases in units of {self.unit!r}")
         self.units = -(-self.cases // self.unit)
         self._salt = zlib.crc32(json.dumps(self.config, sort_keys=True).encode())
-        self._arrays = {name: _numbers(group, name, self.cases, self.unit) for name in attributes["variables"]}
+        self._arrays = {
+            name: _numbers(group, name, self.cases, self.unit) for name in attributes["variables"]
+        }
         self._done = _numbers(group, DONE, self.units, 1)
         self._description = self._described()
 
@@ -124,14 +149,17 @@ class Store:
     def _mark(self, data: Mapping[str, np.ndarray]) -> int:
         total = self._salt
         for name in sorted(data):
-            total = zlib.crc32(np.ascontiguousarray(data[name]).tobytes(), zlib.crc32(name.encode(), total))
+            total = zlib.crc32(
+                np.ascontiguousarray(data[name]).tobytes(), zlib.crc32(name.encode(), total)
+            )
         return (1 << 32) | total
 
     def write(self, unit: int, data: Mapping[str, np.ndarray]) -> None:
         """Writes one unit: its data, then its mark.
 
         Raises:
-          StoreWriteError: it cannot be written, or somebody has deleted or replaced the store; nothing of the unit stays then.
+          StoreWriteError: it cannot be written, or somebody has deleted or replaced the store;
+            nothing of the unit stays then.
         """
         self._check_it_is_there()
         try:
@@ -145,7 +173,9 @@ class Store:
             raise
 
     def _described(self) -> list[bytes | None]:
-        """What describes this store on disk: the group's file and those of its arrays; None for one that is not there."""
+        """What describes this store on disk: the group's file and those of its arrays; None for one
+        that is not there.
+        """
 
         def content(file: Path) -> bytes | None:
             try:
@@ -156,20 +186,33 @@ class Store:
         return [content(self.path / name / "zarr.json") for name in ("", *self._arrays, DONE)]
 
     def _check_it_is_there(self) -> None:
-        """StoreWriteError if the store was deleted, wholly or in part, or another one is in its place."""
+        """StoreWriteError if the store was deleted, wholly or in part, or another one is in its
+        place.
+        """
         now = self._described()
         if now == self._description:
             return
         if now[0] is None:
-            text = "was deleted while it was in use. Start the same call again to begin anew, or choose another path."
+            text = (
+                "was deleted while it was in use. Start the same call again to begin anew, or"
+                " choose another path."
+            )
         elif now[0] != self._description[0]:
-            text = "was replaced by another store while it was in use. Choose another path, and start the same call again."
+            text = (
+                "was replaced by another store while it was in use. Choose another path, and start"
+                " the same call again."
+            )
         else:
-            text = "lost arrays while it was in use. Delete what is left of it, and start the same call again."
+            text = (
+                "lost arrays while it was in use. Delete what is left of it, and start the same"
+                " call again."
+            )
         raise StoreWriteError(f"{self.path}: {text}")
 
     def _take_back(self, unit: int) -> None:
-        """Removes what was written of a unit into a store that was deleted meanwhile, with the folders that came to be by it."""
+        """Removes what was written of a unit into a store that was deleted meanwhile, with the
+        folders that came to be by it.
+        """
         if (self.path / "zarr.json").exists():
             return
         for array in (*self._arrays.values(), self._done):
@@ -185,7 +228,9 @@ class Store:
     def read(self, unit: int) -> dict[str, np.ndarray] | None:
         """The data of one unit; None if they do not fit its mark."""
         try:
-            data = {name: np.asarray(array[self.span(unit)]) for name, array in self._arrays.items()}
+            data = {
+                name: np.asarray(array[self.span(unit)]) for name, array in self._arrays.items()
+            }
             return data if int(self._done[unit]) == self._mark(data) else None
         except OSError as error:
             if error.errno in _FORBIDDEN:
@@ -201,14 +246,20 @@ class Store:
         return sorted([*map(int, np.flatnonzero(~marks)), *damaged]), damaged
 
     def read_all(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Everything that is done, (cases, ...), and which cases are, (cases,) bool; StoreError if a unit is damaged."""
+        """Everything that is done, (cases, ...), and which cases are, (cases,) bool; StoreError if
+        a unit is damaged.
+        """
         done = np.zeros(self.cases, bool)
-        out = {name: np.full(array.shape, array.fill_value, array.dtype) for name, array in self._arrays.items()}
+        out = {
+            name: np.full(array.shape, array.fill_value, array.dtype)
+            for name, array in self._arrays.items()
+        }
         for unit in np.flatnonzero(self.marks()):
             data = self.read(int(unit))
             if data is None:
                 raise StoreError(
-                    f"{self.path}: unit {unit} is damaged (its data do not fit its checksum). Run the same sweep again to mend it."
+                    f"{self.path}: unit {unit} is damaged (its data do not fit its checksum). Run"
+                    " the same sweep again to mend it."
                 )
             done[self.span(int(unit))] = True
             for name, values in data.items():
@@ -227,18 +278,29 @@ class Store:
         try:
             yield
         except OSError as error:
-            kept = f"{int(self.marks().sum())} of {self.units} units are written and valid: start the same call again to go on"
+            kept = (
+                f"{int(self.marks().sum())} of {self.units} units are written and valid: start the"
+                " same call again to go on"
+            )
             raise _why(self.path, error, kept) from error
 
 
 def _numbers(group: Any, name: str, rows: int, chunk: int) -> Any:
-    """An array of a group; ValueError if it is none of numbers that this package could have written."""
+    """An array of a group; ValueError if it is none of numbers that this package could have
+    written.
+    """
     array = group[name]
-    format_, kind = getattr(array.metadata, "zarr_format", None), getattr(getattr(array, "dtype", None), "kind", None)
+    format_, kind = (
+        getattr(array.metadata, "zarr_format", None),
+        getattr(getattr(array, "dtype", None), "kind", None),
+    )
     if format_ != 3 or kind is None or kind not in _NUMBERS:
         raise ValueError(f"{name!r} is no array of numbers in zarr's format 3")
     if array.shape[:1] != (rows,) or array.chunks != (min(chunk, rows), *array.shape[1:]):
-        raise ValueError(f"{name!r} has the shape {array.shape} in chunks of {array.chunks}, which is not that of {rows} rows")
+        raise ValueError(
+            f"{name!r} has the shape {array.shape} in chunks of {array.chunks}, which is not that"
+            f" of {rows} rows"
+        )
     return array
 
 
@@ -250,7 +312,10 @@ def _said(error: Exception) -> str:
 def _why(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
     """The error for a failed write, in words."""
     if error.errno in _FULL:
-        text = f"{path}: no space left to write to ({error.strerror}). Make room, or take another disk."
+        text = (
+            f"{path}: no space left to write to ({error.strerror}). Make room, or take another"
+            " disk."
+        )
     elif error.errno in _FORBIDDEN:
         text = f"{path}: cannot be written ({error.strerror}). Choose a path that you may write to."
     else:
@@ -274,18 +339,35 @@ def load_store(path: str | os.PathLike) -> Store:
     except PermissionError as error:
         raise StoreError(f"{place}: cannot be read ({error.strerror}).") from error
     except Exception as error:
-        raise StoreError(f"{place}: is not a store of iblf_jax ({type(error).__name__}). Choose another path.") from error
+        raise StoreError(
+            f"{place}: is not a store of iblf_jax ({type(error).__name__}). Choose another path."
+        ) from error
     if known != FORMAT:
-        came = "something that iblf_jax did not write" if known is None else f"a store of format {known}"
-        raise StoreError(f"{place}: holds {came}, expected a store of format {FORMAT}. Choose another path.")
+        came = (
+            "something that iblf_jax did not write"
+            if known is None
+            else f"a store of format {known}"
+        )
+        raise StoreError(
+            f"{place}: holds {came}, expected a store of format {FORMAT}. Choose another path."
+        )
     try:
         return Store(place, group)
     except Exception as error:
-        raise StoreError(f"{place}: is damaged: its description is wrong ({_said(error)}). Delete it, or choose another path.") from error
+        raise StoreError(
+            f"{place}: is damaged: its description is wrong ({_said(error)}). Delete it, or choose"
+            " another path."
+        ) from error
 
 
 def open_store(
-    path: str | os.PathLike, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int, *, any_unit: bool = False
+    path: str | os.PathLike,
+    config: dict[str, Any],
+    variables: Mapping[str, Variable],
+    cases: int,
+    unit: int,
+    *,
+    any_unit: bool = False,
 ) -> Store:
     """Opens a store to go on with it, or makes it.
 
@@ -298,7 +380,8 @@ def open_store(
       any_unit: take the unit of a store that exists, whatever it is.
 
     Raises:
-      StoreError: it was made with another configuration, is foreign or damaged, or cannot be written.
+      StoreError: it was made with another configuration, is foreign or damaged, or cannot be
+        written.
     """
     place, config = Path(path), json.loads(json.dumps(config))
     if not _exists(place):
@@ -306,19 +389,24 @@ def open_store(
     store = load_store(place)
     found = differences(store.config, config)
     named = [text for text in found if not text.startswith("program:")]
-    found = named or [text + " (the code of a law, a robot or a metric has changed)" for text in found]
+    found = named or [
+        text + " (the code of a law, a robot or a metric has changed)" for text in found
+    ]
     if not any_unit:
         found += differences({"unit": store.unit}, {"unit": unit})
     if found:
         tied = any(text.startswith("kernel.") for text in found)
         remedy = (
-            "A native kernel is tied to processor and compiler: go on on a machine of the same kind, or choose another path, "
-            'with backend="xla" if machines of several kinds are to share it.'
+            "A native kernel is tied to processor and compiler: go on on a machine of the same"
+            ' kind, or choose another path, with backend="xla" if machines of several kinds are to'
+            " share it."
             if tied
             else "Go on with the same arguments, or choose another path."
         )
         more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
-        raise StoreError(f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. {remedy}")
+        raise StoreError(
+            f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. {remedy}"
+        )
     if not os.access(place, os.W_OK):
         raise _why(place, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
     return store
@@ -332,8 +420,12 @@ def _exists(place: Path) -> bool:
         raise _why(place, error) from error
 
 
-def _make(place: Path, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int) -> None:
-    """Makes a store beside its place and renames it in; if another process was first, its store stays."""
+def _make(
+    place: Path, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int
+) -> None:
+    """Makes a store beside its place and renames it in; if another process was first, its store
+    stays.
+    """
     zarr = _zarr()
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -350,10 +442,27 @@ def _make(place: Path, config: dict[str, Any], variables: Mapping[str, Variable]
                     config={"write_empty_chunks": True},
                 )
                 array.attrs["units"] = v.unit
-            group.create_array(DONE, shape=(-(-cases // unit),), chunks=(1,), dtype="uint64", fill_value=0, dimension_names=("unit",))
-            group.attrs.update({_MARK: FORMAT, "config": config, "cases": cases, "unit": unit, "variables": list(variables)})
+            group.create_array(
+                DONE,
+                shape=(-(-cases // unit),),
+                chunks=(1,),
+                dtype="uint64",
+                fill_value=0,
+                dimension_names=("unit",),
+            )
+            group.attrs.update(
+                {
+                    _MARK: FORMAT,
+                    "config": config,
+                    "cases": cases,
+                    "unit": unit,
+                    "variables": list(variables),
+                }
+            )
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # zarr says that consolidated metadata are not in its specification yet
+                warnings.simplefilter(
+                    "ignore"
+                )  # zarr says that consolidated metadata are not in its specification yet
                 zarr.consolidate_metadata(group.store)
             os.rename(folder / "store", place)
     except OSError as error:

@@ -1,13 +1,15 @@
 """The result of a Monte-Carlo study: `Study`.
 
-Per run it holds the metrics, the status and what was drawn; never a trajectory.  `study.replay(i)` makes run i again in full.
+Per run it holds the metrics, the status and what was drawn; never a trajectory.  `study.replay(i)`
+makes run i again in full.
 
-Failed runs are part of every count and of every statistic, unless they are left out on request, and then the answer says how many
-were.  Runs that could not be made (an inadmissible draw, `Status.INADMISSIBLE_DRAW`) have no numbers; they are left out of
-statistics always, are counted, and the answer says so.
+Failed runs are part of every count and of every statistic, unless they are left out on request, and
+then the answer says how many were.  Runs that could not be made (an inadmissible draw,
+`Status.INADMISSIBLE_DRAW`) have no numbers; they are left out of statistics always, are counted,
+and the answer says so.
 
-A run whose start was drawn on or outside its bounds has violated them at t = 0, before any law could act.  Its flag is the same; counts,
-`started_outside` and `replay` tell it apart.
+A run whose start was drawn on or outside its bounds has violated them at t = 0, before any law
+could act.  Its flag is the same; counts, `started_outside` and `replay` tell it apart.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ if TYPE_CHECKING:
     import xarray
 
 VIOLATED = LEFT | Status.NOT_FINITE
-"""What `violation_probability` counts: a run that did not keep its bounds or regions, or that ran away, after which it has no say."""
+"""What `violation_probability` counts: a run that did not keep its bounds or regions, or that ran
+away, after which it has no say."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,7 +60,9 @@ class OneRun:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Study:
-    """Many runs of one scenario with drawn parameters; arrays have N runs first.  `study[i]` is one run."""
+    """Many runs of one scenario with drawn parameters; arrays have N runs first.  `study[i]` is one
+    run.
+    """
 
     scenario: Scenario
     """The nominal scenario."""
@@ -76,10 +81,19 @@ class Study:
     def of(cls, setup: StudySetup, results: Results) -> Study:
         """The study with these results."""
         units = metric_units(setup.shared.folds)
-        order = {name: None for name, _ in units if name in results.metrics} | results.metrics  # theirs, not sorted as by jit
+        order = {
+            name: None for name, _ in units if name in results.metrics
+        } | results.metrics  # theirs, not sorted as by jit
         metrics = Metrics({name: results.metrics[name] for name in order}, units)
         samples = {target.path: results.samples[target.path] for target in setup.study_run.targets}
-        return cls(setup.shared.cases.scenario, metrics, results.status, results.fastest_mode, samples, setup)
+        return cls(
+            setup.shared.cases.scenario,
+            metrics,
+            results.status,
+            results.fastest_mode,
+            samples,
+            setup,
+        )
 
     @property
     def runs(self) -> int:
@@ -117,7 +131,12 @@ class Study:
     def __getitem__(self, index: int) -> OneRun:
         """One run: its metrics, status and drawn values."""
         i = checks.entry("index", index, self.runs, "runs")
-        return OneRun(i, jax.tree.map(lambda x: x[i], self.metrics), int(self.status[i]), {path: x[i] for path, x in self.samples.items()})
+        return OneRun(
+            i,
+            jax.tree.map(lambda x: x[i], self.metrics),
+            int(self.status[i]),
+            {path: x[i] for path, x in self.samples.items()},
+        )
 
     @property
     def failed(self) -> np.ndarray:
@@ -131,7 +150,9 @@ class Study:
 
     @cached_property
     def started_outside(self) -> np.ndarray:
-        """Whether each run violated a bound or a region at t = 0 already, (N,) bool: drawn there, so that no law could keep it."""
+        """Whether each run violated a bound or a region at t = 0 already, (N,) bool: drawn there,
+        so that no law could keep it.
+        """
         inside = [np.min(margins, axis=1) > 0 for margins in summaries.first_margins(self).values()]
         return self.made & (self.status & int(LEFT) != 0) & ~np.all(inside, axis=0)
 
@@ -139,35 +160,48 @@ class Study:
     def status_counts(self) -> dict[str, int]:
         """How many runs there are of each kind.
 
-        OK, FLAGGED and FAILED add up to all runs: no flag, flags that are no failure, and a flag of `status.FAILED`.  Then how many have
-        each flag, of which a run may have several, and how many of those that violated a bound did so at t = 0 (`started_outside`).
+        OK, FLAGGED and FAILED add up to all runs: no flag, flags that are no failure, and a flag of
+          `status.FAILED`.  Then how many have
+        each flag, of which a run may have several, and how many of those that violated a bound did
+        so at t = 0 (`started_outside`).
         """
         failed, flagged = self.status & int(FAILED) != 0, self.status != 0
-        counts = {"OK": int(np.sum(~flagged)), "FLAGGED": int(np.sum(flagged & ~failed)), "FAILED": int(np.sum(failed))}
+        counts = {
+            "OK": int(np.sum(~flagged)),
+            "FLAGGED": int(np.sum(flagged & ~failed)),
+            "FAILED": int(np.sum(failed)),
+        }
         counts |= {flag.name or "": int(np.sum(self.status & int(flag) != 0)) for flag in Status}
         return counts | {"STARTED_OUTSIDE": int(np.sum(self.started_outside))}
 
     @property
     def violation_probability(self) -> Probability:
-        """How probable it is that a run leaves its bounds or regions, or runs away, with the 95 % Clopper-Pearson interval.
+        """How probable it is that a run leaves its bounds or regions, or runs away, with the 95 %
+        Clopper-Pearson interval.
 
-        Runs that started outside their bounds count, for they have violated them; `started_outside` says which they are.  That a law
-        violates them has the probability `probability((study.status & VIOLATED != 0) & ~study.started_outside)`, with
-        `VIOLATED = ij.status.VIOLATED | Status.NOT_FINITE`.
+        Runs that started outside their bounds count, for they have violated them; `started_outside`
+        says which they are.  That a law violates them has the probability
+        `probability((study.status & VIOLATED != 0) & ~study.started_outside)`, with `VIOLATED =
+        ij.status.VIOLATED | Status.NOT_FINITE`.
         """
         return self.probability(VIOLATED)
 
-    def probability(self, event: Status | np.ndarray = VIOLATED, confidence: float = 0.95) -> Probability:
+    def probability(
+        self, event: Status | np.ndarray = VIOLATED, confidence: float = 0.95
+    ) -> Probability:
         """The probability of an event over the runs that were made.
 
-            [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)],   a = 1 - confidence           (Clopper-Pearson)
+            [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)],   a = 1 - confidence
+            (Clopper-Pearson)
 
         Args:
-          event: flags of `Status`, any of which counts, or (N,) bool such as `study.metrics.rmse[:, 0] > 0.1`.
+          event: flags of `Status`, any of which counts, or (N,) bool such as `study.metrics.rmse[:,
+            0] > 0.1`.
           confidence: of the interval, in (0, 1).
 
         Returns:
-          Estimate, interval, count and runs.  For designs the interval comes from the replicates (Student t), and is None without.
+          Estimate, interval, count and runs.  For designs the interval comes from the replicates
+          (Student t), and is None without.
 
         Raises:
           ValueError: an event of another shape, a confidence outside (0, 1).
@@ -175,16 +209,21 @@ class Study:
         Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
         """
         try:
-            happened = self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
+            happened = (
+                self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
+            )
         except Exception:  # a number of more bits than flags, or nothing that is an array
             happened = np.zeros(0)
         if happened.shape != (self.runs,) or happened.dtype != bool:
             raise checks.fail("event", event, f"flags of Status, or {self.runs} booleans")
         confidence = statistics.check_confidence(confidence)
-        return statistics.probability(happened, self.made, confidence, self.setup.sampler, self.setup.replicates)
+        return statistics.probability(
+            happened, self.made, confidence, self.setup.sampler, self.setup.replicates
+        )
 
     def worst(self, count: int = 10, metric: str = "margin") -> np.ndarray:
-        """Numbers of the worst runs, worst first: smallest margin, or largest of another metric, of the worst joint.
+        """Numbers of the worst runs, worst first: smallest margin, or largest of another metric, of
+        the worst joint.
 
         Args:
           count: how many, at most N.
@@ -200,7 +239,9 @@ class Study:
         """
         count = checks.positive_integer("count", count)
         values = statistics.one_number(self.metrics, metric)
-        order = np.argsort(values if metric in statistics.SMALLER_IS_WORSE else -values, kind="stable")
+        order = np.argsort(
+            values if metric in statistics.SMALLER_IS_WORSE else -values, kind="stable"
+        )
         return order[self.made[order]][:count]
 
     def parameter_unit(self, path: str) -> str:
@@ -211,33 +252,51 @@ class Study:
         """Which runs a statistic is over, (N,) bool, and what to say about it."""
         exclude_failed = checks.flag("exclude_failed", exclude_failed)
         used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
-        said = {"runs": int(used.sum()), "excluded": int(self.runs - used.sum()), "failed_excluded": str(bool(exclude_failed))}
-        return used, said | {"failed_included": int(np.sum(used & (self.status & int(FAILED) != 0)))}
+        said = {
+            "runs": int(used.sum()),
+            "excluded": int(self.runs - used.sum()),
+            "failed_excluded": str(bool(exclude_failed)),
+        }
+        return used, said | {
+            "failed_included": int(np.sum(used & (self.status & int(FAILED) != 0)))
+        }
 
     @property
     def included(self) -> str:
         """In words: which runs statistics are over, unless failed ones are left out."""
         said = self.chosen()[1]
-        failed = f"{said['failed_included']} failed ones included (exclude_failed=True leaves them out)"
+        failed = (
+            f"{said['failed_included']} failed ones included (exclude_failed=True leaves them out)"
+        )
         unmade = f"; {said['excluded']} were not made" if said["excluded"] else ""
-        return f"statistics are over {said['runs']} runs, {failed if said['failed_included'] else 'none of them failed'}{unmade}"
+        return (
+            f"statistics are over {said['runs']} runs,"
+            f" {failed if said['failed_included'] else 'none of them failed'}{unmade}"
+        )
 
-    def quantiles(self, quantiles: Sequence[float] = (0.05, 0.5, 0.95), *, exclude_failed: bool = False) -> xarray.Dataset:
-        """Quantiles of every metric over the runs, an `xarray.Dataset` with the dimensions `quantile` and `joint`.
+    def quantiles(
+        self, quantiles: Sequence[float] = (0.05, 0.5, 0.95), *, exclude_failed: bool = False
+    ) -> xarray.Dataset:
+        """Quantiles of every metric over the runs, an `xarray.Dataset` with the dimensions
+        `quantile` and `joint`.
 
             Q(p) = min {y : at least p N of the runs have a value <= y}
 
         Args:
           quantiles: numbers p from 0 to 1.
-          exclude_failed: leave out failed runs; the attributes `runs` and `excluded` say how many were used and left out.
+          exclude_failed: leave out failed runs; the attributes `runs` and `excluded` say how many
+            were used and left out.
 
         Raises:
           ValueError: numbers outside [0, 1].
         """
         return summaries.metric_quantiles(self, quantiles, exclude_failed)
 
-    def correlations(self, metrics: Sequence[str] | None = None, *, exclude_failed: bool = False) -> xarray.Dataset:
-        """Spearman's rank correlation of every drawn parameter with every metric (its worst joint), and the p-value.
+    def correlations(
+        self, metrics: Sequence[str] | None = None, *, exclude_failed: bool = False
+    ) -> xarray.Dataset:
+        """Spearman's rank correlation of every drawn parameter with every metric (its worst joint),
+        and the p-value.
 
         Args:
           metrics: names; all if not given.
@@ -256,7 +315,8 @@ class Study:
         samples: int = 200,
         exclude_failed: bool = False,
     ) -> xarray.Dataset:
-        """The tube with the quantiles of the runs along time, (quantile, time, joint), from the first `runs` runs, made again.
+        """The tube with the quantiles of the runs along time, (quantile, time, joint), from the
+        first `runs` runs, made again.
 
         Args:
           quantiles: numbers from 0 to 1.
@@ -270,11 +330,15 @@ class Study:
         return summaries.bands(self, quantiles, runs, samples, exclude_failed)
 
     def to_xarray(self) -> xarray.Dataset:
-        """All runs as an `xarray.Dataset`: metrics and status along `run` (and `joint`), the drawn values as coordinates."""
+        """All runs as an `xarray.Dataset`: metrics and status along `run` (and `joint`), the drawn
+        values as coordinates.
+        """
         return summaries.to_xarray(self)
 
     def plot(self, **options: Any) -> Any:
-        """Overview figure: the tube with bands, margins, and margin against each parameter.  Options as `plotting.study_overview`."""
+        """Overview figure: the tube with bands, margins, and margin against each parameter.
+        Options as `plotting.study_overview`.
+        """
         from iblf_jax import plotting
 
         return plotting.study_overview(self, **options)
@@ -283,9 +347,10 @@ class Study:
     def replay(self, index: int, *, record_every: int = 1) -> Rollout:
         """Makes one run again, with its whole trajectory.
 
-        Metrics, status and fastest mode are bit-identical to those of run `index`: its block is run again by the same compiled
-        program.  The trajectory comes from the program for a single run, where XLA rounds differently: it agrees with the metrics
-        to rounding, until a run that has left its bounds amplifies that.  A warning says if the run started outside its bounds.
+        Metrics, status and fastest mode are bit-identical to those of run `index`: its block is run
+        again by the same compiled program.  The trajectory comes from the program for a single run,
+        where XLA rounds differently: it agrees with the metrics to rounding, until a run that has
+          left its bounds amplifies that.  A warning says if the run started outside its bounds.
 
         Args:
           index: run number.
@@ -295,7 +360,8 @@ class Study:
           A `Rollout`, with the drawn parameters in its scenario.
 
         Raises:
-          ValueError: no such run (an IndexError too), or one that was not made because a draw was inadmissible.
+          ValueError: no such run (an IndexError too), or one that was not made because a draw was
+            inadmissible.
 
         Source: design of this package.
         """
@@ -303,11 +369,18 @@ class Study:
         record_every = checks.recorded_every(record_every, self.setup.study_run.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
-            raise checks.fail(f"run {i}", drawn, "admissible draws", "It was not made; see study.made.")
+            raise checks.fail(
+                f"run {i}", drawn, "admissible draws", "It was not made; see study.made."
+            )
         block, place = divmod(i, block_size())
-        ((_, again),) = run_blocks(self.setup.study_run, self.setup.shared, self.setup.lanes, [block])
+        ((_, again),) = run_blocks(
+            self.setup.study_run, self.setup.shared, self.setup.lanes, [block]
+        )
         again = jax.tree.map(lambda x: x[place], again)
-        if not all(np.array_equal(x, self.metrics[name][i], equal_nan=True) for name, x in again.metrics.items()):
+        if not all(
+            np.array_equal(x, self.metrics[name][i], equal_nan=True)
+            for name, x in again.metrics.items()
+        ):
             reason = "made on another machine or version"
             notices.warn(f"Run {i} gives other numbers here than in the study: {reason}.")
         study_run, shared = self.setup.study_run, self.setup.shared
@@ -315,14 +388,18 @@ class Study:
             paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
             shared.folds,
             shared.dt,
-            noise_of(self.scenario, shared.cases.key, self.setup.lanes(np.asarray([i])).index[0]).get(NOISE_NAME),
+            noise_of(
+                self.scenario, shared.cases.key, self.setup.lanes(np.asarray([i])).index[0]
+            ).get(NOISE_NAME),
             steps=study_run.steps,
             method=study_run.method,
             record_every=record_every,
         )
         self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)
-        return dataclasses.replace(run, metrics=metrics, status=again.status, fastest_mode=again.fastest_mode)
+        return dataclasses.replace(
+            run, metrics=metrics, status=again.status, fastest_mode=again.fastest_mode
+        )
 
     def _warn_of_start(self, i: int) -> None:
         if not self.started_outside[i]:
@@ -330,11 +407,15 @@ class Study:
         first = {unit: margins[i] for unit, margins in summaries.first_margins(self).items()}
         unit = next(unit for unit, margins in first.items() if not np.min(margins) > 0)
         worst, plant = int(np.argmin(first[unit])), self.scenario.plant
-        name = in_words(self.scenario.regions[worst], plant) if unit == "m" else joint_names(plant, self.scenario.n)[worst]
+        name = (
+            in_words(self.scenario.regions[worst], plant)
+            if unit == "m"
+            else joint_names(plant, self.scenario.n)[worst]
+        )
         notices.warn(
-            f"Run {i} started outside its bounds: {name} was drawn {-first[unit][worst]:.3g} {unit} beyond one at t = 0. "
-            "That violation is the draw's, not the law's: narrow the perturbations of the start, or leave such runs out "
-            "(study.started_outside).",
+            f"Run {i} started outside its bounds: {name} was drawn {-first[unit][worst]:.3g} {unit}"
+            " beyond one at t = 0. That violation is the draw's, not the law's: narrow the"
+            " perturbations of the start, or leave such runs out (study.started_outside).",
             SimulationWarning,
         )
 
@@ -342,12 +423,23 @@ class Study:
         if not checks.is_concrete(self):
             return "Study(being traced)"
         counts = self.status_counts
-        lines = [f"Study({self.runs} runs of {self.duration:g} s, dt = {self.dt:g} s, seed {self.seed}, {self.setup.sampler})"]
+        lines = [
+            f"Study({self.runs} runs of {self.duration:g} s, dt = {self.dt:g} s, seed {self.seed},"
+            f" {self.setup.sampler})"
+        ]
         lines += [f"  bound violated or run away: {self.violation_probability}"]
         if counts["STARTED_OUTSIDE"]:
-            lines += [f"    {counts['STARTED_OUTSIDE']} of them at t = 0, because they started outside: the draw's doing, not the law's"]
-        lines += [f"  failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok: {counts['OK']}"]
-        flags = [f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])]
+            lines += [
+                f"    {counts['STARTED_OUTSIDE']} of them at t = 0, because they started outside:"
+                " the draw's doing, not the law's"
+            ]
+        lines += [
+            f"  failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok:"
+            f" {counts['OK']}"
+        ]
+        flags = [
+            f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])
+        ]
         lines += [f"  flags, of which a run may have several: {'; '.join(flags)}"] if flags else []
         lines += [f"  {self.included}"]
         return "\n".join(lines)

@@ -1,4 +1,6 @@
-"""Summaries of a study as labelled data: quantiles, rank correlations, quantile bands along time, everything."""
+"""Summaries of a study as labelled data: quantiles, rank correlations, quantile bands along time,
+everything.
+"""
 
 from __future__ import annotations
 
@@ -34,16 +36,22 @@ def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
     """Numbers in [0, 1], or a ValueError."""
     values = np.atleast_1d(np.asarray(checks.as_floats("quantiles", quantiles), float).round(7))
     if values.ndim != 1 or values.size == 0 or not np.all((values >= 0) & (values <= 1)):
-        raise checks.fail("quantiles", quantiles, "numbers from 0 to 1", "(0.05, 0.5, 0.95), for example.")
+        raise checks.fail(
+            "quantiles", quantiles, "numbers from 0 to 1", "(0.05, 0.5, 0.95), for example."
+        )
     return values
 
 
 def first_margins(study: Study) -> dict[str, np.ndarray]:
-    """How far each run is inside its constraints at t = 0; not above zero where it starts on or outside them.
+    """How far each run is inside its constraints at t = 0; not above zero where it starts on or
+    outside them.
 
-    By unit: "rad" and, where velocities have bounds, "rad/s", (N, n); "m" where there are m regions, (N, m).
+    By unit: "rad" and, where velocities have bounds, "rad/s", (N, n); "m" where there are m
+      regions, (N, m).
     """
-    return {unit: np.asarray(x) for unit, x in _first_margins(study.scenario, study.samples).items()}
+    return {
+        unit: np.asarray(x) for unit, x in _first_margins(study.scenario, study.samples).items()
+    }
 
 
 @jax.jit
@@ -63,7 +71,9 @@ def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, 
     return jax.vmap(one)(samples)
 
 
-def metric_quantiles(study: Study, quantiles: Sequence[float], exclude_failed: bool) -> xarray.Dataset:
+def metric_quantiles(
+    study: Study, quantiles: Sequence[float], exclude_failed: bool
+) -> xarray.Dataset:
     """Quantiles of every metric over the runs; see `Study.quantiles`."""
     import xarray
 
@@ -72,7 +82,11 @@ def metric_quantiles(study: Study, quantiles: Sequence[float], exclude_failed: b
     variables = {}
     for name, values in study.metrics.items():
         values = np.asarray(values)
-        made = _quantile(values[used], levels) if used.any() else np.full((len(levels), *values.shape[1:]), np.nan)
+        made = (
+            _quantile(values[used], levels)
+            if used.any()
+            else np.full((len(levels), *values.shape[1:]), np.nan)
+        )
         variables[name] = (
             ("quantile", *own_dims(name, values.shape[1:], study.scenario.n)),
             made,
@@ -86,12 +100,20 @@ def _quantile(values: np.ndarray, levels: np.ndarray) -> np.ndarray:
     return np.quantile(values, levels, axis=0, method="inverted_cdf")
 
 
-def correlations(study: Study, metrics: Sequence[str] | None, exclude_failed: bool) -> xarray.Dataset:
-    """Spearman's rank correlation of every drawn parameter with metrics; see `Study.correlations`."""
+def correlations(
+    study: Study, metrics: Sequence[str] | None, exclude_failed: bool
+) -> xarray.Dataset:
+    """Spearman's rank correlation of every drawn parameter with metrics; see
+    `Study.correlations`.
+    """
     import xarray
 
     used, said = study.chosen(exclude_failed)
-    names = list(study.metrics) if metrics is None else checks.listed("metrics", metrics, '["margin", "rmse"]')
+    names = (
+        list(study.metrics)
+        if metrics is None
+        else checks.listed("metrics", metrics, '["margin", "rmse"]')
+    )
     drawn = statistics.columns(study.samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
@@ -99,11 +121,20 @@ def correlations(study: Study, metrics: Sequence[str] | None, exclude_failed: bo
         for i, x in enumerate(drawn.values()):
             found[i, j] = statistics.rank_correlation(x[used], y)
     dims = ("parameter", "metric")
-    variables = {"correlation": (dims, found[..., 0], {"units": "1"}), "p_value": (dims, found[..., 1], {"units": "1"})}
-    return xarray.Dataset(variables, {"parameter": list(drawn), "metric": names}, said | {"of": "the worst joint of each metric"})
+    variables = {
+        "correlation": (dims, found[..., 0], {"units": "1"}),
+        "p_value": (dims, found[..., 1], {"units": "1"}),
+    }
+    return xarray.Dataset(
+        variables,
+        {"parameter": list(drawn), "metric": names},
+        said | {"of": "the worst joint of each metric"},
+    )
 
 
-def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exclude_failed: bool) -> xarray.Dataset:
+def bands(
+    study: Study, quantiles: Sequence[float], runs: int, samples: int, exclude_failed: bool
+) -> xarray.Dataset:
     """Quantiles along time of position and error; see `Study.bands`."""
     import xarray
 
@@ -113,23 +144,51 @@ def bands(study: Study, quantiles: Sequence[float], runs: int, samples: int, exc
     record_every = max(1, setup.study_run.steps // checks.positive_integer("samples", samples))
     parts, times = [], np.zeros(0)
     for _, (arrays, t, _, _) in run_blocks(
-        setup.study_run, setup.shared, setup.lanes, range(-(-count // size)), chunk=size, record_every=record_every
+        setup.study_run,
+        setup.shared,
+        setup.lanes,
+        range(-(-count // size)),
+        chunk=size,
+        record_every=record_every,
     ):
         parts.append(arrays)
         times = t[0]
     whole = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
     used = study.made[:count] if not exclude_failed else study.chosen(True)[0][:count]
     if not used.any():
-        raise checks.fail("runs", count, "at least one run that is not left out", "Take more runs, or exclude_failed=False.")
+        raise checks.fail(
+            "runs",
+            count,
+            "at least one run that is not left out",
+            "Take more runs, or exclude_failed=False.",
+        )
     dims = ("quantile", "time", "joint")
-    variables: dict[str, Any] = {name: (dims, _quantile(whole[name][used], levels), {"units": SIGNALS[name].unit}) for name in BANDS}
+    variables: dict[str, Any] = {
+        name: (dims, _quantile(whole[name][used], levels), {"units": SIGNALS[name].unit})
+        for name in BANDS
+    }
     edges: dict[str, Any] = {"lower": np.max, "upper": np.min, "q_d": np.median}
     for name, edge in edges.items():
-        words = {"lower": "tightest lower bound", "upper": "tightest upper bound", "q_d": "median reference"}[name]
-        variables[name] = (dims[1:], edge(whole[name][used], axis=0), {"units": "rad", "description": f"{words} of the runs"})
+        words = {
+            "lower": "tightest lower bound",
+            "upper": "tightest upper bound",
+            "q_d": "median reference",
+        }[name]
+        variables[name] = (
+            dims[1:],
+            edge(whole[name][used], axis=0),
+            {"units": "rad", "description": f"{words} of the runs"},
+        )
     failed = int(np.sum(used & (study.status[:count] & int(FAILED) != 0)))
-    said = {"runs": int(used.sum()), "excluded": int(count - used.sum()), "failed_included": failed, "of_runs": study.runs}
-    return xarray.Dataset(variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, said)
+    said = {
+        "runs": int(used.sum()),
+        "excluded": int(count - used.sum()),
+        "failed_included": failed,
+        "of_runs": study.runs,
+    }
+    return xarray.Dataset(
+        variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, said
+    )
 
 
 def to_xarray(study: Study) -> xarray.Dataset:
@@ -147,8 +206,15 @@ def to_xarray(study: Study) -> xarray.Dataset:
             {"units": study.metrics.units.get(name, "")},
         )
     flags = [flag for flag in Status if flag]
-    masks = {"flag_masks": np.array([int(f) for f in flags], np.int32), "flag_meanings": " ".join((f.name or "").lower() for f in flags)}
-    variables["status"] = ("run", study.status, {"units": "1", "description": "bit flags; 0 is ok"} | masks)
+    masks = {
+        "flag_masks": np.array([int(f) for f in flags], np.int32),
+        "flag_meanings": " ".join((f.name or "").lower() for f in flags),
+    }
+    variables["status"] = (
+        "run",
+        study.status,
+        {"units": "1", "description": "bit flags; 0 is ok"} | masks,
+    )
     variables["fastest_mode"] = ("run", study.fastest_mode, {"units": "1/s"})
     coordinates: dict[str, Any] = {"run": np.arange(study.runs)}
     for path, values in study.samples.items():
@@ -159,9 +225,22 @@ def to_xarray(study: Study) -> xarray.Dataset:
             {"units": unit, "nominal": np.asarray(get(study.scenario, path)).tolist()},
         )
     setup = study.setup
-    attributes: dict[str, Any] = {"runs": study.runs, "failed": int(np.sum(study.status & int(FAILED) != 0)), "seed": study.seed}
-    attributes |= {"duration": study.duration, "dt": study.dt, "method": setup.study_run.method, "sampler": setup.sampler}
+    attributes: dict[str, Any] = {
+        "runs": study.runs,
+        "failed": int(np.sum(study.status & int(FAILED) != 0)),
+        "seed": study.seed,
+    }
+    attributes |= {
+        "duration": study.duration,
+        "dt": study.dt,
+        "method": setup.study_run.method,
+        "sampler": setup.sampler,
+    }
     attributes |= {"backend": setup.study_run.backend, "iblf_jax_version": iblf_jax.__version__}
-    attributes["perturbations"] = json.dumps({path: describe_component(p) for path, p in study.perturbations.items()})
-    attributes["parameters"] = json.dumps({p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario, named=False)})
+    attributes["perturbations"] = json.dumps(
+        {path: describe_component(p) for path, p in study.perturbations.items()}
+    )
+    attributes["parameters"] = json.dumps(
+        {p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario, named=False)}
+    )
     return xarray.Dataset(variables, coordinates, attributes)

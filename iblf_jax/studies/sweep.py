@@ -1,8 +1,9 @@
-"""Sweeps: a scenario over many values of its parameters, with perturbed runs at each, into an `xarray.Dataset`.
+"""Sweeps: a scenario over many values of its parameters, with perturbed runs at each, into an
+`xarray.Dataset`.
 
-Cases are numbered, case = point * runs + run, and run r draws the same at every point (common random numbers), so that points differ by
-what was swept and not by luck.  With a store the cases are computed and written unit by unit (`store`), and a sweep that was
-killed goes on where it was.
+Cases are numbered, case = point * runs + run, and run r draws the same at every point (common
+random numbers), so that points differ by what was swept and not by luck.  With a store the cases
+are computed and written unit by unit (`store`), and a sweep that was killed goes on where it was.
 """
 
 from __future__ import annotations
@@ -72,17 +73,21 @@ def sweep(
 ) -> xarray.Dataset:
     """Runs a scenario over many values of its parameters, with perturbed runs at each.
 
-        case = point * runs + run;   leaf = perturbation(value at the point, F^-1(u)),   u from seed, run and path only
+        case = point * runs + run;   leaf = perturbation(value at the point, F^-1(u)),   u from
+        seed, run and path only
 
-    Results are bit-identical whatever `chunk`, `unit`, the devices, the processes, and however often it was killed and started again.
+    Results are bit-identical whatever `chunk`, `unit`, the devices, the processes, and however
+    often it was killed and started again.
 
     Args:
       scenario: what to run, of n joints.
-      grid: path -> values for a grid: numbers, or arrays for a vector leaf; a number fills every entry.  Path -> distribution (or
-        `factor`, `offset` of one) for the other designs.  Empty for one point, the scenario itself, with perturbed runs.
+      grid: path -> values for a grid: numbers, or arrays for a vector leaf; a number fills every
+        entry.  Path -> distribution (or `factor`, `offset` of one) for the other designs.  Empty
+        for one point, the scenario itself, with perturbed runs.
       duration: length of a run [s], a whole number of steps.
       dt: time step [s].
-      perturbations: path -> `factor`, `offset` or `value` of a distribution, around the values of each point.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution, around the values of
+        each point.
       runs: perturbed runs at each point.
       seed: whole number that fixes all draws.
       design: "grid", "random" or "latin_hypercube".
@@ -100,34 +105,63 @@ def sweep(
       progress: a progress bar; shown where somebody watches if not given.
 
     Returns:
-      An `xarray.Dataset` of the metrics and `status`, with one dimension for each path of a grid (or "point"), then `run` if there are
-      perturbations, then `joint`; the configuration, seed and versions are in its attributes.  `started_outside` tells runs that violated
-      a bound at t = 0 already, which no law could keep, from violations of the law; it is there if `first_violation_time` is.
+      An `xarray.Dataset` of the metrics and `status`, with one dimension for each path of a grid
+      (or "point"), then `run` if there are perturbations, then `joint`; the configuration, seed and
+      versions are in its attributes.  `started_outside` tells runs that violated a bound at t = 0
+      already, which no law could keep, from violations of the law; it is there if
+      `first_violation_time` is.
 
     Raises:
       ValueError: bad arguments; the message names the field, the value and the remedy.
-      StoreError: a store of another configuration, a foreign or unwritable one, a full disk.  What was written stays valid.
-      Interrupted: Ctrl-C or SIGTERM with a store, after the unit at hand; the message says how to go on.
+      StoreError: a store of another configuration, a foreign or unwritable one, a full disk.  What
+        was written stays valid.
+      Interrupted: Ctrl-C or SIGTERM with a store, after the unit at hand; the message says how to
+        go on.
 
     Source: design of this package.
     """
-    how = _How(checked_how(chunk, memory, devices), checks.flag("progress", progress, optional=True))
-    runs, perturbations = checks.positive_integer("runs", runs, most=MOST_RUNS), {} if perturbations is None else perturbations
+    how = _How(
+        checked_how(chunk, memory, devices), checks.flag("progress", progress, optional=True)
+    )
+    runs, perturbations = (
+        checks.positive_integer("runs", runs, most=MOST_RUNS),
+        ({} if perturbations is None else perturbations),
+    )
     replicates = check_sampler(sampler, runs, replicates)
-    checks.mapping("perturbations", perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
+    checks.mapping(
+        "perturbations", perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}'
+    )
     if not perturbations and runs > 1:
-        raise checks.fail("runs", runs, "1 without perturbations", "Without any all runs at a point are the same.")
+        raise checks.fail(
+            "runs", runs, "1 without perturbations", "Without any all runs at a point are the same."
+        )
     if not perturbations and isinstance(grid, Mapping) and not grid:
-        raise checks.fail("grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate.")
+        raise checks.fail(
+            "grid", grid, "something to vary", "Give a grid or perturbations, or use ij.simulate."
+        )
     unit = None if unit is None else checks.positive_integer("unit", unit, most=checks.MOST_STEPS)
     store = None if store is None else checks.file_path("store", store, "a folder")
     where = make_points(canonical(scenario), grid, design, points, checks.seed(seed))
-    options: dict[str, Any] = {"metrics": metrics, "backend": backend, "sampler": sampler, "replicates": replicates, "points": where.values}
-    setup = prepare(scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options)
+    options: dict[str, Any] = {
+        "metrics": metrics,
+        "backend": backend,
+        "sampler": sampler,
+        "replicates": replicates,
+        "points": where.values,
+    }
+    setup = prepare(
+        scenario, perturbations, runs, seed, duration=duration, dt=dt, method=method, **options
+    )
     checks.fits("runs at all points", setup.cases, setup.bytes_a_case)
     config = configuration.describe(setup, where, design, float(dt))
-    result = _in_memory(setup, config, how) if store is None else _into_store(setup, config, how, store, unit)
-    status, modes, errors = (np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE))
+    result = (
+        _in_memory(setup, config, how)
+        if store is None
+        else _into_store(setup, config, how, store, unit)
+    )
+    status, modes, errors = (
+        np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE)
+    )
     tell_of_step(status, modes, errors, float(dt), method)
     return result
 
@@ -140,8 +174,8 @@ def load_sweep(path: str | os.PathLike) -> xarray.Dataset:
       path: folder that `sweep` writes to, its `store`.
 
     Returns:
-      The Dataset that `sweep` returns; where nothing has been computed yet, NaN and status -1.  Its attributes `computed_cases` and
-      `cases` say how far it is.
+      The Dataset that `sweep` returns; where nothing has been computed yet, NaN and status -1.  Its
+      attributes `computed_cases` and `cases` say how far it is.
 
     Raises:
       ValueError: something that is not a path.
@@ -151,7 +185,10 @@ def load_sweep(path: str | os.PathLike) -> xarray.Dataset:
     try:
         return _dataset(opened)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, MemoryError) as error:
-        raise StoreError(f"{path}: is damaged: its configuration is wrong ({type(error).__name__}). Choose another store.") from error
+        raise StoreError(
+            f"{path}: is damaged: its configuration is wrong ({type(error).__name__}). Choose"
+            " another store."
+        ) from error
 
 
 def _dataset(store: Store) -> xarray.Dataset:
@@ -161,42 +198,67 @@ def _dataset(store: Store) -> xarray.Dataset:
 
 def _flat(results: Results) -> dict[str, Any]:
     drawn = {DRAWN + path: x for path, x in results.samples.items()}
-    return {**results.metrics, "status": results.status, "fastest_mode": results.fastest_mode, **drawn}
+    return {
+        **results.metrics,
+        "status": results.status,
+        "fastest_mode": results.fastest_mode,
+        **drawn,
+    }
 
 
 def _variables(setup: StudySetup, config: dict[str, Any]) -> dict[str, Variable]:
     """The arrays of a sweep."""
     shapes = _flat(setup.shapes)
     units = dict(metric_units(setup.shared.folds))
-    units |= {"status": "1", "fastest_mode": "1/s"} | {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
+    units |= {"status": "1", "fastest_mode": "1/s"} | {
+        DRAWN + path: p["unit"] for path, p in config["perturbed"].items()
+    }
     shapes = {name: shapes[name] for name in {n: None for n in units if n in shapes} | shapes}
     return {
-        name: Variable(x.shape[1:], str(x.dtype), own_dims(name.removeprefix(DRAWN), x.shape[1:], config["joints"]), units.get(name, ""))
+        name: Variable(
+            x.shape[1:],
+            str(x.dtype),
+            own_dims(name.removeprefix(DRAWN), x.shape[1:], config["joints"]),
+            units.get(name, ""),
+        )
         for name, x in shapes.items()
     }
 
 
 def _in_memory(setup: StudySetup, config: dict[str, Any], how: _How) -> xarray.Dataset:
     if distributed.size() > 1:
-        raise checks.fail("store", None, "a store, in a job of several processes", "They meet there: store='sweep.zarr' on a shared disk.")
+        raise checks.fail(
+            "store",
+            None,
+            "a store, in a job of several processes",
+            "They meet there: store='sweep.zarr' on a shared disk.",
+        )
     variables = _variables(setup, config)
     data = {name: np.zeros((setup.cases, *v.shape), v.dtype) for name, v in variables.items()}
     with bar(how.progress, setup.cases) as shown:
         for part, cases in _units(setup, [0], setup.cases, how, shown):
             for name, values in part.items():
                 data[name][cases] = values
-    return to_dataset(config, data, {name: v.unit for name, v in variables.items()}, np.ones(setup.cases, bool))
+    return to_dataset(
+        config, data, {name: v.unit for name, v in variables.items()}, np.ones(setup.cases, bool)
+    )
 
 
-def _units(setup: StudySetup, units: Sequence[int], unit: int, how: _How, shown: Any) -> Iterator[tuple[dict[str, np.ndarray], slice]]:
-    """Computes units and yields their data and cases, in order; in pieces, if a unit is all there is."""
+def _units(
+    setup: StudySetup, units: Sequence[int], unit: int, how: _How, shown: Any
+) -> Iterator[tuple[dict[str, np.ndarray], slice]]:
+    """Computes units and yields their data and cases, in order; in pieces, if a unit is all there
+    is.
+    """
     size = block_size()
     spans = [slice(u * unit, min((u + 1) * unit, setup.cases)) for u in units]
     blocks = [block for span in spans for block in range(span.start // size, -(-span.stop // size))]
     pieces: list[dict[str, np.ndarray]] = []
     waiting = iter(spans)
     span = next(waiting, None)
-    for block, results in run_blocks(setup.study_run, setup.shared, setup.lanes, blocks, **how.where):
+    for block, results in run_blocks(
+        setup.study_run, setup.shared, setup.lanes, blocks, **how.where
+    ):
         assert span is not None
         here = min(size, span.stop - block * size)
         pieces.append({name: x[:here] for name, x in _flat(results).items()})
@@ -209,24 +271,47 @@ def _units(setup: StudySetup, units: Sequence[int], unit: int, how: _How, shown:
 def _chosen_unit(setup: StudySetup, unit: int | None) -> int:
     """Cases in a unit: whole blocks, or all there is."""
     size, cases = block_size(), setup.cases
-    wanted = min(plan.SWEEP_UNIT / setup.study_run.steps, cases / plan.SWEEP_UNITS) if unit is None else unit
+    wanted = (
+        min(plan.SWEEP_UNIT / setup.study_run.steps, cases / plan.SWEEP_UNITS)
+        if unit is None
+        else unit
+    )
     return min(cases, size * max(1, round(wanted / size)))
 
 
-def _into_store(setup: StudySetup, config: dict[str, Any], how: _How, path: str | os.PathLike, unit: int | None) -> xarray.Dataset:
-    store = open_store(path, config, _variables(setup, config), setup.cases, _chosen_unit(setup, unit), any_unit=unit is None)
+def _into_store(
+    setup: StudySetup, config: dict[str, Any], how: _How, path: str | os.PathLike, unit: int | None
+) -> xarray.Dataset:
+    store = open_store(
+        path,
+        config,
+        _variables(setup, config),
+        setup.cases,
+        _chosen_unit(setup, unit),
+        any_unit=unit is None,
+    )
     size = store.unit
     pending, damaged = store.pending()
     if damaged:
         notices.warn(
-            f"{path}: {len(damaged)} units are damaged (their data do not fit their checksums) and are computed again: {damaged[:10]}."
+            f"{path}: {len(damaged)} units are damaged (their data do not fit their checksums) and"
+            f" are computed again: {damaged[:10]}."
         )
     mine = distributed.share(pending)
     done, longest, begin = 0, 0.0, time.monotonic()
-    with StopRequest() as stop, bar(how.progress, setup.cases, setup.cases - sum(_length(store, u) for u in pending)) as shown:
+    with (
+        StopRequest() as stop,
+        bar(
+            how.progress, setup.cases, setup.cases - sum(_length(store, u) for u in pending)
+        ) as shown,
+    ):
         for data, span in _units(setup, mine, size, how, shown):
             store.write(span.start // size, data)
-            done, longest, begin = done + 1, max(longest, time.monotonic() - begin), time.monotonic()
+            done, longest, begin = (
+                done + 1,
+                max(longest, time.monotonic() - begin),
+                time.monotonic(),
+            )
             if stop.asked and done < len(mine):
                 raise _interrupted(store)
 
@@ -249,8 +334,8 @@ def _length(store: Store, unit: int) -> int:
 def _interrupted(store: Store) -> Interrupted:
     marks = store.marks()
     return Interrupted(
-        f"Stopped after {int(marks.sum())} of {store.units} units, which are written to {store.path}. "
-        "Start the same call or command again to go on from there."
+        f"Stopped after {int(marks.sum())} of {store.units} units, which are written to"
+        f" {store.path}. Start the same call or command again to go on from there."
     )
 
 

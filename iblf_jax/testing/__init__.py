@@ -1,8 +1,9 @@
-"""Checkers for members of every family: does this class fit the package, and if not, what is missing?
+"""Checkers for members of every family: does this class fit the package, and if not, what is
+missing?
 
-The contract of a family is the Protocol in its `_base.py` (or at the head of its file).  Each checker here takes an
-instance, a user's own from a notebook cell too, and either returns None or raises a `ContractError` that lists everything
-it found, each with the remedy:
+The contract of a family is the Protocol in its `_base.py` (or at the head of its file).  Each
+checker here takes an instance, a user's own from a notebook cell too, and either returns None or
+raises a `ContractError` that lists everything it found, each with the remedy:
 
     @ij.component
     class MyLaw:
@@ -10,10 +11,12 @@ it found, each with the remedy:
 
     ij.testing.check_law(MyLaw(gain=3.0))
 
-All look at the same things: the methods are there; shapes, types and state structures are as promised; numbers are finite;
-the member works under `jit` and `vmap`; derivatives in both modes are those of finite differences; float32 stays float32.
-Then comes what the mathematics of the family asks for.  The package's own contract tests are these functions.
-They compute in float64 whatever the session's setting is, and leave the setting as it was.
+All look at the same things: the methods are there; shapes, types and state structures are as
+  promised; numbers are finite;
+the member works under `jit` and `vmap`; derivatives in both modes are those of finite differences;
+float32 stays float32. Then comes what the mathematics of the family asks for.  The package's own
+contract tests are these functions. They compute in float64 whatever the session's setting is, and
+leave the setting as it was.
 """
 
 from iblf_jax.testing._contract import ContractError as ContractError

@@ -15,16 +15,37 @@ from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, p
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints, scenario_of
 from iblf_jax.world.bounds import Tube
 
-XI = (-40.0, -3.0, -1.0 - 1e-9, -1.0, -1.0 + 1e-9, -0.9, -0.3, -1e-9, 0.0, 1e-9, 0.3, 0.9, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 3.0, 40.0)
-"""Where every barrier is looked at, in xi: far outside, on and about the wall, inside, on and about zero."""
+XI = (
+    -40.0,
+    -3.0,
+    -1.0 - 1e-9,
+    -1.0,
+    -1.0 + 1e-9,
+    -0.9,
+    -0.3,
+    -1e-9,
+    0.0,
+    1e-9,
+    0.3,
+    0.9,
+    1.0 - 1e-9,
+    1.0,
+    1.0 + 1e-9,
+    3.0,
+    40.0,
+)
+"""Where every barrier is looked at, in xi: far outside, on and about the wall, inside, on and about
+zero."""
 
 TIMES = (0.0, 1.0, 2.5, 4.0)
 
 
 def check_barrier(barrier: Any, *, n: int | None = None) -> None:
-    """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays along alpha.
+    """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays
+    along alpha.
 
-        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the wall,
+        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the
+        wall,
         s alpha + dV1/dt <= -decay_rate V1,   |xi| <= xi_bound(V1), where it claims them
 
     Args:
@@ -38,9 +59,19 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
     check_number(n)
     with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
         guard, uses_o = barrier.guard, barrier.uses_o
-        remedy = "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
-        findings.require(isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf), f"guard is {guard!r}", remedy)
-        findings.require(isinstance(uses_o, bool), f"uses_o is {uses_o!r}", "It must be a bool of the class, uses_o: ClassVar[bool]")
+        remedy = (
+            "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
+        )
+        findings.require(
+            isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
+            f"guard is {guard!r}",
+            remedy,
+        )
+        findings.require(
+            isinstance(uses_o, bool),
+            f"uses_o is {uses_o!r}",
+            "It must be a bool of the class, uses_o: ClassVar[bool]",
+        )
         findings.stop_if_any()
         n = number_of_joints(findings, barrier, n)
         barrier = fitted_to(in_dtype(barrier, "float64"), n, "barrier")
@@ -49,14 +80,21 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
         o = _joint_by_joint(n, 0.1, 0.2) if uses_o else None
         tube = setting.tube(jnp.asarray(1.0))
         q = tube.q_d + _joint_by_joint(n, 0.2, -0.15)
-        calls: dict[str, tuple] = {"value(tube, q)": (barrier.value, (tube, q)), "slope(tube, q)": (barrier.slope, (tube, q))}
+        calls: dict[str, tuple] = {
+            "value(tube, q)": (barrier.value, (tube, q)),
+            "slope(tube, q)": (barrier.slope, (tube, q)),
+        }
         calls["virtual_velocity(tube, q, k1, o)"] = (barrier.virtual_velocity, (tube, q, k1, o))
         for label, (call, args) in calls.items():
             has_shape(findings, label, shape_of(findings, label, call, *args), (n,))
         findings.stop_if_any()
 
         def outputs(barrier, tube, q, k1, o):
-            named = (barrier.value(tube, q), barrier.slope(tube, q), barrier.virtual_velocity(tube, q, k1, o))
+            named = (
+                barrier.value(tube, q),
+                barrier.slope(tube, q),
+                barrier.virtual_velocity(tube, q, k1, o),
+            )
             return dict(zip(calls, named, strict=True))
 
         probe(findings, outputs, barrier, (tube, q, k1, o))
@@ -74,22 +112,32 @@ def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
 
 
 @jax.jit
-def _numbers(barrier: Any, setting: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array) -> dict[str, jax.Array]:
-    """The barrier at every xi, with its derivatives by q in both modes, and the rate of V1 along q' = alpha."""
+def _numbers(
+    barrier: Any, setting: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array
+) -> dict[str, jax.Array]:
+    """The barrier at every xi, with its derivatives by q in both modes, and the rate of V1 along q'
+    = alpha.
+    """
 
     def at(xi):
         tube: Tube = setting.tube(t)
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
 
         def functions(q):
-            return barrier.value(tube, q), barrier.slope(tube, q), barrier.virtual_velocity(tube, q, k1, o)
+            return (
+                barrier.value(tube, q),
+                barrier.slope(tube, q),
+                barrier.virtual_velocity(tube, q, k1, o),
+            )
 
         ones = jnp.ones_like(q)
         (V1, slope, alpha), forward = jax.jvp(functions, (q,), (ones,))
         pull = jax.vjp(functions, q)[1]
         one_by_one = jnp.eye(3)[:, :, None] * ones
         reverse = jax.vmap(pull)(tuple(one_by_one[:, i] for i in range(3)))[0]
-        rate = jax.jvp(lambda t, q: barrier.value(setting.tube(t), q), (t, q), (jnp.ones_like(t), alpha))[1]
+        rate = jax.jvp(
+            lambda t, q: barrier.value(setting.tube(t), q), (t, q), (jnp.ones_like(t), alpha)
+        )[1]
         return {
             "V1": V1,
             "slope": slope,
@@ -107,22 +155,38 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     got = {name: np.asarray(value) for name, value in numbers.items()}
     xi = np.asarray(XI)[:, None] + 0 * got["xi"]
     words = {"V1": "value", "slope": "slope", "alpha": "virtual_velocity"}
-    remedy = "Evaluate at iblf_jax.barriers.guarded_error; mind removable singularities at e1 = 0 (double jnp.where)"
-    for prefix, text in (("", ""), ("d", "the forward derivative of "), ("r", "the reverse derivative of ")):
+    remedy = (
+        "Evaluate at iblf_jax.barriers.guarded_error; mind removable singularities at e1 = 0"
+        " (double jnp.where)"
+    )
+    for prefix, text in (
+        ("", ""),
+        ("d", "the forward derivative of "),
+        ("r", "the reverse derivative of "),
+    ):
         for name, word in words.items():
             bad = ~np.isfinite(got[prefix + name])
             where = f"xi = {xi[bad][0]:.12g}" if np.any(bad) else ""
             findings.require(not np.any(bad), f"{text}{word} is not finite at {where}", remedy)
         findings.stop_if_any()
     zero = np.abs(xi) == 0
-    findings.require(np.all(np.abs(got["V1"][zero]) < 1e-12), "V1 is not 0 at e1 = 0", "Subtract its value there")
+    findings.require(
+        np.all(np.abs(got["V1"][zero]) < 1e-12), "V1 is not 0 at e1 = 0", "Subtract its value there"
+    )
     findings.require(np.all(np.abs(got["slope"][zero]) < 1e-12), "the slope is not 0 at e1 = 0")
     findings.require(
-        np.all(got["V1"] >= 0), "V1 is negative somewhere", "A Lyapunov function is >= 0; beyond the guard go on along the tangent"
+        np.all(got["V1"] >= 0),
+        "V1 is negative somewhere",
+        "A Lyapunov function is >= 0; beyond the guard go on along the tangent",
     )
     inward = np.sign(xi) * got["slope"] >= 0
-    findings.require(np.all(inward), "the slope points outward somewhere", "tau = ... - slope must push back, beyond the wall too")
-    # On the edge of the guard both one-sided derivatives are right, so the points within 1e-3 of it are left out.
+    findings.require(
+        np.all(inward),
+        "the slope points outward somewhere",
+        "tau = ... - slope must push back, beyond the wall too",
+    )
+    # On the edge of the guard both one-sided derivatives are right, so the points within 1e-3 of it
+    # are left out.
     clear = np.abs(np.abs(xi) - (1 - guard)) > 1e-3 * guard
     off = np.abs(got["dV1"] - got["slope"]) / np.maximum(1.0, np.abs(got["slope"]))
     worst = float(np.max(off[clear]))
@@ -130,10 +194,21 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     findings.require(worst < 1e-8, f"the slope is not dV1/dq (relative error {worst:.2g})", remedy)
     inside = np.abs(xi) < 1 - 2 * guard
     growth = float(np.max(got["decay"][inside]))
-    findings.require(growth <= 1e-9, f"V1 grows at rate {growth:.3g} along q' = alpha", "alpha must make slope . alpha + dV1/dt negative")
+    findings.require(
+        growth <= 1e-9,
+        f"V1 grows at rate {growth:.3g} along q' = alpha",
+        "alpha must make slope . alpha + dV1/dt negative",
+    )
 
 
-def _claims(findings: Findings, barrier: Any, tube: Tube, k1: jax.Array, numbers: dict[str, jax.Array], guard: float) -> None:
+def _claims(
+    findings: Findings,
+    barrier: Any,
+    tube: Tube,
+    k1: jax.Array,
+    numbers: dict[str, jax.Array],
+    guard: float,
+) -> None:
     """What the barrier promises of V1, if it promises anything."""
     xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "V1", "decay"))
     inside = np.abs(xi) < min(1 - 2 * guard, 1.0)
@@ -141,23 +216,42 @@ def _claims(findings: Findings, barrier: Any, tube: Tube, k1: jax.Array, numbers
     if rate is not None:
         has_shape(findings, "decay_rate(k1)", rate, k1.shape)
         excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
-        findings.require(excess <= 1e-9, f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha", "Claim a smaller rate, or None")
+        findings.require(
+            excess <= 1e-9,
+            f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
+            "Claim a smaller rate, or None",
+        )
     ratio = getattr(barrier, "error_over_slope", lambda tube, q: None)
     if ratio(tube, tube.q_d) is not None:
         q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
-        found, slope = np.asarray(jax.jit(jax.vmap(lambda q: ratio(tube, q)))(q)), np.asarray(numbers["slope"])
+        found, slope = (
+            np.asarray(jax.jit(jax.vmap(lambda q: ratio(tube, q)))(q)),
+            np.asarray(numbers["slope"]),
+        )
         off = np.abs(found * slope - (q - np.asarray(tube.q_d)))[inside]
         remedy = "It is e1/s inside the wall, written so that it has no 0/0 at e1 = 0"
-        findings.require(np.max(off) < 1e-9, f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})", remedy)
-        findings.require(np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy)
+        findings.require(
+            np.max(off) < 1e-9,
+            f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})",
+            remedy,
+        )
+        findings.require(
+            np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
+        )
     bound = getattr(barrier, "xi_bound", lambda V, tube: None)
     if bound(jnp.asarray(V1[0]), tube) is not None:
         claimed = np.asarray(jax.jit(jax.vmap(lambda V: bound(V, tube)))(V1))
         kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]
-        findings.require(np.all(kept), "|xi| is beyond xi_bound(V1, tube)", "It must hold wherever V1 <= V; return None for no claim")
+        findings.require(
+            np.all(kept),
+            "|xi| is beyond xi_bound(V1, tube)",
+            "It must hold wherever V1 <= V; return None for no claim",
+        )
 
 
-def _joints_apart(findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any) -> None:
+def _joints_apart(
+    findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
+) -> None:
     """No joint's barrier depends on another joint."""
     for label, function in (
         ("value", lambda q: barrier.value(tube, q)),
@@ -165,4 +259,8 @@ def _joints_apart(findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1
         ("virtual_velocity", lambda q: barrier.virtual_velocity(tube, q, k1, o)),
     ):
         J = np.asarray(jax.jit(jax.jacfwd(function))(q))
-        findings.require(np.all(np.diag(np.diag(J)) == J), f"{label} mixes joints", "It is written joint by joint; the law needs it so")
+        findings.require(
+            np.all(np.diag(np.diag(J)) == J),
+            f"{label} mixes joints",
+            "It is written joint by joint; the law needs it so",
+        )

@@ -1,4 +1,6 @@
-"""What a law does at its bounds and beyond them: inside it must be finite, beyond it may be undefined, and that is a remark."""
+"""What a law does at its bounds and beyond them: inside it must be finite, beyond it may be
+undefined, and that is a remark.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class Points(NamedTuple):
 
 
 def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
-    """Torque, V1 and their derivatives in both modes are finite inside the bounds; whether they are beyond them, too."""
+    """Torque, V1 and their derivatives in both modes are finite inside the bounds; whether they are
+    beyond them, too.
+    """
     infinite = _infinite_in_e2(findings, scenario)
     everywhere = _swept(findings, scenario, "xi", infinite)
     if scenario.velocity_bounds is None:
@@ -43,7 +47,9 @@ def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
     return _swept(findings, scenario, "xi of the velocity", infinite) and everywhere
 
 
-def _command(scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _command(
+    scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Torque, alpha and V1 without a disturbance."""
     setting = scenario.setting
     state = law.init(scenario.initial.q, scenario.initial.dq, setting)
@@ -62,32 +68,47 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
         one = jnp.ones_like(alpha)
         return jax.jvp(lambda dq: _command(scenario, law, q, dq)[0], (alpha + e2,), (one,))[1]
 
-    near, nearer = (float(np.max(np.abs(slope(scenario, jnp.asarray(e2))))) for e2 in (NEAR, NEARER))
+    near, nearer = (
+        float(np.max(np.abs(slope(scenario, jnp.asarray(e2))))) for e2 in (NEAR, NEARER)
+    )
     if not np.isfinite(near) or nearer <= GROWTH * near + 1.0:
         return False
     findings.add(
         "the derivative of the torque with respect to e2 = q' - alpha is infinite at e2 = 0 "
         f"(it is {near:.3g} N m s/rad at e2 = {NEAR:g} rad/s and {nearer:.3g} at {NEARER:g})",
-        "Replace a power |e2|^a sign(e2) with a < 1 by e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta",
+        "Replace a power |e2|^a sign(e2) with a < 1 by e2 (e2^2 + delta^2)^((a - 1)/2) with a small"
+        " delta",
     )
     return True
 
 
 def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bool) -> bool:
-    """Looks along the positions ("xi") or the velocities across their bounds; whether everything is finite beyond them."""
+    """Looks along the positions ("xi") or the velocities across their bounds; whether everything is
+    finite beyond them.
+    """
     found, xi = _at_points(scenario, axis), np.asarray(XI)
     beyond = np.zeros(xi.size, bool)
-    remedy = "Near the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay finite"
+    remedy = (
+        "Near the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay"
+        " finite"
+    )
     for label, finite in found.finite.items():
         beyond |= ~finite & ~found.inside
         bad = ~finite & found.inside
         if label != LABELS[0] and infinite_in_e2:
             bad &= ~found.at_rest
         if np.array_equal(xi[bad], [0.0]) and label != LABELS[0]:
-            smooth = "Smooth a root, a norm or a power below 1 of an error there, as (e^2 + delta^2)^(1/2) for |e|"
+            smooth = (
+                "Smooth a root, a norm or a power below 1 of an error there, as (e^2 +"
+                " delta^2)^(1/2) for |e|"
+            )
             findings.add(f"{label} is not finite where the error is 0", smooth)
             continue
-        findings.require(not np.any(bad), f"{label} is not finite at {axis} = {_listed(xi[bad])}, inside the bounds", remedy)
+        findings.require(
+            not np.any(bad),
+            f"{label} is not finite at {axis} = {_listed(xi[bad])}, inside the bounds",
+            remedy,
+        )
     findings.require(
         np.all(found.V1[found.inside & found.finite[LABELS[0]]] >= 0),
         "V1 is negative somewhere",
@@ -96,8 +117,10 @@ def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bo
     if np.any(beyond):
         what = "bound" if axis == "xi" else "velocity bound"
         findings.remark(
-            f"the law is undefined beyond the {what}: it or its derivative is not finite at {axis} = {_listed(xi[beyond])}",
-            "A run that leaves the bounds is frozen there and flagged NOT_FINITE; with iblf_jax.barriers.guarded_error it would go on",
+            f"the law is undefined beyond the {what}: it or its derivative is not finite at {axis}"
+            f" = {_listed(xi[beyond])}",
+            "A run that leaves the bounds is frozen there and flagged NOT_FINITE; with"
+            " iblf_jax.barriers.guarded_error it would go on",
         )
     return not np.any(beyond)
 
@@ -144,5 +167,7 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
 
 def _all_finite(tree: Any) -> np.ndarray:
     """Whether all numbers of each point are finite, bool."""
-    parts = [np.isfinite(np.asarray(x).reshape(len(XI), -1)).all(axis=1) for x in jax.tree.leaves(tree)]
+    parts = [
+        np.isfinite(np.asarray(x).reshape(len(XI), -1)).all(axis=1) for x in jax.tree.leaves(tree)
+    ]
     return np.all(parts, axis=0)

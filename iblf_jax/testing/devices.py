@@ -1,4 +1,6 @@
-"""The checkers for sensors and actuators: the contracts are `iblf_jax.sensors.Sensor` and `iblf_jax.actuators.Actuator`."""
+"""The checkers for sensors and actuators: the contracts are `iblf_jax.sensors.Sensor` and
+`iblf_jax.actuators.Actuator`.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,11 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
         def outputs(sensor, q, dq, normal, period):
             sensor = getattr(sensor, "unrounded", sensor)
             measured, state = sensor.measure(q, dq, normal, period, sensor.init(q, dq, period))
-            return {"q": measured.q, "dq": measured.dq, **{f"state, leaf {i}": x for i, x in enumerate(jax.tree.leaves(state))}}
+            return {
+                "q": measured.q,
+                "dq": measured.dq,
+                **{f"state, leaf {i}": x for i, x in enumerate(jax.tree.leaves(state))},
+            }
 
         probe(findings, outputs, fitted, (q, dq, normal, period))
 
@@ -68,7 +74,11 @@ def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
     kind = f" ({q.dtype})"
     state = shape_of(findings, "init(q, dq, period)" + kind, sensor.init, q, dq, period)
     label = "measure(q, dq, normal, period, state)" + kind
-    found = None if state is None else shape_of(findings, label, sensor.measure, q, dq, normal, period, state)
+    found = (
+        None
+        if state is None
+        else shape_of(findings, label, sensor.measure, q, dq, normal, period, state)
+    )
     if found is None:
         return
     is_pair = isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Measurement)
@@ -83,7 +93,8 @@ def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
 
 
 def check_actuator(actuator: Any, *, n: int | None = None) -> None:
-    """Checks an actuator: shapes, the state's structure, derivatives, float32, and that it starts at the torque of `init`.
+    """Checks an actuator: shapes, the state's structure, derivatives, float32, and that it starts
+    at the torque of `init`.
 
     Its input need not be a torque.  From the state that `init(tau)` returns, at a standstill, some
     input, in whatever unit, must make it deliver tau; and at that input its state must not grow.
@@ -107,7 +118,10 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
 
         def outputs(actuator, asked, dq):
             delivered = actuator.deliver(asked, dq, actuator.init(0.9 * asked))
-            return {"tau": delivered.tau, **{f"rate, leaf {i}": x for i, x in enumerate(jax.tree.leaves(delivered.rate))}}
+            return {
+                "tau": delivered.tau,
+                **{f"rate, leaf {i}": x for i, x in enumerate(jax.tree.leaves(delivered.rate))},
+            }
 
         probe(findings, outputs, fitted, (asked, dq))
         _starts_at_its_torque(findings, fitted, asked / jnp.max(jnp.abs(asked)))
@@ -130,7 +144,9 @@ def _delivers(findings: Findings, actuator, asked, dq) -> None:
 
 
 def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Array) -> None:
-    """From `init(tau)` some input delivers tau at a standstill, and keeps the state from growing."""
+    """From `init(tau)` some input delivers tau at a standstill, and keeps the state from
+    growing.
+    """
     for size in SMALL_TORQUES:
         torque = size * direction
         state = actuator.init(torque)
@@ -143,13 +159,15 @@ def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Arra
             return
     delivered = np.asarray(actuator.deliver(torque, jnp.zeros_like(torque), state).tau)
     findings.add(
-        f"from init({np.asarray(torque)}) at a standstill no input makes it deliver that torque; commanded to, it gives {delivered} N m",
+        f"from init({np.asarray(torque)}) at a standstill no input makes it deliver that torque;"
+        f" commanded to, it gives {delivered} N m",
         "`init` must return the state in which the actuator delivers the torque",
     )
 
 
 def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Array | None:
-    """An input, in any unit, at which a state delivers a torque at a standstill, by Newton's method.
+    """An input, in any unit, at which a state delivers a torque at a standstill, by Newton's
+    method.
 
     None if no start leads to one.
     """
@@ -170,7 +188,10 @@ def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Ar
         if delivers.size:
             return jnp.asarray(inputs[delivers[0]])
         finite = np.isfinite(missing).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
-        steps = [np.linalg.lstsq(slope, short, rcond=None)[0] for slope, short in zip(slopes[finite], missing[finite], strict=True)]
+        steps = [
+            np.linalg.lstsq(slope, short, rcond=None)[0]
+            for slope, short in zip(slopes[finite], missing[finite], strict=True)
+        ]
         if not steps or not np.any(steps):
             return None
         inputs = inputs.copy()
@@ -179,7 +200,9 @@ def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Ar
 
 
 def _growth(actuator: Any, asked: jax.Array, state: Any) -> float:
-    """How fast the state grows by itself at a constant input at a standstill, 1/s; 0 if not at all."""
+    """How fast the state grows by itself at a constant input at a standstill, 1/s; 0 if not at
+    all.
+    """
     flat, rebuild = ravel_pytree(state)
     if flat.size == 0:
         return 0.0

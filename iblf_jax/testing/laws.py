@@ -35,16 +35,22 @@ SPEED = 2.0
 """rad/s.  Bounds of the velocities for a law that needs some."""
 
 
-def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = None) -> tuple[str, ...]:
-    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite inside its bounds, a short closed loop.
+def check_law(
+    law: Any, *, scenario: Scenario | None = None, n: int | None = None
+) -> tuple[str, ...]:
+    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite inside its
+    bounds, a short closed loop.
 
     Args:
       law: an instance.
-      scenario: to try it in; if not given the paper's simulation, or one like it for as many joints as the law is for.
-      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these are scalars.
+      scenario: to try it in; if not given the paper's simulation, or one like it for as many joints
+        as the law is for.
+      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these
+        are scalars.
 
     Returns:
-      Remarks, such as that the law is undefined beyond its bounds, where many published laws are; an empty tuple if there are none.
+      Remarks, such as that the law is undefined beyond its bounds, where many published laws are;
+      an empty tuple if there are none.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
@@ -57,7 +63,9 @@ def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = Non
         if watched is None and getattr(unwrapped(law), "needs_velocity_bounds", False):
             watched = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
         try:
-            base = in_dtype(dataclasses.replace(base, controller=law, velocity_bounds=watched), "float64")
+            base = in_dtype(
+                dataclasses.replace(base, controller=law, velocity_bounds=watched), "float64"
+            )
         except ValueError as error:
             findings.add(f"it does not go into a Scenario ({error})")
             findings.stop_if_any()
@@ -83,7 +91,12 @@ def check_law(law: Any, *, scenario: Scenario | None = None, n: int | None = Non
 
 
 def _structure(findings: Findings, scenario: Scenario) -> None:
-    law, setting, q, dq = scenario.controller, scenario.setting, scenario.initial.q, scenario.initial.dq
+    law, setting, q, dq = (
+        scenario.controller,
+        scenario.setting,
+        scenario.initial.q,
+        scenario.initial.dq,
+    )
     t, kind = jnp.zeros((), q.dtype), f" ({q.dtype})"
     state = shape_of(findings, "init(q, dq, setting)" + kind, law.init, q, dq, setting)
     if state is None:
@@ -93,7 +106,10 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
     if answer is None:
         return
     if not (isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)):
-        findings.add(f"{label} gives {type(answer).__name__}", "It must be a pair (Command, rate of the state)")
+        findings.add(
+            f"{label} gives {type(answer).__name__}",
+            "It must be a pair (Command, rate of the state)",
+        )
         return
     command, rate = answer
     for name in ("tau", "alpha", "V1"):
@@ -101,7 +117,9 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
         remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
         if ok:
             got = getattr(command, name).dtype
-            findings.require(got == q.dtype, f"Command.{name} is {got} for {q.dtype} arguments", remedy)
+            findings.require(
+                got == q.dtype, f"Command.{name} is {got} for {q.dtype} arguments", remedy
+            )
     for name in ("guard_active", "saturated"):
         has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape, jnp.bool_)
     same_structure(findings, "the rate that command returns" + kind, rate, state)
@@ -113,15 +131,25 @@ def _closed_loop(findings: Findings, scenario: Scenario, is_defined_beyond: bool
         with notices.muted():
             run = simulate(scenario, duration=SHORT_RUN, dt=1e-3, record_every=10, metrics=())
     except (TypeError, ValueError) as error:
-        findings.add(f"it does not run in a closed loop ({type(error).__name__}: {str(error).splitlines()[0]})")
+        findings.add(
+            f"it does not run in a closed loop ({type(error).__name__}:"
+            f" {str(error).splitlines()[0]})"
+        )
         return
     left = int(run.status) & int(VIOLATED | Status.ALPHA_INFEASIBLE)
     if left and not is_defined_beyond:
         findings.remark(
-            "the closed loop of the check left the bounds, beyond which the law is undefined", "Try it in a scenario of its own"
+            "the closed loop of the check left the bounds, beyond which the law is undefined",
+            "Try it in a scenario of its own",
         )
         return
-    lost = int(run.status) & int(Status.NOT_FINITE) and not int(run.status) & int(Status.STEP_TOO_LARGE)
-    findings.require(not lost, f"the arm ran away within {SHORT_RUN} s of the closed loop", "Look at the signs of the feedback")
+    lost = int(run.status) & int(Status.NOT_FINITE) and not int(run.status) & int(
+        Status.STEP_TOO_LARGE
+    )
+    findings.require(
+        not lost,
+        f"the arm ran away within {SHORT_RUN} s of the closed loop",
+        "Look at the signs of the feedback",
+    )
     finite = all(np.all(np.isfinite(x)) for x in (run.q, run.dq, run.tau, run.V))
     findings.require(finite, "the closed loop gave numbers that are not finite")

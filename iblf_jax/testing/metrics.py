@@ -32,8 +32,12 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
     check_number(n)
     with examine(fold, "Fold", Fold) as findings:
         units = fold.units
-        ok = hasattr(units, "items") and all(isinstance(x, str) for pair in units.items() for x in pair)
-        findings.require(ok, f"units is {units!r}", 'It must be a dict from name to SI unit, {"rmse": "rad"}')
+        ok = hasattr(units, "items") and all(
+            isinstance(x, str) for pair in units.items() for x in pair
+        )
+        findings.require(
+            ok, f"units is {units!r}", 'It must be a dict from name to SI unit, {"rmse": "rad"}'
+        )
         n = number_of_joints(findings, fold, n)
         fold = fitted_to(in_dtype(fold, "float64"), n, "metric")
         for dtype in ("float64", "float32"):
@@ -48,13 +52,26 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
         result = jax.jit(folded)((fold,), some)
         for name, value in result.items():
             findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
-        finite = {name for name, value in result.items() if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)}
-        probe(findings, lambda fold, moving: {k: v for k, v in outputs(fold, moving, flags).items() if k in finite}, fold, (moving,))
+        finite = {
+            name
+            for name, value in result.items()
+            if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)
+        }
+        probe(
+            findings,
+            lambda fold, moving: {
+                k: v for k, v in outputs(fold, moving, flags).items() if k in finite
+            },
+            fold,
+            (moving,),
+        )
         at_rest(findings, fold, some)
 
 
 def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
-    """A made-up run of n joints, (LENGTH, ...), at steps of so many seconds, all its numbers apart from each other."""
+    """A made-up run of n joints, (LENGTH, ...), at steps of so many seconds, all its numbers apart
+    from each other.
+    """
     t = np.arange(LENGTH) * step
     dt = np.where((np.arange(LENGTH) > 0) & (np.arange(LENGTH) < LENGTH - 1), step, 0.5 * step)
     since = np.where(np.arange(LENGTH) > 0, step, 0.0)
@@ -62,14 +79,26 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
 
     def wave(size):
         phase, speed = rng.uniform(0, 6, (2, 1, n))
-        return size * np.sin((1 + speed) * angle + phase) + rng.uniform(-0.1, 0.1, (LENGTH, n)) * size
+        return (
+            size * np.sin((1 + speed) * angle + phase) + rng.uniform(-0.1, 0.1, (LENGTH, n)) * size
+        )
 
     q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
-    numbers = {name: wave(1.0) for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")}
+    numbers = {
+        name: wave(1.0)
+        for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
+    }
     sides = {"lower": np.full((LENGTH, n), 0.2), "upper": np.full((LENGTH, n), 0.85)}
     k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
-    numbers |= {"slack": np.abs(wave(0.1)), "dq_lower": np.full((LENGTH, n), -0.9), "dq_upper": np.full((LENGTH, n), 1.1)}
-    numbers |= {"region_margin": 0.3 + wave(0.2)[:, :REGIONS], "region_slack": np.abs(wave(0.1))[:, :REGIONS]}
+    numbers |= {
+        "slack": np.abs(wave(0.1)),
+        "dq_lower": np.full((LENGTH, n), -0.9),
+        "dq_upper": np.full((LENGTH, n), 1.1),
+    }
+    numbers |= {
+        "region_margin": 0.3 + wave(0.2)[:, :REGIONS],
+        "region_slack": np.abs(wave(0.1))[:, :REGIONS],
+    }
     numbers |= sides | {
         "q": q_d + e1,
         "e1": e1,
@@ -82,7 +111,10 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         "step": since,
     }
     flags = {name: rng.uniform(size=(LENGTH, n)) < 0.3 for name in ("guard_active", "saturated")}
-    return samples_from({k: jnp.asarray(v) for k, v in numbers.items()}, {k: jnp.asarray(v) for k, v in flags.items()})
+    return samples_from(
+        {k: jnp.asarray(v) for k, v in numbers.items()},
+        {k: jnp.asarray(v) for k, v in flags.items()},
+    )
 
 
 def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
@@ -107,15 +139,35 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
     result = shape_of(findings, "finish(acc)" + kind, fold.finish, acc)
     if result is None:
         return
-    if findings.require(isinstance(result, dict), f"finish(acc) gives {type(result).__name__}", "It must be a dict from name to array"):
+    if findings.require(
+        isinstance(result, dict),
+        f"finish(acc) gives {type(result).__name__}",
+        "It must be a dict from name to array",
+    ):
         remedy = "Every name needs a unit, and every unit a name"
-        findings.require(set(result) == set(fold.units), f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}", remedy)
+        findings.require(
+            set(result) == set(fold.units),
+            f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}",
+            remedy,
+        )
 
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     """On a run without any error or torque, nothing is NaN, and nor is any derivative."""
-    still, kept = jax.tree.map(jnp.zeros_like, samples), ("t", "dt", "step", "lower", "upper", "q_d")
-    rest = dataclasses.replace(still, q=samples.q_d, **{name: getattr(samples, name) for name in kept})
+    still, kept = (
+        jax.tree.map(jnp.zeros_like, samples),
+        (
+            "t",
+            "dt",
+            "step",
+            "lower",
+            "upper",
+            "q_d",
+        ),
+    )
+    rest = dataclasses.replace(
+        still, q=samples.q_d, **{name: getattr(samples, name) for name in kept}
+    )
     moving, flags = parts(rest)
 
     @jax.jit
@@ -130,6 +182,14 @@ def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
 
     values, gradient = both(fold, moving)
     for name, value in values.items():
-        findings.require(not np.any(np.isnan(value)), f"{name} is NaN on a run without any error", "Guard divisions and roots by zero")
+        findings.require(
+            not np.any(np.isnan(value)),
+            f"{name} is NaN on a run without any error",
+            "Guard divisions and roots by zero",
+        )
     clean = all(not np.any(np.isnan(x)) for x in jax.tree.leaves(gradient))
-    findings.require(clean, "its derivative is NaN on a run without any error", "sqrt(0) has no derivative: use a double jnp.where")
+    findings.require(
+        clean,
+        "its derivative is NaN on a run without any error",
+        "sqrt(0) has no derivative: use a double jnp.where",
+    )

@@ -1,4 +1,6 @@
-"""The checker for objectives: the contract is `iblf_jax.tuning.quantities.Quantity`, which every term and requirement is made of."""
+"""The checker for objectives: the contract is `iblf_jax.tuning.quantities.Quantity`, which every
+term and requirement is made of.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +34,28 @@ DIRECTIONS = 3
 """Directions in which second derivatives are looked at."""
 
 
-def check_objective(objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0, n: int | None = None) -> None:
-    """Checks what gains are to be tuned for: accumulators, derivatives, float32, no NaN, and a short run that gives it its scales.
+def check_objective(
+    objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0, n: int | None = None
+) -> None:
+    """Checks what gains are to be tuned for: accumulators, derivatives, float32, no NaN, and a
+    short run that gives it its scales.
 
-        g = d(smooth value) / d(samples) by both modes and by finite differences,   N = N^T,   value at the start finite and not 0
+        g = d(smooth value) / d(samples) by both modes and by finite differences,   N = N^T,   value
+        at the start finite and not 0
 
     Args:
-      objective: an objective as you composed it, a requirement, or a quantity of your own that they are made of.
-      scenario: what it is tried on; if not given the paper's simulation, or one like it for as many joints as its leaves have.
+      objective: an objective as you composed it, a requirement, or a quantity of your own that they
+        are made of.
+      scenario: what it is tried on; if not given the paper's simulation, or one like it for as many
+        joints as its leaves have.
       duration: of the run [s], as `tune` will have it.
-      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these are scalars.
+      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these
+        are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: what it is tried on is no scenario, has another number of joints than `n`, or is not for a time.
+      ValueError: what it is tried on is no scenario, has another number of joints than `n`, or is
+        not for a time.
     """
     check_scenario(scenario, n)
     duration = checks.positive_number("duration", duration, "s")
@@ -64,13 +74,19 @@ def check_objective(objective: Any, *, scenario: Scenario | None = None, duratio
         with examine(quantity, "Quantity", Quantity) as findings:
             _quantity(findings, in_dtype(quantity, "float64"), duration, joints)
     with examine(objective, "Objective", Objective) as findings:
-        findings.require(objective.quantities, "it has neither terms nor requirements", "Such as ij.objectives.tracking()")
+        findings.require(
+            objective.quantities,
+            "it has neither terms nor requirements",
+            "Such as ij.objectives.tracking()",
+        )
         findings.stop_if_any()
         _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
 
 
 def _with_joints(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective with the joints of the scenario's robot; a selection that does not fit it is a finding."""
+    """The objective with the joints of the scenario's robot; a selection that does not fit it is a
+    finding.
+    """
     with examine(objective, "Objective", Objective) as findings:
         try:
             return for_scenario(objective, scenario)
@@ -88,18 +104,30 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
         _structure(findings, *in_dtype((quantity, jax.tree.map(lambda x: x[0], some)), dtype))
     findings.stop_if_any()
     moving, flags = parts(some)
-    flags |= {name: moving.pop(name) for name in ("t", "dt")}  # the grid of the samples; nothing is differentiated by it
+    flags |= {
+        name: moving.pop(name) for name in ("t", "dt")
+    }  # the grid of the samples; nothing is differentiated by it
     fold = Quantities((quantity,))
 
     def outputs(fold, moving):
-        return {"the smooth value": folded((fold,), samples_from(moving, in_dtype(flags, moving["q"].dtype)))["tuning_smooth"]}
+        return {
+            "the smooth value": folded(
+                (fold,), samples_from(moving, in_dtype(flags, moving["q"].dtype))
+            )["tuning_smooth"]
+        }
 
     exact = jax.jit(folded)((fold,), some)["tuning_exact"]
-    findings.require(np.all(np.isfinite(exact)), f"the exact value is not finite on an ordinary run: {np.asarray(exact)}")
+    findings.require(
+        np.all(np.isfinite(exact)),
+        f"the exact value is not finite on an ordinary run: {np.asarray(exact)}",
+    )
     probe(findings, outputs, fold, (moving,))
     at_rest(findings, fold, some)
     largest = np.max(jax.jit(folded)((fold,), some)["tuning_pieces"])
-    findings.require(np.allclose(largest, exact), f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}")
+    findings.require(
+        np.allclose(largest, exact),
+        f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}",
+    )
     if hasattr(quantity, "hessian"):
         _second_order(findings, quantity, moving, flags)
 
@@ -110,37 +138,59 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
     if acc is None:
         return
     same_structure(
-        findings, "update(acc, sample)" + kind, shape_of(findings, "update(acc, sample)" + kind, quantity.update, acc, first), acc
+        findings,
+        "update(acc, sample)" + kind,
+        shape_of(findings, "update(acc, sample)" + kind, quantity.update, acc, first),
+        acc,
     )
     result = shape_of(findings, "finish(acc)" + kind, quantity.finish, acc)
     three = isinstance(result, tuple) and len(result) == 3
     if result is not None and findings.require(
-        three, f"finish(acc) gives {type(result).__name__}", "It must be (smooth value, exact value, pieces)"
+        three,
+        f"finish(acc) gives {type(result).__name__}",
+        "It must be (smooth value, exact value, pieces)",
     ):
         for name, value in zip(("smooth value", "exact value"), result[:2], strict=True):
             has_shape(findings, f"the {name} of finish(acc){kind}", value, ())
         shape = getattr(result[2], "shape", ())
         findings.require(
-            len(shape) == 1, f"the pieces of finish(acc){kind} have shape {shape}", "They must be (m,): value[None] if it is one"
+            len(shape) == 1,
+            f"the pieces of finish(acc){kind} have shape {shape}",
+            "They must be (m,): value[None] if it is one",
         )
     matrix = hasattr(quantity, "hessian") or not hasattr(quantity, "curvature")
-    findings.require(matrix, "it has `curvature` without `hessian`", "Second-order methods need both")
+    findings.require(
+        matrix, "it has `curvature` without `hessian`", "Second-order methods need both"
+    )
     if not hasattr(quantity, "curvature"):
         return
     outer = shape_of(findings, "curvature(acc, sample)" + kind, quantity.curvature, acc, first)
     if outer is not None and findings.require(
-        isinstance(outer, Outer), f"curvature(acc, sample) gives {type(outer).__name__}", "It must be an iblf_jax.engine.derivatives.Outer"
+        isinstance(outer, Outer),
+        f"curvature(acc, sample) gives {type(outer).__name__}",
+        "It must be an iblf_jax.engine.derivatives.Outer",
     ):
         size = getattr(outer.vector, "shape", ())
         findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
-        weight = jnp.shape(outer.weight) if not hasattr(outer.weight, "shape") else outer.weight.shape
-        findings.require(weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}")
+        weight = (
+            jnp.shape(outer.weight) if not hasattr(outer.weight, "shape") else outer.weight.shape
+        )
+        findings.require(
+            weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}"
+        )
 
 
-def _second_order(findings: Findings, quantity: Any, moving: dict[str, jax.Array], flags: dict[str, jax.Array]) -> None:
-    """The Gauss-Newton matrix along some directions of the samples is square, symmetric and finite."""
+def _second_order(
+    findings: Findings, quantity: Any, moving: dict[str, jax.Array], flags: dict[str, jax.Array]
+) -> None:
+    """The Gauss-Newton matrix along some directions of the samples is square, symmetric and
+    finite.
+    """
     rng = np.random.default_rng(6)
-    ways = [jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), moving) for _ in range(DIRECTIONS)]
+    ways = [
+        jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), moving)
+        for _ in range(DIRECTIONS)
+    ]
     directions = jax.tree.map(lambda *x: jnp.stack(x), *ways)
 
     @jax.jit
@@ -149,7 +199,10 @@ def _second_order(findings: Findings, quantity: Any, moving: dict[str, jax.Array
             def one(acc, sample):
                 none = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
                 outer = quantity.curvature(acc, sample) if hasattr(quantity, "curvature") else none
-                return quantity.update(acc, sample), (outer.vector, jnp.broadcast_to(outer.weight, outer.vector.shape))
+                return quantity.update(acc, sample), (
+                    outer.vector,
+                    jnp.broadcast_to(outer.weight, outer.vector.shape),
+                )
 
             run = samples_from(moving, flags)
             acc, kept = jax.lax.scan(one, quantity.init(jax.tree.map(lambda x: x[0], run)), run)
@@ -167,34 +220,65 @@ def _second_order(findings: Findings, quantity: Any, moving: dict[str, jax.Array
     try:
         found = np.asarray(matrix(quantity, moving, directions))
     except Exception as error:
-        findings.add(f"hessian(products, pieces, slopes) raised {type(error).__name__}: {str(error).splitlines()[0]}")
+        findings.add(
+            f"hessian(products, pieces, slopes) raised {type(error).__name__}:"
+            f" {str(error).splitlines()[0]}"
+        )
         return
     if not findings.require(
-        found.shape == (DIRECTIONS, DIRECTIONS), f"hessian gives shape {found.shape}", "It must be (D, D) for products (D, D)"
+        found.shape == (DIRECTIONS, DIRECTIONS),
+        f"hessian gives shape {found.shape}",
+        "It must be (D, D) for products (D, D)",
     ):
         return
-    finite = findings.require(np.all(np.isfinite(found)), "the matrix of hessian is not finite on an ordinary run")
+    finite = findings.require(
+        np.all(np.isfinite(found)), "the matrix of hessian is not finite on an ordinary run"
+    )
     off = float(np.max(np.abs(found - found.T)))
     symmetric = not finite or off <= 1e-9 * max(1.0, float(np.max(np.abs(found))))
-    findings.require(symmetric, f"the matrix of hessian is not symmetric (by {off:.2g})", "It is a matrix of second derivatives")
+    findings.require(
+        symmetric,
+        f"the matrix of hessian is not symmetric (by {off:.2g})",
+        "It is a matrix of second derivatives",
+    )
 
 
-def _on_a_run(findings: Findings, objective: Objective, scenario: Scenario, duration: float) -> None:
+def _on_a_run(
+    findings: Findings, objective: Objective, scenario: Scenario, duration: float
+) -> None:
     """A run gives finite numbers, and every term its scale."""
     try:
         with notices.muted():
-            metrics = simulate(scenario, duration=duration, dt=1e-3, record_every=1000, metrics=(Quantities(objective.quantities),)).metrics
+            metrics = simulate(
+                scenario,
+                duration=duration,
+                dt=1e-3,
+                record_every=1000,
+                metrics=(Quantities(objective.quantities),),
+            ).metrics
     except (TypeError, ValueError) as error:
-        findings.add(f"it cannot be had from a run ({type(error).__name__}: {str(error).splitlines()[0]})")
+        findings.add(
+            f"it cannot be had from a run ({type(error).__name__}: {str(error).splitlines()[0]})"
+        )
         return
     for name, value in (("smooth", metrics["tuning_smooth"]), ("exact", metrics["tuning_exact"])):
-        findings.require(np.all(np.isfinite(value)), f"its {name} values on a run are {np.asarray(value)}", "They must be finite")
+        findings.require(
+            np.all(np.isfinite(value)),
+            f"its {name} values on a run are {np.asarray(value)}",
+            "They must be finite",
+        )
     findings.stop_if_any()
     try:
         goal = complete(objective, np.asarray(metrics["tuning_exact"])[: len(objective.terms)])
     except ValueError as error:
-        findings.add(str(error).rstrip("."), "Or give check_objective the scenario and the duration that `tune` will have")
+        findings.add(
+            str(error).rstrip("."),
+            "Or give check_objective the scenario and the duration that `tune` will have",
+        )
         return
     smooth = jnp.asarray(metrics["tuning_smooth"])
     numbers = [*(goal.values(smooth) if goal.terms else ()), *goal.excesses(smooth)]
-    findings.require(np.all(np.isfinite(numbers)), f"its terms and requirements on a run are {[float(x) for x in numbers]}")
+    findings.require(
+        np.all(np.isfinite(numbers)),
+        f"its terms and requirements on a run are {[float(x) for x in numbers]}",
+    )

@@ -24,12 +24,14 @@ from iblf_jax.world.robots import Robot
 
 
 def check_observer(observer: Any, *, model: Any = None, n: int | None = None) -> None:
-    """Checks an observer: shapes, the state's structure, derivatives, float32, and a hundred steps of a scan.
+    """Checks an observer: shapes, the state's structure, derivatives, float32, and a hundred steps
+    of a scan.
 
     Args:
       observer: an instance.
       model: the robot that it knows; an arm of n joints if not given.
-      n: number of joints, if no model is given; found from its leaves if not given, 2 if these are scalars.
+      n: number of joints, if no model is given; found from its leaves if not given, 2 if these are
+        scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
@@ -42,7 +44,9 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
         if model is None:
             model = arm_of(number_of_joints(findings, observer, n))
         if n not in (None, model.n):
-            raise checks.fail("n", n, f"{model.n}, the joints of the model", "Leave one of the two out.")
+            raise checks.fail(
+                "n", n, f"{model.n}, the joints of the model", "Leave one of the two out."
+            )
         model = in_dtype(model, "float64")
         n, t = model.n, jnp.asarray(0.7)
         fitted = fitted_to(in_dtype(observer, "float64"), n, "observer")
@@ -68,9 +72,16 @@ def _structure(findings: Findings, observer, t, q, dq, tau, model) -> None:
     if state is None:
         return
     label = "estimate(t, q, dq, model, state)" + kind
-    has_shape(findings, label, shape_of(findings, label, observer.estimate, t, q, dq, model, state), (n,))
+    has_shape(
+        findings, label, shape_of(findings, label, observer.estimate, t, q, dq, model, state), (n,)
+    )
     label = "derivative(t, q, dq, tau, model, state)" + kind
-    same_structure(findings, label, shape_of(findings, label, observer.derivative, t, q, dq, tau, model, state), state)
+    same_structure(
+        findings,
+        label,
+        shape_of(findings, label, observer.derivative, t, q, dq, tau, model, state),
+        state,
+    )
 
 
 def _scan(findings: Findings, observer, t, q, dq, tau, model) -> None:
@@ -82,9 +93,15 @@ def _scan(findings: Findings, observer, t, q, dq, tau, model) -> None:
         return state, observer.estimate(t, q, dq, model, state)
 
     try:
-        state, estimates = jax.jit(lambda: jax.lax.scan(step, observer.init(q, dq, model), length=100))()
+        state, estimates = jax.jit(
+            lambda: jax.lax.scan(step, observer.init(q, dq, model), length=100)
+        )()
     except TypeError as error:
         findings.add(f"its state does not keep its type in a scan ({str(error).splitlines()[0]})")
         return
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, estimates)))
-    findings.require(finite, "its state is not finite after 0.1 s at a standstill with a constant torque", "Look at the signs of its rate")
+    findings.require(
+        finite,
+        "its state is not finite after 0.1 s at a standstill with a constant torque",
+        "Look at the signs of its rate",
+    )

@@ -17,7 +17,8 @@ TOLERANCE = 1e-9
 
 
 def check_robot(robot: Any, *, q: Any = None) -> None:
-    """Checks a robot: shapes, derivatives, float32; M positive definite, M' - 2 C skew, G = dU/dq, J = d tip/dq.
+    """Checks a robot: shapes, derivatives, float32; M positive definite, M' - 2 C skew, G = dU/dq,
+    J = d tip/dq.
 
         M = M^T > 0,   x^T (M' - 2 C) x = 0,   C(q, v) v = M' v - 1/2 d/dq (v^T M v),   G = dU/dq
 
@@ -31,15 +32,29 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
     """
     with examine(robot, "Robot", Robot) as findings:
         n = robot.n
-        findings.require(isinstance(n, int) and n >= 1, f"n is {n!r}", "It must be the number of joints, a Python int")
-        findings.require(hasattr(robot, "payload"), "it has no leaf `payload`", "Add a point mass at the tip [kg], 0 by default")
+        findings.require(
+            isinstance(n, int) and n >= 1,
+            f"n is {n!r}",
+            "It must be the number of joints, a Python int",
+        )
+        findings.require(
+            hasattr(robot, "payload"),
+            "it has no leaf `payload`",
+            "Add a point mass at the tip [kg], 0 by default",
+        )
         findings.stop_if_any()
         robot = in_dtype(robot, "float64")
         rng = np.random.default_rng(1)
-        points = jnp.asarray(rng.uniform(-2, 2, (4, n))) if q is None else jnp.atleast_2d(checks.as_floats("q", q))
+        points = (
+            jnp.asarray(rng.uniform(-2, 2, (4, n)))
+            if q is None
+            else jnp.atleast_2d(checks.as_floats("q", q))
+        )
         checks.check_values("q", points, None)
         if points.ndim != 2 or points.shape[1] != n or not len(points):
-            raise checks.fail("q", points, f"configurations, shape (m, {n})", f"Its shape is {points.shape}.")
+            raise checks.fail(
+                "q", points, f"configurations, shape (m, {n})", f"Its shape is {points.shape}."
+            )
         _shapes(findings, robot, points[0])
         findings.stop_if_any()
 
@@ -64,7 +79,9 @@ def _shapes(findings: Findings, robot: Any, q: Any) -> None:
     n = robot.n
     tip = shape_of(findings, "tip(q)", robot.tip, q)
     if tip is not None:
-        findings.require(tip.shape in ((2,), (3,)), f"tip(q) has shape {tip.shape}", "It must be (2,) or (3,)")
+        findings.require(
+            tip.shape in ((2,), (3,)), f"tip(q) has shape {tip.shape}", "It must be (2,) or (3,)"
+        )
     d = tip.shape[0] if tip is not None and tip.shape in ((2,), (3,)) else 2
     methods = {
         "mass_matrix(q)": (robot.mass_matrix, (q,), (n, n)),
@@ -89,7 +106,9 @@ def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[st
         "skew": N + N.T,
         "skew_scale": jnp.max(jnp.abs(C)),
         "linear": robot.coriolis(q, v, u) - C @ u,
-        "christoffel": robot.coriolis(q, v, v) - coriolis_from_mass_matrix(robot.mass_matrix, q, v, v),
+        "christoffel": (
+            robot.coriolis(q, v, v) - coriolis_from_mass_matrix(robot.mass_matrix, q, v, v)
+        ),
         "gravity": robot.gravity(q) - jax.grad(robot.potential)(q),
         "gravity_scale": jnp.max(jnp.abs(robot.gravity(q))),
         "jacobian": robot.jacobian(q) - jax.jacfwd(robot.tip)(q),
@@ -100,16 +119,39 @@ def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[st
 def _physics(findings: Findings, got: dict[str, np.ndarray]) -> None:
     def small(name, scale, problem, remedy):
         size = float(np.max(np.abs(got[name])))
-        findings.require(size <= TOLERANCE * max(1.0, float(scale)), f"{problem} (by {size:.2g})", remedy)
+        findings.require(
+            size <= TOLERANCE * max(1.0, float(scale)), f"{problem} (by {size:.2g})", remedy
+        )
 
     scale = np.max(np.abs(got["M"]))
     motion = max(np.max(np.abs(got["skew_scale"])), scale)
     small("asymmetry", scale, "M(q) is not symmetric", "Build it symmetric")
     lowest = float(np.min(np.linalg.eigvalsh(0.5 * (got["M"] + np.swapaxes(got["M"], 1, 2)))))
-    findings.require(lowest > 0, f"M(q) is not positive definite (lowest eigenvalue {lowest:.3g})", "Give every joint some inertia")
-    small("linear", motion, "coriolis(q, v, u) is not linear in u", "It is C(q, v) u, not C(q, v) v")
-    small("christoffel", motion, "coriolis(q, v, v) does not follow from M(q)", "Use iblf_jax.robots.from_energy to derive it")
-    small("skew", motion, "M' - 2 C is not skew-symmetric", "Use the Christoffel symbols: iblf_jax.robots.from_energy")
-    small("gravity", np.max(got["gravity_scale"]), "gravity(q) is not dU/dq of potential(q)", "Look at signs and heights")
+    findings.require(
+        lowest > 0,
+        f"M(q) is not positive definite (lowest eigenvalue {lowest:.3g})",
+        "Give every joint some inertia",
+    )
+    small(
+        "linear", motion, "coriolis(q, v, u) is not linear in u", "It is C(q, v) u, not C(q, v) v"
+    )
+    small(
+        "christoffel",
+        motion,
+        "coriolis(q, v, v) does not follow from M(q)",
+        "Use iblf_jax.robots.from_energy to derive it",
+    )
+    small(
+        "skew",
+        motion,
+        "M' - 2 C is not skew-symmetric",
+        "Use the Christoffel symbols: iblf_jax.robots.from_energy",
+    )
+    small(
+        "gravity",
+        np.max(got["gravity_scale"]),
+        "gravity(q) is not dU/dq of potential(q)",
+        "Look at signs and heights",
+    )
     small("jacobian", 1.0, "jacobian(q) is not d tip/dq", "Use iblf_jax.robots.from_energy")
     small("tip", 1.0, "the last row of skeleton(q) is not tip(q)", "skeleton is base, joints, tip")

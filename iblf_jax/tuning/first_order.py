@@ -1,8 +1,10 @@
-"""The methods of optax: adam with a schedule, and L-BFGS with its line search, on coordinates that are squashed into the box.
+"""The methods of optax: adam with a schedule, and L-BFGS with its line search, on coordinates that
+are squashed into the box.
 
-A step to where a run is invalid is rejected: adam goes back to where it was and halves its rate, for good; the line search of L-BFGS
-takes the loss there for very large.  They suit many parameters (reverse mode) and runs that are drawn anew at every step; for few
-gains `newton` needs fewer rollouts.
+A step to where a run is invalid is rejected: adam goes back to where it was and halves its rate,
+  for good; the line search of L-BFGS
+takes the loss there for very large.  They suit many parameters (reverse mode) and runs that are
+drawn anew at every step; for few gains `newton` needs fewer rollouts.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ INVALID_LOSS = 1e6
 
 
 def squashed(box: Box, w: np.ndarray):
-    """Squashed coordinates z, row by row, and the function that takes a gradient by z to one by w."""
+    """Squashed coordinates z, row by row, and the function that takes a gradient by z to one by
+    w.
+    """
     z, pull = jax.vjp(jax.vmap(partial(squash, box=box)), jnp.asarray(w))
     return np.asarray(z), lambda g: np.asarray(pull(jnp.asarray(g, z.dtype))[0])
 
@@ -33,9 +37,15 @@ class Adam:
     converges = False
     penalised = True
 
-    def __init__(self, box: Box, iterations: int, learning_rate: float = 0.1, schedule: str = "cosine"):
+    def __init__(
+        self, box: Box, iterations: int, learning_rate: float = 0.1, schedule: str = "cosine"
+    ):
         self.box = box
-        rate = optax.cosine_decay_schedule(learning_rate, iterations, 0.02) if schedule == "cosine" else learning_rate
+        rate = (
+            optax.cosine_decay_schedule(learning_rate, iterations, 0.02)
+            if schedule == "cosine"
+            else learning_rate
+        )
         self.optimiser = optax.adam(rate)
         self.update = jax.jit(jax.vmap(self.optimiser.update))
 
@@ -44,7 +54,13 @@ class Adam:
         w = np.stack([unsquash(x, self.box) for x in z])
         inner = jax.tree.map(np.asarray, jax.vmap(self.optimiser.init)(jnp.asarray(w)))
         starts = len(z)
-        return {"w": w, "safe": w.copy(), "inner": inner, "slower": np.ones(starts), "done": np.zeros(starts, bool)}
+        return {
+            "w": w,
+            "safe": w.copy(),
+            "inner": inner,
+            "slower": np.ones(starts),
+            "done": np.zeros(starts, bool),
+        }
 
     def restart(self, state, start: int) -> None:
         """Nothing is kept that a change of the loss would make wrong."""
@@ -59,25 +75,37 @@ class Adam:
         gradient = pull(found.gradient)
         valid = np.isfinite(found.value.loss) & np.all(np.isfinite(gradient), axis=1)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
-            move, inner = self.update(jnp.asarray(np.where(valid[:, None], gradient, 0.0)), state["inner"])
-        keep = jax.tree.map(lambda new, old: np.where(valid.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old), inner, state["inner"])
+            move, inner = self.update(
+                jnp.asarray(np.where(valid[:, None], gradient, 0.0)), state["inner"]
+            )
+        keep = jax.tree.map(
+            lambda new, old: np.where(valid.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old),
+            inner,
+            state["inner"],
+        )
         state["inner"] = jax.tree.map(np.asarray, keep)
         state["slower"] = np.where(valid, state["slower"], 0.5 * state["slower"])
         state["safe"] = np.where(valid[:, None], state["w"], state["safe"])
         back = 0.5 * (state["w"] + state["safe"])
-        state["w"] = np.where(valid[:, None], state["w"] + state["slower"][:, None] * np.asarray(move), back)
+        state["w"] = np.where(
+            valid[:, None], state["w"] + state["slower"][:, None] * np.asarray(move), back
+        )
         return z, found
 
 
 class LBFGS:
-    """L-BFGS of optax with its zoom line search, one start after another; its state is a dict of arrays."""
+    """L-BFGS of optax with its zoom line search, one start after another; its state is a dict of
+    arrays.
+    """
 
     converges = True
     penalised = True
 
     def __init__(self, box: Box, tolerance: float = 1e-6, memory: int = 10, line_steps: int = 12):
         self.box, self.tolerance = box, tolerance
-        search = optax.scale_by_zoom_linesearch(max_linesearch_steps=line_steps, initial_guess_strategy="one")
+        search = optax.scale_by_zoom_linesearch(
+            max_linesearch_steps=line_steps, initial_guess_strategy="one"
+        )
         self.optimiser = optax.lbfgs(memory_size=memory, linesearch=search)
         self.compiled = jax.jit(self._search, static_argnames=("derive",))
 
@@ -85,7 +113,12 @@ class LBFGS:
         """The state before the first step."""
         w = np.stack([unsquash(x, self.box) for x in z])
         inner = jax.tree.map(np.array, jax.vmap(self.optimiser.init)(jnp.asarray(w)))
-        return {"w": w, "inner": inner, "loss": np.full(len(z), np.inf), "done": np.zeros(len(z), bool)}
+        return {
+            "w": w,
+            "inner": inner,
+            "loss": np.full(len(z), np.inf),
+            "done": np.zeros(len(z), bool),
+        }
 
     def restart(self, state, start: int) -> None:
         """Forget curvature and line search of one start."""
@@ -117,7 +150,9 @@ class LBFGS:
 
         value, gradient = optax.value_and_grad_from_state(loss)(w, state=inner)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
-            move, inner = self.optimiser.update(gradient, inner, w, value=value, grad=gradient, value_fn=loss)
+            move, inner = self.optimiser.update(
+                gradient, inner, w, value=value, grad=gradient, value_fn=loss
+            )
         return optax.apply_updates(w, move), inner
 
     def step(self, evaluate: Any, state):
@@ -125,7 +160,9 @@ class LBFGS:
         for s in np.flatnonzero(~state["done"]).tolist():
             shared, lanes = evaluate.row(s)
             inner = jax.tree.map(lambda x, s=s: jnp.asarray(x[s]), state["inner"])
-            w, inner = self.compiled(shared, lanes, jnp.asarray(state["w"][s]), inner, derive=evaluate.derive)
+            w, inner = self.compiled(
+                shared, lanes, jnp.asarray(state["w"][s]), inner, derive=evaluate.derive
+            )
             evaluate.evaluations += int(np.asarray(optax.tree.get(inner, "num_linesearch_steps")))
             _put(state["inner"], inner, s)
             state["w"][s] = np.asarray(w)

@@ -1,25 +1,30 @@
-"""What gains are tuned for: objectives, composed with + and weights, and requirements, which are penalty and verdict at once.
+"""What gains are tuned for: objectives, composed with + and weights, and requirements, which are
+penalty and verdict at once.
 
-    objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort() + 10 * ij.objectives.peak_torque()
-    objective += ij.objectives.margin_above(0.05)
+    objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort() + 10 *
+    ij.objectives.peak_torque() objective += ij.objectives.margin_above(0.05)
 
 A term is a smooth number of a run over its scale, so that terms are comparable:
 
-    plain   weight value / scale                 above   weight softplus(sharpness (value - limit) / scale) / sharpness
+    plain   weight value / scale                 above   weight softplus(sharpness (value - limit) /
+    scale) / sharpness
 
-`scale` and `limit`, where they are not given, are the value at the gains that tuning starts from (its mean over perturbed
-runs).  A requirement holds where
+`scale` and `limit`, where they are not given, are the value at the gains that tuning starts from
+(its mean over perturbed runs).  A requirement holds where
 
     g = (value - limit) / scale < 0        (its sign turned for "above" requirements);
 
 the tuning keeps g below zero (`newton`), in the report it passes or fails, with a confidence.
 
-In all functions `joints=` selects the joints that count, by index, name, slice or one truth value each (`core.joints`); `weights=` is one
-number, or one for each joint (or for each selected joint).  A limit may be one number for all joints, or one for each:
+In all functions `joints=` selects the joints that count, by index, name, slice or one truth value
+each (`core.joints`); `weights=` is one number, or one for each joint (or for each selected joint).
+A limit may be one number for all joints, or one for each:
 
-    ij.objectives.peak_torque_below([140, 140, 140, 27, 27, 27]) + ij.objectives.error_below(0.01, joints=["wrist_1", "wrist_2"])
+    ij.objectives.peak_torque_below([140, 140, 140, 27, 27, 27]) + ij.objectives.error_below(0.01,
+    joints=["wrist_1", "wrist_2"])
 
-Limits of single joints are kept as one requirement on the largest part of a limit, max_i |y_i| / limit_i < 1.
+Limits of single joints are kept as one requirement on the largest part of a limit, max_i |y_i| /
+limit_i < 1.
 """
 
 from __future__ import annotations
@@ -86,7 +91,8 @@ class Requirement:
       limit: what it must stay below, () in the quantity's unit.
       scale: the size that matters, () in the quantity's unit, > 0.
       allowed: share of perturbed runs that may break it, () [1], >= 0; 0.01 if not given.
-      event: "value": broken where g >= 0; "violated": broken where the run left its bounds or ran away; "value" if not given.
+      event: "value": broken where g >= 0; "violated": broken where the run left its bounds or ran
+        away; "value" if not given.
       name: what reports call it; "requirement" if not given.
       function: the one that made it, for messages; "" if not given.
     """
@@ -102,7 +108,9 @@ class Requirement:
     def check(self) -> None:
         """Raises ValueError for a share above 1, or another event."""
         if checks.is_concrete(self.allowed) and self.allowed > 1:
-            raise checks.fail("Requirement.allowed", self.allowed, "a share of the runs, from 0 to 1")
+            raise checks.fail(
+                "Requirement.allowed", self.allowed, "a share of the runs, from 0 to 1"
+            )
         checks.one_of("Requirement.event", self.event, ("value", "violated"))
 
     def excess(self, x: jax.Array) -> jax.Array:
@@ -125,7 +133,8 @@ class Requirement:
 
 @component
 class Objective:
-    """A sum of terms and a set of requirements; made by the functions of this module and by + and *.
+    """A sum of terms and a set of requirements; made by the functions of this module and by + and
+    *.
 
     Args:
       terms: what is minimised, a tuple of `Term`; () if not given.
@@ -139,13 +148,21 @@ class Objective:
         if isinstance(other, Requirement):
             other = Objective((), (other,))
         if not isinstance(other, Objective):
-            raise checks.fail("objective", other, "an objective or a requirement to add", "ij.objectives has them.")
+            raise checks.fail(
+                "objective",
+                other,
+                "an objective or a requirement to add",
+                "ij.objectives has them.",
+            )
         return Objective((*self.terms, *other.terms), (*self.requirements, *other.requirements))
 
     def __mul__(self, weight: Any) -> Objective:
         weight = checks.as_floats("weight", weight)
         checks.shape_is("weight", weight, ())
-        terms = tuple(Term(t.quantity, weight * t.weight, t.scale, t.limit, t.sharpness, t.shape, t.name) for t in self.terms)
+        terms = tuple(
+            Term(t.quantity, weight * t.weight, t.scale, t.limit, t.sharpness, t.shape, t.name)
+            for t in self.terms
+        )
         return Objective(terms, self.requirements)
 
     __rmul__ = __mul__
@@ -195,12 +212,17 @@ def _remedy(given: Any) -> str:
 
 def is_complete(objective: Objective) -> bool:
     """Whether no scale or limit is missing."""
-    return all(t.scale is not None and (t.limit is not None or t.shape == "plain") for t in _composed(objective).terms)
+    return all(
+        t.scale is not None and (t.limit is not None or t.shape == "plain")
+        for t in _composed(objective).terms
+    )
 
 
 def _composed(objective: Any) -> Objective:
     if not isinstance(objective, Objective):
-        raise checks.fail("objective", objective, "an objective", "Such as ij.objectives.tracking().")
+        raise checks.fail(
+            "objective", objective, "an objective", "Such as ij.objectives.tracking()."
+        )
     return objective
 
 
@@ -220,7 +242,12 @@ def complete(objective: Objective, start: Any) -> Objective:
 def _completed(t: Term, x: Any) -> Term:
     missing = t.scale is None or (t.limit is None and t.shape == "above")
     if missing and not (np.isfinite(x) and abs(x) > 0):
-        raise checks.fail(f"{t.name}: its value at the start", x, "a finite number other than 0", "Give the term a scale of its own.")
+        raise checks.fail(
+            f"{t.name}: its value at the start",
+            x,
+            "a finite number other than 0",
+            "Give the term a scale of its own.",
+        )
     scale = abs(x) if t.scale is None else t.scale
     limit = x if t.limit is None and t.shape == "above" else t.limit
     quantity = t.quantity
@@ -230,13 +257,17 @@ def _completed(t: Term, x: Any) -> Term:
 
 
 def sharper(objective: Objective, factor: float) -> Objective:
-    """The objective with the smoothing of every peak in its terms multiplied by a factor; all else, and the structure, stays."""
+    """The objective with the smoothing of every peak in its terms multiplied by a factor; all else,
+    and the structure, stays.
+    """
 
     def mended(part: Any) -> Any:
         smoothing = getattr(part.quantity, "smoothing", None)
         if smoothing is None:
             return part
-        return dataclasses.replace(part, quantity=dataclasses.replace(part.quantity, smoothing=factor * smoothing))
+        return dataclasses.replace(
+            part, quantity=dataclasses.replace(part.quantity, smoothing=factor * smoothing)
+        )
 
     objective = _composed(objective)
     return Objective(tuple(map(mended, objective.terms)), objective.requirements)
@@ -244,17 +275,27 @@ def sharper(objective: Objective, factor: float) -> Objective:
 
 def is_smoothed(objective: Objective) -> bool:
     """Whether a term of the objective is smoothed, so that `sharper` changes it."""
-    return any(getattr(term.quantity, "smoothing", None) is not None for term in _composed(objective).terms)
+    return any(
+        getattr(term.quantity, "smoothing", None) is not None for term in _composed(objective).terms
+    )
 
 
 def has_price_on_torque(objective: Objective) -> bool:
-    """Whether a term or a requirement grows with the torque; a metric of the user's own is taken for one that does."""
+    """Whether a term or a requirement grows with the torque; a metric of the user's own is taken
+    for one that does.
+    """
     quantities = _composed(objective).quantities
-    return any(getattr(q, "signal", "torque") in ("torque", "torque_rate") for q in quantities if not _of_the_error(q))
+    return any(
+        getattr(q, "signal", "torque") in ("torque", "torque_rate")
+        for q in quantities
+        if not _of_the_error(q)
+    )
 
 
 def check_signals(objective: Objective, scenario: Scenario) -> None:
-    """Raises ValueError for an objective of what the scenario's runs do not have: margins of velocities or regions, a slack."""
+    """Raises ValueError for an objective of what the scenario's runs do not have: margins of
+    velocities or regions, a slack.
+    """
     for quantity in _composed(objective).quantities:
         check_needs("objective", quantity, scenario)
 
@@ -264,14 +305,16 @@ def _of_the_error(quantity: Quantity) -> bool:
 
 
 def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective with its selections of joints as indices of the scenario's robot, weights and limits checked.
+    """The objective with its selections of joints as indices of the scenario's robot, weights and
+    limits checked.
 
     Args:
       objective: as the user composed it.
       scenario: of the n joints that names, slices and numbers of weights refer to.
 
     Raises:
-      ValueError: a joint that the robot does not have, or another number of weights or limits; the message names the function.
+      ValueError: a joint that the robot does not have, or another number of weights or limits; the
+        message names the function.
     """
     names = joint_names(scenario.plant, scenario.n)
     terms = tuple(_part_of(t, t.name, names) for t in _composed(objective).terms)
@@ -289,7 +332,8 @@ def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:
     if isinstance(quantity, MetricResult):
         function = "metric"
         if quantity.joints is None:
-            return part  # its weights belong to the numbers of the metric, which may be other than the joints
+            # its weights belong to the numbers of the metric, which may be other than the joints
+            return part
     chosen = indices(f"{function}: joints", quantity.joints, names)
     _check_count(function, quantity, len(chosen), len(names))
     if quantity.joints is None:
@@ -304,15 +348,24 @@ def _check_count(function: str, quantity: Any, chosen: int, n: int) -> None:
     of_limits = isinstance(quantity, Peak) and quantity.relative
     name = _LIMIT_OF.get(function, "limit") if of_limits else "weights"
     came = 1.0 / quantity.weights if of_limits else quantity.weights
-    raise checks.fail(f"{function}: {name}", came, f"one number, or {chosen}, one for each of the joints", f"Its shape is {shape}.")
+    raise checks.fail(
+        f"{function}: {name}",
+        came,
+        f"one number, or {chosen}, one for each of the joints",
+        f"Its shape is {shape}.",
+    )
 
 
 _LIMIT_OF = {"margin": "target", "velocity_margin": "target", "region_margin": "target"}
 """Functions whose limit has another name."""
 
 
-def _number(function: str, name: str, value: Any, sign: str | None = None, most: int = 0) -> jax.Array:
-    """An argument of one of these functions as an array of at most `most` dimensions; ValueError with the argument's name."""
+def _number(
+    function: str, name: str, value: Any, sign: str | None = None, most: int = 0
+) -> jax.Array:
+    """An argument of one of these functions as an array of at most `most` dimensions; ValueError
+    with the argument's name.
+    """
     field = f"{function}: {name}"
     array = checks.as_floats(field, value)
     if array.ndim > most:
@@ -331,23 +384,33 @@ def _limit(function: str, name: str, value: Any, example: str) -> jax.Array:
     try:
         array = _number(function, name, value, "positive", most=1)
     except ValueError as error:
-        raise ValueError(f"{error} Such as {function}({name}={example}), or one number for each joint.") from error
+        raise ValueError(
+            f"{error} Such as {function}({name}={example}), or one number for each joint."
+        ) from error
     if array.ndim and not array.size:
         raise checks.fail(f"{function}: {name}", value, "at least one number")
     return array
 
 
-def _choice(function: str, joints: Any, weights: Any, sign: str | None = "nonnegative") -> tuple[Selection, Any]:
+def _choice(
+    function: str, joints: Any, weights: Any, sign: str | None = "nonnegative"
+) -> tuple[Selection, Any]:
     """The joints that count, and their weights, of the sign that the function takes.
 
-    Floating-point numbers as `joints` were weights in earlier versions.  They are no indices, so they still mean that.
+    Floating-point numbers as `joints` were weights in earlier versions.  They are no indices, so
+    they still mean that.
     """
     if holds_weights(joints):
         if weights is not None:
-            raise checks.fail(f"{function}: joints", joints, "indices, names or a slice of joints", "The weights are in weights=.")
+            raise checks.fail(
+                f"{function}: joints",
+                joints,
+                "indices, names or a slice of joints",
+                "The weights are in weights=.",
+            )
         notices.warn(
-            f"{function}(joints=...) selects joints by index, name or slice. Floating-point numbers are read as weights, as in earlier "
-            f"versions: write {function}(weights=...).",
+            f"{function}(joints=...) selects joints by index, name or slice. Floating-point numbers"
+            f" are read as weights, as in earlier versions: write {function}(weights=...).",
             DeprecationWarning,
         )
         joints, weights = None, joints
@@ -385,28 +448,40 @@ def _peak(
     after: Any = 0.0,
     smoothing: Any = 0.01,
 ) -> tuple[Peak, Any, Selection]:
-    """The peak of a signal under a limit that is one number, or one for each joint; and the limit of that peak."""
+    """The peak of a signal under a limit that is one number, or one for each joint; and the limit
+    of that peak.
+    """
     chosen, w = _choice(function, joints, weights)
     after = _number(function, "after", after)
     smoothing = _number(function, "smoothing", smoothing, "positive")
     if jnp.ndim(limit) == 0:
         return Peak(limit, signal, w, after, smoothing, joints=chosen), limit, chosen
     if jnp.ndim(w) == 1 and jnp.shape(w) != jnp.shape(limit):
-        raise checks.fail(f"{function}: weights", w, f"one number, or {jnp.size(limit)}, as there are limits")
+        raise checks.fail(
+            f"{function}: weights", w, f"one number, or {jnp.size(limit)}, as there are limits"
+        )
     one: Any = 1.0
     return Peak(one, signal, w / limit, after, smoothing, joints=chosen, relative=True), one, chosen
 
 
-def _below(function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str) -> Requirement:
+def _below(
+    function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str
+) -> Requirement:
     """The requirement that a peak is below its limit."""
     quantity, limit, _ = peak
-    return Requirement(quantity, limit, limit, _share(function, allowed), name=name, function=function)
+    return Requirement(
+        quantity, limit, limit, _share(function, allowed), name=name, function=function
+    )
 
 
-def _above(function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str) -> Requirement:
+def _above(
+    function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str
+) -> Requirement:
     """The requirement that a margin, the negative of a peak, is above its limit."""
     quantity, limit, _ = peak
-    return Requirement(quantity, -limit, limit, _share(function, allowed), name=name, function=function)
+    return Requirement(
+        quantity, -limit, limit, _share(function, allowed), name=name, function=function
+    )
 
 
 def _share(function: str, allowed: Any) -> jax.Array:
@@ -417,28 +492,49 @@ def _share(function: str, allowed: Any) -> jax.Array:
 
 
 def _one_term(function: str, quantity: Quantity, scale: Any, name: str = "") -> Objective:
-    return Objective((Term(quantity, scale=_optional(function, "scale", scale), name=name or function),))
+    return Objective(
+        (Term(quantity, scale=_optional(function, "scale", scale), name=name or function),)
+    )
 
 
-def _integral(function: str, signal: str, joints: Any, weights: Any, scale: Any, after: Any = 0.0, tolerance: Any = None) -> Objective:
+def _integral(
+    function: str,
+    signal: str,
+    joints: Any,
+    weights: Any,
+    scale: Any,
+    after: Any = 0.0,
+    tolerance: Any = None,
+) -> Objective:
     chosen, w = _choice(function, joints, weights)
     quantity = TimeIntegral(signal, w, _number(function, "after", after), tolerance, chosen)
     return _one_term(function, quantity, scale)
 
 
-def _soft(function: str, peak: tuple[Peak, Any, Selection], scale: Any, limit: Any, sharpness: Any) -> Objective:
+def _soft(
+    function: str, peak: tuple[Peak, Any, Selection], scale: Any, limit: Any, sharpness: Any
+) -> Objective:
     """A soft penalty on a peak above a limit."""
     sharpness = _number(function, "sharpness", sharpness, "positive")
-    return Objective((Term(peak[0], scale=scale, limit=limit, sharpness=sharpness, shape="above", name=function),))
+    return Objective(
+        (
+            Term(
+                peak[0], scale=scale, limit=limit, sharpness=sharpness, shape="above", name=function
+            ),
+        )
+    )
 
 
-def tracking(*, joints: Any = None, weights: Any = None, after: Any = 0.0, scale: Any = None) -> Objective:
+def tracking(
+    *, joints: Any = None, weights: Any = None, after: Any = 0.0, scale: Any = None
+) -> Objective:
     """Integral of the squared position error.
 
         int sum_i (w_i e1_i)^2 dt / scale
 
     Args:
-      joints: which joints count: indices, names, a slice, or one truth value each; all if not given.
+      joints: which joints count: indices, names, a slice, or one truth value each; all if not
+        given.
       weights: w, one number, one for each joint, or one for each selected joint; 1 if not given.
       after: count from this time on [s].
       scale: in rad^2 s; the value at the starting gains if not given.
@@ -455,17 +551,24 @@ def tracking(*, joints: Any = None, weights: Any = None, after: Any = 0.0, scale
 
 
 def effort(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
-    """Integral of the squared torque, int sum_i (w_i tau_i)^2 dt / scale; arguments as `tracking`, scale in N^2 m^2 s."""
+    """Integral of the squared torque, int sum_i (w_i tau_i)^2 dt / scale; arguments as `tracking`,
+    scale in N^2 m^2 s.
+    """
     return _integral("effort", "torque", joints, weights, scale)
 
 
 def torque_rate(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
-    """Integral of the squared rate of the torque, int sum_i (w_i tau_i')^2 dt / scale; arguments as `tracking`, scale in N^2 m^2/s."""
+    """Integral of the squared rate of the torque, int sum_i (w_i tau_i')^2 dt / scale; arguments as
+    `tracking`, scale in N^2 m^2/s.
+    """
     return _integral("torque_rate", "torque_rate", joints, weights, scale)
 
 
-def settle(tolerance: Any = 0.01, *, joints: Any = None, weights: Any = None, scale: Any = 1.0) -> Objective:
-    """Time that the joints spend outside a tolerance, the smooth twin of the settling time, sum over joints / scale.
+def settle(
+    tolerance: Any = 0.01, *, joints: Any = None, weights: Any = None, scale: Any = 1.0
+) -> Objective:
+    """Time that the joints spend outside a tolerance, the smooth twin of the settling time, sum
+    over joints / scale.
 
         int sum_i w_i^2 sigmoid((|e1_i| - tolerance) / (0.1 tolerance)) dt / scale
 
@@ -498,13 +601,18 @@ def peak_torque(
     """
     function = "peak_torque"
     given = None if limit is None else _limit(function, "limit", limit, "140.0")
-    peak = _peak(function, "torque", 1.0 if given is None else given, joints, weights, smoothing=smoothing)
+    peak = _peak(
+        function, "torque", 1.0 if given is None else given, joints, weights, smoothing=smoothing
+    )
     scale = None if given is None else peak[1]
     return _soft(function, peak, scale, scale, sharpness)
 
 
-def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None) -> Objective:
-    """Soft penalty on coming nearer to a bound than a target, softplus(sharpness (1 - margin / target)) / sharpness.
+def margin(
+    target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
+) -> Objective:
+    """Soft penalty on coming nearer to a bound than a target, softplus(sharpness (1 - margin /
+    target)) / sharpness.
 
     Args:
       target: in rad, one number or one for each joint.
@@ -514,34 +622,48 @@ def margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, j
     return _soft_margin("margin", "deficit", target, sharpness, smoothing, joints)
 
 
-def velocity_margin(target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None) -> Objective:
-    """Soft penalty on velocities that come nearer to a bound than a target; as `margin`, in rad/s, for scenarios with `velocity_bounds`."""
+def velocity_margin(
+    target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
+) -> Objective:
+    """Soft penalty on velocities that come nearer to a bound than a target; as `margin`, in rad/s,
+    for scenarios with `velocity_bounds`.
+    """
     return _soft_margin("velocity_margin", "velocity_deficit", target, sharpness, smoothing, joints)
 
 
 def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
-    """Soft penalty on coming nearer to a region's wall than a target; as `margin`, in m, for scenarios with `regions`."""
+    """Soft penalty on coming nearer to a region's wall than a target; as `margin`, in m, for
+    scenarios with `regions`.
+    """
     return _soft_margin("region_margin", "region_deficit", target, sharpness, smoothing, None)
 
 
-def _soft_margin(function: str, signal: str, target: Any, sharpness: Any, smoothing: Any, joints: Any) -> Objective:
+def _soft_margin(
+    function: str, signal: str, target: Any, sharpness: Any, smoothing: Any, joints: Any
+) -> Objective:
     given = _limit(function, "target", target, "0.05")
     peak = _peak(function, signal, given, joints, None, smoothing=smoothing)
     return _soft(function, peak, peak[1], -peak[1], sharpness)
 
 
-def metric(fold: Fold, name: str, *, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
-    """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own, summed over the joints.
+def metric(
+    fold: Fold, name: str, *, joints: Any = None, weights: Any = None, scale: Any = None
+) -> Objective:
+    """A result of any metric, `metric(ij.metrics.Tracking(), "iae")` or of a fold of your own,
+    summed over the joints.
 
         sum_i w_i m_i / scale
 
-    It has to be differentiable: integrals, rms values and peaks are; a time at which something happens has no slope, and is infinite
-    where it does not happen (for the settling time there is `settle`).  `iblf_jax.testing.check_objective` looks at it.
+    It has to be differentiable: integrals, rms values and peaks are; a time at which something
+      happens has no slope, and is infinite
+    where it does not happen (for the settling time there is `settle`).
+    `iblf_jax.testing.check_objective` looks at it.
 
     Args:
       fold: the metric, such as `iblf_jax.metrics.Tracking()`.
       name: which of the fold's results; one of its `units`.
-      joints: which of its numbers count, where it has one for each joint: indices, names, a slice, or one truth value each.
+      joints: which of its numbers count, where it has one for each joint: indices, names, a slice,
+        or one truth value each.
       weights: w, one number or as many as the result, or the selection, has; 1 if not given.
       scale: in the result's unit; the value at the starting gains if not given.
 
@@ -549,7 +671,8 @@ def metric(fold: Fold, name: str, *, joints: Any = None, weights: Any = None, sc
       An `Objective`, to be weighted and added to others.
 
     Raises:
-      ValueError: something that is not a fold, a name that it does not return, a scale that is not positive.
+      ValueError: something that is not a fold, a name that it does not return, a scale that is not
+        positive.
 
     Source: design of this package.
     """
@@ -561,7 +684,9 @@ def metric(fold: Fold, name: str, *, joints: Any = None, weights: Any = None, sc
     return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)
 
 
-def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = None, weights: Any = None) -> Requirement:
+def error_below(
+    limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: Any = None, weights: Any = None
+) -> Requirement:
     """|e1| < limit on every joint from a time on: `error_below(0.01, after=1.0)`.
 
         w_i |e1_i(t)| < limit_i     for t >= after
@@ -570,16 +695,21 @@ def error_below(limit: Any, *, after: Any = 0.0, allowed: Any = 0.01, joints: An
       limit: in rad, one number or one for each joint (or for each selected joint).
       after: in s.
       allowed: share of perturbed runs that may break it.
-      joints: which joints count: indices, names, a slice, or one truth value each; all if not given.
+      joints: which joints count: indices, names, a slice, or one truth value each; all if not
+        given.
       weights: w, one number or one for each joint; 1 if not given.
     """
     given = _limit("error_below", "limit", limit, "0.01")
     peak = _peak("error_below", "error", given, joints, weights, after)
-    name = f"|e1|{_of_joints(peak[2])} < {_in_words(given, 'rad')}" + (f" after {after:g} s" if after else "")
+    name = f"|e1|{_of_joints(peak[2])} < {_in_words(given, 'rad')}" + (
+        f" after {after:g} s" if after else ""
+    )
     return _below("error_below", peak, allowed, name)
 
 
-def peak_torque_below(limit: Any, *, allowed: Any = 0.01, joints: Any = None, weights: Any = None) -> Requirement:
+def peak_torque_below(
+    limit: Any, *, allowed: Any = 0.01, joints: Any = None, weights: Any = None
+) -> Requirement:
     """Largest |tau| < limit [N m], one number or one for each joint; arguments as `error_below`."""
     given = _limit("peak_torque_below", "limit", limit, "140.0")
     peak = _peak("peak_torque_below", "torque", given, joints, weights)
@@ -588,21 +718,39 @@ def peak_torque_below(limit: Any, *, allowed: Any = 0.01, joints: Any = None, we
 
 
 def margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
-    """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `limit`, `allowed` and `joints` as `error_below`."""
+    """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `limit`, `allowed`
+    and `joints` as `error_below`.
+    """
     return _margin_above("margin_above", "deficit", "margin", limit, "rad", allowed, joints)
 
 
 def velocity_margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
-    """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with `velocity_bounds`; as `margin_above`."""
-    return _margin_above("velocity_margin_above", "velocity_deficit", "velocity margin", limit, "rad/s", allowed, joints)
+    """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with
+    `velocity_bounds`; as `margin_above`.
+    """
+    return _margin_above(
+        "velocity_margin_above",
+        "velocity_deficit",
+        "velocity margin",
+        limit,
+        "rad/s",
+        allowed,
+        joints,
+    )
 
 
 def region_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
-    """Minimum over time and regions of the distance to the wall > limit [m], for scenarios with `regions`; as `margin_above`."""
-    return _margin_above("region_margin_above", "region_deficit", "region margin", limit, "m", allowed, None)
+    """Minimum over time and regions of the distance to the wall > limit [m], for scenarios with
+    `regions`; as `margin_above`.
+    """
+    return _margin_above(
+        "region_margin_above", "region_deficit", "region margin", limit, "m", allowed, None
+    )
 
 
-def _margin_above(function: str, signal: str, words: str, limit: Any, unit: str, allowed: Any, joints: Any) -> Requirement:
+def _margin_above(
+    function: str, signal: str, words: str, limit: Any, unit: str, allowed: Any, joints: Any
+) -> Requirement:
     given = _limit(function, "limit", limit, "0.05")
     peak = _peak(function, signal, given, joints, None)
     name = f"{words}{_of_joints(peak[2])} > {_in_words(given, unit)}"
@@ -612,7 +760,8 @@ def _margin_above(function: str, signal: str, words: str, limit: Any, unit: str,
 def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:
     """The probability that a run leaves its bounds or runs away is below a limit.
 
-    In the loss: the margin of the worst `probability` share of the runs (at least of one) is driven above zero.
+    In the loss: the margin of the worst `probability` share of the runs (at least of one) is driven
+      above zero.
 
     Args:
       probability: the limit.
@@ -622,6 +771,15 @@ def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requi
     size = _number(function, "scale", scale, "positive")
     share = _number(function, "probability", probability, "nonnegative")
     if checks.is_concrete(share) and share > 1:
-        raise checks.fail(f"{function}: probability", probability, "a share of the runs, from 0 to 1")
-    made = Requirement(Peak(size, "deficit"), checks.as_floats("limit", 0.0), size, share, event="violated", function=function)
+        raise checks.fail(
+            f"{function}: probability", probability, "a share of the runs, from 0 to 1"
+        )
+    made = Requirement(
+        Peak(size, "deficit"),
+        checks.as_floats("limit", 0.0),
+        size,
+        share,
+        event="violated",
+        function=function,
+    )
     return dataclasses.replace(made, name=f"violation probability < {probability:g}")

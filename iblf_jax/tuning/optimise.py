@@ -1,24 +1,30 @@
-"""The loop of a tuning: steps of a method, multipliers, sharper and sharper peaks, the best so far, early stop, checkpoint and resume.
+"""The loop of a tuning: steps of a method, multipliers, sharper and sharper peaks, the best so far,
+early stop, checkpoint and resume.
 
-The default method (`newton`) takes the requirements as they are.  Methods that know one loss only (`penalised`) have them driven in by an
-augmented Lagrangian: whenever a start has converged (or after INNER steps),
+The default method (`newton`) takes the requirements as they are.  Methods that know one loss only
+(`penalised`) have them driven in by an augmented Lagrangian: whenever a start has converged (or
+  after INNER steps),
 
     lam <- max(0, lam + mu G),     mu <- 5 mu where the largest G has not fallen to a quarter,
 
-so a start that breaks them finds its way in while the penalty stays finite everywhere.  The best so far is the one with the lowest
-objective among those that keep the requirements and the bounds, or, while none does, the one that breaks them least, their G added up.
+so a start that breaks them finds its way in while the penalty stays finite everywhere.  The best so
+far is the one with the lowest objective among those that keep the requirements and the bounds, or,
+while none does, the one that breaks them least, their G added up.
 
-A peak in the objective is smoothed in the loss.  The smooth maximum lies above the maximum by smoothing times a logarithm, so its bottom is
-not where the maximum's is; but it is soon found, and narrow valleys are not in it.  So the loss is followed while it is made sharper: once
-all starts have converged at the tolerance ROUGH (or after INNER steps, HASTY where several are left to choose from), the smoothing is
-divided by SHARPER, the better half of the starts goes on and the others are given up.  What counts as the best is judged without
-smoothing throughout.
+A peak in the objective is smoothed in the loss.  The smooth maximum lies above the maximum by
+smoothing times a logarithm, so its bottom is not where the maximum's is; but it is soon found, and
+narrow valleys are not in it.  So the loss is followed while it is made sharper: once all starts
+have converged at the tolerance ROUGH (or after INNER steps, HASTY where several are left to choose
+from), the smoothing is divided by SHARPER, the better half of the starts goes on and the others are
+given up.  What counts as the best is judged without smoothing throughout.
 
-Under limits, a single start takes turns with a second one (`probes`): it is followed to the tolerance ROUGH, then, if that took no more
-than SOON values with derivatives, the second one, until LONG values are spent; then the better of them goes on to the end.
+Under limits, a single start takes turns with a second one (`probes`): it is followed to the
+tolerance ROUGH, then, if that took no more than SOON values with derivatives, the second one, until
+LONG values are spent; then the better of them goes on to the end.
 
-A checkpoint holds the whole state after each step, written to a temporary file that is then renamed.  A run that was killed goes on
-from there and gives the same numbers, bit by bit, as one that was not.
+A checkpoint holds the whole state after each step, written to a temporary file that is then
+renamed.  A run that was killed goes on from there and gives the same numbers, bit by bit, as one
+that was not.
 """
 
 from __future__ import annotations
@@ -39,18 +45,20 @@ from iblf_jax.tuning.objectives import is_smoothed, sharper
 from iblf_jax.tuning.problem import Formulation, Lane, ProblemInputs, Slope
 
 INNER = 12
-"""Steps at most between two updates of the multipliers, for methods that settle; others take this many."""
+"""Steps at most between two updates of the multipliers, for methods that settle; others take this
+many."""
 FIRST_MU = 10.0
 LARGEST_MU = 1e6
 OUTER = 12
 """Updates of the multipliers at most."""
 SHARPER = 4.0
 ROUGH, HASTY = 1e-3, 6
-"""Tolerance before the last sharpening, and steps at most of several starts without requirements: what is found there is a place to go on
-from, and good enough to choose by."""
+"""Tolerance before the last sharpening, and steps at most of several starts without requirements:
+what is found there is a place to go on from, and good enough to choose by."""
 
 SOON, LONG = 25, 40
-"""Values with derivatives of two searches that take turns: after how many at most the second begins, and with how many both end."""
+"""Values with derivatives of two searches that take turns: after how many at most the second
+begins, and with how many both end."""
 
 
 class CountedProblem:
@@ -66,14 +74,18 @@ class CountedProblem:
         """Which starts are evaluated; the others come back invalid."""
 
     def __call__(self, z: np.ndarray) -> Slope:
-        """Value and derivatives at z, (S, p), a group of needed starts at a time, so that all calls are of one compiled shape."""
+        """Value and derivatives at z, (S, p), a group of needed starts at a time, so that all calls
+        are of one compiled shape.
+        """
         wanted = np.flatnonzero(self.needed)
         self.evaluations += len(wanted)
         lanes = self.lanes._replace(z=np.asarray(z, self.shared.dt.dtype))
         parts = []
         for first in range(0, len(wanted), self.group):
             rows = np.resize(wanted[first : first + self.group], self.group)
-            found = self.derive(self.shared, jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], lanes))
+            found = self.derive(
+                self.shared, jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], lanes)
+            )
             parts.append(jax.tree.map(np.asarray, found))
         found = jax.tree.map(lambda *x: np.concatenate(x)[: len(wanted)], *parts)
         return found if len(wanted) == len(z) else _spread(found, wanted, len(z))
@@ -84,10 +96,14 @@ class CountedProblem:
 
 
 def _spread(found: Slope, rows: np.ndarray, starts: int) -> Slope:
-    """What was found for some starts, among all of them; the others are invalid, with losses that are infinite."""
+    """What was found for some starts, among all of them; the others are invalid, with losses that
+    are infinite.
+    """
 
     def placed(x: np.ndarray) -> np.ndarray:
-        whole = np.full((starts, *x.shape[1:]), np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
+        whole = np.full(
+            (starts, *x.shape[1:]), np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype
+        )
         whole[rows] = x
         return whole
 
@@ -110,13 +126,24 @@ class Derive:
         return hash((self.function, self.formulation))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Derive) and (self.function, self.formulation) == (other.function, other.formulation)
+        return isinstance(other, Derive) and (self.function, self.formulation) == (
+            other.function,
+            other.formulation,
+        )
 
 
 class Loop:
     """State of a tuning, all of it arrays in `state`; `run` goes on from wherever it is."""
 
-    def __init__(self, evaluator: CountedProblem, method: Any, z: np.ndarray, *, resample: bool = False, sharpenings: int = 0):
+    def __init__(
+        self,
+        evaluator: CountedProblem,
+        method: Any,
+        z: np.ndarray,
+        *,
+        resample: bool = False,
+        sharpenings: int = 0,
+    ):
         self.evaluator, self.method, self.resample = evaluator, method, resample
         self.smoothest, self.sharpenings = evaluator.shared.objective, sharpenings
         starts, count = len(z), len(evaluator.formulation.shares)
@@ -145,16 +172,21 @@ class Loop:
         self.penalised = method.penalised
         self.history: dict[str, list[np.ndarray]] = {}
         self.second: Callable[[np.ndarray], np.ndarray | None] | None = None
-        """Called where the first start began and ended, (2, p); where the second begins, or None."""
+        """Called where the first start began and ended, (2, p); where the second begins, or
+        None."""
 
     def take_turns(self, second: Callable[[np.ndarray], np.ndarray | None]) -> None:
-        """Of two starts, the second waits until the first has arrived, and begins where `second` says."""
+        """Of two starts, the second waits until the first has arrived, and begins where `second`
+        says.
+        """
         self.second = second
         self.sharpenings = max(self.sharpenings, 1)
         self.state["waiting"][1] = self.state["finished"][1] = True
         self.method.retire(self.state["method"], 1)
 
-    def run(self, iterations: int, *, tolerance: float, patience: int, on_step: Callable[[Loop], None]) -> str:
+    def run(
+        self, iterations: int, *, tolerance: float, patience: int, on_step: Callable[[Loop], None]
+    ) -> str:
         """Steps until done; returns why it stopped."""
         state = self.state
         while int(state["iteration"]) < iterations:
@@ -174,7 +206,9 @@ class Loop:
     @property
     def best(self) -> int:
         """The start that found the best so far."""
-        return min(range(len(self.state["best_key"])), key=lambda s: tuple(self.state["best_key"][s]))
+        return min(
+            range(len(self.state["best_key"])), key=lambda s: tuple(self.state["best_key"][s])
+        )
 
     def _enter(self, tolerance: float) -> None:
         """Makes loss and tolerance those of the stage that the state says."""
@@ -182,7 +216,9 @@ class Loop:
         if self.sharpenings:
             objective = sharper(self.smoothest, SHARPER**-stage)
             self.evaluator.shared = self.evaluator.shared._replace(objective=objective)
-            self.method.tolerance = tolerance if stage == self.sharpenings else max(tolerance, ROUGH)
+            self.method.tolerance = (
+                tolerance if stage == self.sharpenings else max(tolerance, ROUGH)
+            )
 
     def _sharpen(self) -> None:
         """On to a sharper loss, with the better half of the starts that are left."""
@@ -199,14 +235,24 @@ class Loop:
         for s in order[-(-len(order) // 2) :]:
             state["finished"][s] = state["retired"][s] = True
             self.method.retire(state["method"], s)
-        state["stage"], state["stage_steps"], state["stale"] = state["stage"] + 1, np.asarray(0), np.asarray(0)
+        state["stage"], state["stage_steps"], state["stale"] = (
+            state["stage"] + 1,
+            np.asarray(0),
+            np.asarray(0),
+        )
 
     def _step(self, tolerance: float) -> None:
         state, evaluator = self.state, self.evaluator
         index = evaluator.lanes.index
         if self.resample:
-            index = np.broadcast_to(np.arange(self.runs, dtype=np.uint32) + np.uint32(self.runs * int(state["iteration"])), index.shape)
-        evaluator.lanes = evaluator.lanes._replace(lam=state["lam"].copy(), mu=state["mu"].copy(), index=index)
+            index = np.broadcast_to(
+                np.arange(self.runs, dtype=np.uint32)
+                + np.uint32(self.runs * int(state["iteration"])),
+                index.shape,
+            )
+        evaluator.lanes = evaluator.lanes._replace(
+            lam=state["lam"].copy(), mu=state["mu"].copy(), index=index
+        )
         before, evaluator.needed = evaluator.evaluations, ~state["finished"]
         z, found = self.method.step(evaluator, state["method"])
         state["evaluations"] = state["evaluations"] + (evaluator.evaluations - before)
@@ -220,13 +266,19 @@ class Loop:
         state["iteration"], state["stage_steps"] = state["iteration"] + 1, state["stage_steps"] + 1
 
     def _turn(self, second: Callable[[np.ndarray], np.ndarray | None]) -> None:
-        """Lets the second start begin where the first has soon arrived, and ends it where it takes long."""
+        """Lets the second start begin where the first has soon arrived, and ends it where it takes
+        long.
+        """
         state = self.state
         if state["waiting"][1]:
             if not state["finished"][0]:
                 return
             state["waiting"][1] = False
-            begins = second(np.stack([self.history["z"][0][0], state["method"]["z"][0]])) if state["evaluations"] <= SOON else None
+            begins = (
+                second(np.stack([self.history["z"][0][0], state["method"]["z"][0]]))
+                if state["evaluations"] <= SOON
+                else None
+            )
             if begins is not None:
                 self.method.begin(state["method"], 1, begins)
                 state["finished"][1], state["since"][1], state["stale"] = False, 0, np.asarray(0)
@@ -239,7 +291,9 @@ class Loop:
             if not found.value.valid[s]:
                 continue
             excess = found.value.exact_excess[s]
-            broken = float(np.sum(np.maximum(excess, 0.0))) + max(-float(found.value.margin[s]), 0.0)
+            broken = float(np.sum(np.maximum(excess, 0.0))) + max(
+                -float(found.value.margin[s]), 0.0
+            )
             key = (broken, float(found.value.objective[s]))
             old = state["best_key"][s]
             if not np.isfinite(key[1]) or key >= tuple(old):
@@ -328,7 +382,9 @@ def load_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
         with np.load(place) as file:
             arrays = {name: file[name] for name in file.files}
     except Exception as error:  # torn, another kind of file, or one that only looks like a zip
-        remedy = f"It cannot be read ({type(error).__name__}: {error}): delete it or name another file."
+        remedy = (
+            f"It cannot be read ({type(error).__name__}: {error}): delete it or name another file."
+        )
         raise checks.fail("checkpoint", str(path), "a checkpoint of tune", remedy) from error
     if str(arrays.get("fingerprint")) != mark:
         raise checks.fail(
@@ -340,6 +396,11 @@ def load_checkpoint(path: str | os.PathLike, loop: Loop, mark: str) -> None:
     leaves, structure = jax.tree.flatten(loop.state)
     found = [np.array(arrays[name]) for name in sorted(arrays) if name.startswith("state_")]
     if [(x.shape, x.dtype) for x in found] != [(np.shape(x), np.asarray(x).dtype) for x in leaves]:
-        raise checks.fail("checkpoint", str(path), "a whole checkpoint", "Something is missing in it: delete it or name another file.")
+        raise checks.fail(
+            "checkpoint",
+            str(path),
+            "a whole checkpoint",
+            "Something is missing in it: delete it or name another file.",
+        )
     loop.state = jax.tree.unflatten(structure, found)
     loop.history = {name[8:]: list(x) for name, x in arrays.items() if name.startswith("history_")}

@@ -1,10 +1,12 @@
 """Which leaves are tuned, within which limits, and in which coordinates.
 
-A tuned number x lives in a coordinate z in which the loss is better shaped: z = log x for a gain that is positive, z = x
-otherwise.  Limits on x are limits on z; the "newton" method keeps to them as a box.  The methods of optax know no limits, so they
-work on a free w that is squashed into the box,
+A tuned number x lives in a coordinate z in which the loss is better shaped: z = log x for a gain
+that is positive, z = x otherwise.  Limits on x are limits on z; the "newton" method keeps to them
+as a box.  The methods of optax know no limits, so they work on a free w that is squashed into the
+box,
 
-    z = z_low + (z_high - z_low) sigmoid(w)      both limits,      z = z_low + softplus(w)   or   z_high - softplus(w)      one.
+    z = z_low + (z_high - z_low) sigmoid(w)      both limits,      z = z_low + softplus(w)   or
+    z_high - softplus(w)      one.
 
 Default limits are those of `ranges`.
 """
@@ -70,14 +72,17 @@ def _own_limit(path: str, side: str, value: Any) -> jax.Array | None:
     return limit
 
 
-def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False, scale: str | None = None) -> Tunable:
+def tunable(
+    path: str, low: Any = None, high: Any = None, *, tied: bool = False, scale: str | None = None
+) -> Tunable:
     """A leaf to tune, with limits of one's own.
 
         z = log x ("log") or z = x ("linear"),   low <= x <= high
 
     Args:
       path: of the leaf or entry, such as "controller.K2" or "controller.K2[0]".
-      low, high: limits in the leaf's unit, one number or one an entry; the default ones if not given.
+      low, high: limits in the leaf's unit, one number or one an entry; the default ones if not
+        given.
       tied: one number for all joints rather than one each.
       scale: "log" or "linear"; "log" for leaves that are positive, if not given.
 
@@ -99,7 +104,9 @@ def tunable(path: str, low: Any = None, high: Any = None, *, tied: bool = False,
         except (TypeError, ValueError):  # shapes that do not fit each other
             below = False
         if not below:
-            raise checks.fail(f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them.")
+            raise checks.fail(
+                f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them."
+            )
     return Tunable(path, low, high, checks.flag("tunable: tied", tied), scale)
 
 
@@ -114,7 +121,9 @@ def _as_tunable(place: int, given: Any) -> Tunable:
     return Tunable(given)
 
 
-def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple[tuple[Block, ...], Box]:
+def layout(
+    scenario: Scenario, parameters: Any, dt: float, method: str
+) -> tuple[tuple[Block, ...], Box]:
     """The coordinates of a list of parameters: blocks, and the box with the start in it.
 
     Args:
@@ -123,19 +132,31 @@ def layout(scenario: Scenario, parameters: Any, dt: float, method: str) -> tuple
       dt, method: of the runs, for the default upper limits (`ranges`).
 
     Raises:
-      ValueError: an unknown or overlapping path, limits that exclude the start or are not admissible.
+      ValueError: an unknown or overlapping path, limits that exclude the start or are not
+        admissible.
     """
     given = checks.listed("parameters", parameters, '["controller.k1", "controller.K2"]')
     wanted = [_as_tunable(i, x) for i, x in enumerate(given)]
     check_paths(scenario, [x.path for x in wanted], "parameters")
     starts = [_start_of(scenario, item) for item in wanted]
-    open_ended = {item.path: value for item, (value, _, _) in zip(wanted, starts, strict=True) if item.high is None}
+    open_ended = {
+        item.path: value
+        for item, (value, _, _) in zip(wanted, starts, strict=True)
+        if item.high is None
+    }
     highs = default_highs(scenario, open_ended, dt, method)
     blocks, parts, reasons, start = [], [], [], 0
     for item, (value, log, sign) in zip(wanted, starts, strict=True):
         low, below = default_low(item.path, sign, value) if item.low is None else (item.low, GIVEN)
         high, above = highs.get(item.path, (item.high, GIVEN))
-        block, part = _one(item, value, _limit(item, "low", low, value), _limit(item, "high", high, value), start, log)
+        block, part = _one(
+            item,
+            value,
+            _limit(item, "low", low, value),
+            _limit(item, "high", high, value),
+            start,
+            log,
+        )
         blocks.append(block)
         parts.append(part)
         reasons += [(below, above)] * block.size
@@ -150,17 +171,24 @@ def _start_of(scenario: Scenario, item: Tunable) -> tuple[np.ndarray, bool, str 
     sign = paths.sign_at(scenario, item.path)
     log = item.scale == "log" if item.scale else sign == "positive"
     if log and not np.all(value > 0):
-        raise checks.fail(item.path, value, "values > 0 for a logarithmic scale", 'Use scale="linear".')
+        raise checks.fail(
+            item.path, value, "values > 0 for a logarithmic scale", 'Use scale="linear".'
+        )
     if item.tied and not np.all(value == value.flat[0]):
         value = np.full_like(value, np.exp(np.mean(np.log(value))) if log else np.mean(value))
     return value, log, sign
 
 
-def _one(item: Tunable, value: np.ndarray, low: np.ndarray, high: np.ndarray, start: int, log: bool) -> tuple[Block, tuple]:
+def _one(
+    item: Tunable, value: np.ndarray, low: np.ndarray, high: np.ndarray, start: int, log: bool
+) -> tuple[Block, tuple]:
     size = 1 if item.tied else value.size
     if not np.all(low < high) or not np.all((low <= value) & (value <= high)):
         raise checks.fail(
-            f"tunable({item.path!r})", value, f"a start between its limits {low.tolist()} and {high.tolist()}", "Widen the limits."
+            f"tunable({item.path!r})",
+            value,
+            f"a start between its limits {low.tolist()} and {high.tolist()}",
+            "Widen the limits.",
         )
     block = Block(item.path, value.shape, start, size, log)
     return block, tuple(_coordinate(x.reshape(-1)[:size], log) for x in (value, low, high))
@@ -187,7 +215,9 @@ def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
     for block in blocks:
         part = z[block.start : block.start + block.size]
         part = jnp.exp(part) if block.log else part
-        values[block.path] = jnp.broadcast_to(part[0], block.shape) if block.size == 1 else part.reshape(block.shape)
+        values[block.path] = (
+            jnp.broadcast_to(part[0], block.shape) if block.size == 1 else part.reshape(block.shape)
+        )
     return values
 
 
@@ -198,7 +228,9 @@ def in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
 
 
 def names_of(blocks: tuple[Block, ...]) -> list[str]:
-    """What each coordinate is called: "controller.K2[0]", or the path alone if it is tied or has one entry."""
+    """What each coordinate is called: "controller.K2[0]", or the path alone if it is tied or has
+    one entry.
+    """
     names = []
     for block in blocks:
         indices = list(np.ndindex(block.shape)) if block.size > 1 else [()]
@@ -212,7 +244,9 @@ def squash(w: jax.Array, box: Box) -> jax.Array:
     below, above = jnp.isfinite(low), jnp.isfinite(high)
     low_, high_ = jnp.where(below, low, 0.0), jnp.where(above, high, 0.0)
     both = low_ + (high_ - low_) * jax.nn.sigmoid(w)
-    one = jnp.where(below, low_ + jax.nn.softplus(w), jnp.where(above, high_ - jax.nn.softplus(w), w))
+    one = jnp.where(
+        below, low_ + jax.nn.softplus(w), jnp.where(above, high_ - jax.nn.softplus(w), w)
+    )
     return jnp.where(below & above, both, one)
 
 

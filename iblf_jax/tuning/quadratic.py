@@ -1,11 +1,14 @@
-"""A small convex quadratic programme, by a primal-dual interior-point method: exact enough for multipliers that are reported.
+"""A small convex quadratic programme, by a primal-dual interior-point method: exact enough for
+multipliers that are reported.
 
     minimise  c.x + x.H.x / 2   subject to  A x <= b,      H positive semidefinite
 
-With slacks s and multipliers y the conditions H x + c + A^T y = 0, A x + s = b, y_i s_i = 0 are followed by Newton's method, first
-towards y s = 0 (predictor), then towards a common y_i s_i that depends on how far the predictor came (corrector).
+With slacks s and multipliers y the conditions H x + c + A^T y = 0, A x + s = b, y_i s_i = 0 are
+followed by Newton's method, first towards y s = 0 (predictor), then towards a common y_i s_i that
+depends on how far the predictor came (corrector).
 
-Source: S. Mehrotra, SIAM J. Optim. 2 (1992) 575-601; J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., algorithm 16.4.
+Source: S. Mehrotra, SIAM J. Optim. 2 (1992) 575-601; J. Nocedal, S. J. Wright, Numerical
+  Optimization, 2nd ed., algorithm 16.4.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ PRECISION = 1e-11
 """Of all conditions, relative to the numbers of the programme."""
 
 
-def solve(H: np.ndarray, c: np.ndarray, A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve(
+    H: np.ndarray, c: np.ndarray, A: np.ndarray, b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The x (n,) of the programme, and the multipliers (m,) of its rows.
 
     Args:
@@ -34,7 +39,11 @@ def solve(H: np.ndarray, c: np.ndarray, A: np.ndarray, b: np.ndarray) -> tuple[n
     limit = PRECISION * (1.0 + float(np.max(np.abs(b))))
     for _ in range(MOST):
         dual, primal, gap = H @ x + c + A.T @ y, A @ x + s - b, max(float(s @ y) / len(b), 1e-300)
-        if gap < PRECISION and np.max(np.abs(dual)) < PRECISION * 10 and np.max(np.abs(primal)) < limit:
+        if (
+            gap < PRECISION
+            and np.max(np.abs(dual)) < PRECISION * 10
+            and np.max(np.abs(primal)) < limit
+        ):
             break
         try:
             factor = cho_factor(H + (A.T * (y / s)) @ A)

@@ -1,20 +1,25 @@
-"""What objectives and requirements are made of: smooth numbers of a run, each a fold over its samples.
+"""What objectives and requirements are made of: smooth numbers of a run, each a fold over its
+samples.
 
 Two kinds cover what gains are tuned for, over a signal y(t), a vector:
 
-    TimeIntegral   int |y|^2 dt = sum_k dt_k |y(t_k)|^2, by the weights of the samples (`Sample.dt`: the trapezoidal rule)
-    Peak           max_j p_j,   p_j the largest y_i(t_k) of one entry i of the signal within one window of time
+    TimeIntegral   int |y|^2 dt = sum_k dt_k |y(t_k)|^2, by the weights of the samples (`Sample.dt`:
+    the trapezoidal rule) Peak           max_j p_j,   p_j the largest y_i(t_k) of one entry i of the
+    signal within one window of time
 
-The pieces p_j are smooth where their maximum is not: a requirement on a peak is one on each of its pieces.  In a term of the objective
+The pieces p_j are smooth where their maximum is not: a requirement on a peak is one on each of its
+  pieces.  In a term of the objective
 the maximum is T log sum_j exp(p_j / T), which is smooth and never below it.
 
-Both also give the matrix of their second derivatives without the second derivatives of the motion (Gauss-Newton), from the tangents
-y_u of their signal (`derivatives.Outer`) or p_ju of their pieces:
+Both also give the matrix of their second derivatives without the second derivatives of the motion
+(Gauss-Newton), from the tangents y_u of their signal (`derivatives.Outer`) or p_ju of their pieces:
 
-    TimeIntegral   2 sum dt y_u . y_v         Peak   (sum_j w_j p_ju p_jv - mean_u mean_v) / T,  w the weights of the smooth maximum
+    TimeIntegral   2 sum dt y_u . y_v         Peak   (sum_j w_j p_ju p_jv - mean_u mean_v) / T,  w
+    the weights of the smooth maximum
 
-`MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`, `finish`; for second-order methods
-`hessian`, and `curvature` if that is made of tangents along the way; `iblf_jax.testing.check_objective` looks at it.
+`MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`,
+`finish`; for second-order methods `hessian`, and `curvature` if that is made of tangents along the
+way; `iblf_jax.testing.check_objective` looks at it.
 """
 
 from __future__ import annotations
@@ -50,12 +55,15 @@ class Quantity(Protocol):
         ...
 
     def finish(self, acc: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The smooth value and the exact one (the report's), () each, and the pieces of which the exact one is the largest, (m,)."""
+        """The smooth value and the exact one (the report's), () each, and the pieces of which the
+        exact one is the largest, (m,).
+        """
         ...
 
 
 DEFICITS = {"deficit": "rad", "velocity_deficit": "rad/s", "region_deficit": "m"}
-"""Signals of which the largest is minus a margin -> unit: they have a sign, so their size does not count."""
+"""Signals of which the largest is minus a margin -> unit: they have a sign, so their size does not
+count."""
 OF_LIMIT = "of the limit"
 """Unit of a peak that is measured in limits, one for each joint."""
 TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1"} | DEFICITS
@@ -73,7 +81,8 @@ def chosen_of(values: jax.Array, joints: Selection, field: str) -> jax.Array:
 
 
 def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax.Array:
-    """The weights of the selected joints, () or (k,), from one number, one for each joint, or one for each selected joint.
+    """The weights of the selected joints, () or (k,), from one number, one for each joint, or one
+    for each selected joint.
 
     Raises:
       ValueError: another number of weights.
@@ -89,20 +98,27 @@ def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax
 
 
 def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
-    """Raises ValueError for a selection that is not normalised, or weights that are no list of numbers."""
-    if joints is not None and (not isinstance(joints, tuple) or selection(f"{owner}.joints", joints) != joints):
+    """Raises ValueError for a selection that is not normalised, or weights that are no list of
+    numbers.
+    """
+    if joints is not None and (
+        not isinstance(joints, tuple) or selection(f"{owner}.joints", joints) != joints
+    ):
         raise checks.fail(f"{owner}.joints", joints, "a tuple of indices, names or truth values")
     if jnp.ndim(weights) > 1:
         raise checks.fail(f"{owner}.weights", weights, "one number, or one for each joint")
 
 
-def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any, joints: Selection = None) -> jax.Array:
+def signal_of(
+    name: str, sample: Sample, last: jax.Array, tolerance: Any, joints: Selection = None
+) -> jax.Array:
     """A signal of the selected joints at one sample, (k,), (2 k,) or one number a region.
 
-    error e1; torque tau; torque_rate (tau - last tau) / step, the mean over the step before an instant, jumps of the torque included;
-    outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE tolerance))), whose integral of squares is the time outside the tolerance;
-    deficit (lower - q, q - upper), the largest of which is minus the margin;
-    velocity_deficit the same of the velocities; region_deficit minus the distances to the walls of the regions.
+    error e1; torque tau; torque_rate (tau - last tau) / step, the mean over the step before an
+    instant, jumps of the torque included; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE
+    tolerance))), whose integral of squares is the time outside the tolerance; deficit (lower - q, q
+    - upper), the largest of which is minus the margin; velocity_deficit the same of the velocities;
+      region_deficit minus the distances to the walls of the regions.
     """
 
     def of_joints(values: jax.Array) -> jax.Array:
@@ -114,7 +130,9 @@ def signal_of(name: str, sample: Sample, last: jax.Array, tolerance: Any, joints
         return of_joints(sample.tau)
     if name == "torque_rate":
         change = of_joints(sample.tau - last)
-        return jnp.where(sample.step > 0, change / jnp.where(sample.step > 0, sample.step, 1.0), 0.0)
+        return jnp.where(
+            sample.step > 0, change / jnp.where(sample.step > 0, sample.step, 1.0), 0.0
+        )
     if name == "outside":
         e1 = of_joints(sample.e1)
         size = jnp.where(e1 >= 0, e1, -e1)
@@ -141,7 +159,8 @@ class TimeIntegral:
       weights: w, () or (n,), or one for each selected joint [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       tolerance: for "outside", on |e1|, () [rad], > 0; none if not given.
-      joints: which ones count, a tuple of indices, names or truth values (`core.joints`); None, all, if not given.
+      joints: which ones count, a tuple of indices, names or truth values (`core.joints`); None,
+        all, if not given.
     """
 
     signal: str = static(default="error")
@@ -149,7 +168,12 @@ class TimeIntegral:
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
     tolerance: jax.Array | None = leaf("rad", sign="positive", shape="scalar", default=None)
     joints: tuple | None = static(default=None)
-    units: ClassVar[dict[str, str]] = {"error": "rad^2 s", "torque": "N^2 m^2 s", "torque_rate": "N^2 m^2/s", "outside": "s"}
+    units: ClassVar[dict[str, str]] = {
+        "error": "rad^2 s",
+        "torque": "N^2 m^2 s",
+        "torque_rate": "N^2 m^2/s",
+        "outside": "s",
+    }
 
     def check(self) -> None:
         """Raises ValueError for an unknown signal, or a selection that is none."""
@@ -165,10 +189,13 @@ class TimeIntegral:
         """Weight of a sample, () [s]."""
         if self.signal == "torque_rate":
             return sample.step  # the difference quotient holds for all of the step before
-        # Half of the time since the sample before is in the weight.  Where counting begins within that time, what is left of it counts.
+        # Half of the time since the sample before is in the weight.  Where counting begins within
+        # that time, what is left of it counts.
         before = acc[2]
         left = jnp.maximum(sample.t - self.after, 0.0)
-        return jnp.where(before < self.after, sample.dt - 0.5 * (sample.t - before) + left, sample.dt)
+        return jnp.where(
+            before < self.after, sample.dt - 0.5 * (sample.t - before) + left, sample.dt
+        )
 
     def init(self, sample: Sample):
         """Zero; the first torque has no predecessor but itself."""
@@ -195,21 +222,26 @@ class TimeIntegral:
 
 @component
 class Peak:
-    """max over time and joints of w_i y_i (of its size for error and torque), over the samples with t >= after.
+    """max over time and joints of w_i y_i (of its size for error and torque), over the samples with
+    t >= after.
 
-    Its pieces are the maxima of each entry of the signal within each window of time.  In a term of the objective it is
-    T log sum exp(piece / T) with T = smoothing scale: above the maximum by at most T times the logarithm of the number of pieces that come
-    within T of it.
+    Its pieces are the maxima of each entry of the signal within each window of time.  In a term of
+    the objective it is T log sum exp(piece / T) with T = smoothing scale: above the maximum by at
+    most T times the logarithm of the number of pieces that come within T of it.
 
     Args:
       scale: the size of y that matters, () in its unit, > 0.
-      signal: "error", "torque", "torque_rate", "deficit", "velocity_deficit" or "region_deficit"; "torque" if not given.
+      signal: "error", "torque", "torque_rate", "deficit", "velocity_deficit" or "region_deficit";
+        "torque" if not given.
       weights: w, () or (n,), or one for each selected joint [1]; 1 if not given.
       after: count from this time on, () [s]; 0 if not given.
       smoothing: T as a part of the scale, () [1], > 0; 0.01 if not given.
-      windows: when each window of time after the first begins, (W,) [s]; one window if not given.  `tune` sets them.
-      joints: which ones count, a tuple of indices, names or truth values (`core.joints`); None, all, if not given.
-      relative: whether the weights are 1 / limit of each joint, so that the peak is a number of limits; False if not given.
+      windows: when each window of time after the first begins, (W,) [s]; one window if not given.
+        `tune` sets them.
+      joints: which ones count, a tuple of indices, names or truth values (`core.joints`); None,
+        all, if not given.
+      relative: whether the weights are 1 / limit of each joint, so that the peak is a number of
+        limits; False if not given.
     """
 
     scale: jax.Array = leaf("", sign="positive", shape="scalar")
@@ -220,7 +252,9 @@ class Peak:
     windows: jax.Array | None = leaf("s", shape="any", default=None)
     joints: tuple | None = static(default=None)
     relative: bool = static(default=False)
-    units: ClassVar[dict[str, str]] = {name: unit for name, unit in TUNED_SIGNALS.items() if name != "outside"}
+    units: ClassVar[dict[str, str]] = {
+        name: unit for name, unit in TUNED_SIGNALS.items() if name != "outside"
+    }
 
     @property
     def needs(self) -> str | None:
@@ -232,7 +266,12 @@ class Peak:
         checks.one_of("Peak.signal", self.signal, tuple(self.units))
         _check_choice("Peak", self.joints, self.weights)
         if self.signal == "region_deficit" and self.joints is not None:
-            raise checks.fail("Peak.joints", self.joints, "None for regions", "A region does not belong to a joint.")
+            raise checks.fail(
+                "Peak.joints",
+                self.joints,
+                "None for regions",
+                "A region does not belong to a joint.",
+            )
 
     @property
     def unit(self) -> str:
@@ -252,7 +291,9 @@ class Peak:
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
 
     def init(self, sample: Sample):
-        """Below everything, (W, 2 k) for k joints, or (W, m) for m regions; the first torque has no predecessor but itself."""
+        """Below everything, (W, 2 k) for k joints, or (W, m) for m regions; the first torque has no
+        predecessor but itself.
+        """
         count = 1 if self.windows is None else 1 + self.windows.size
         return jnp.full((count, self._entries(sample)), -FAR, sample.t.dtype), sample.tau
 
@@ -308,7 +349,12 @@ class MetricResult:
 
     def check(self) -> None:
         """Raises ValueError for something that is not a fold, or a name that it does not return."""
-        checks.conforms("MetricResult.fold", self.fold, Fold, "iblf_jax.metrics has them; iblf_jax.testing.check_fold looks at your own.")
+        checks.conforms(
+            "MetricResult.fold",
+            self.fold,
+            Fold,
+            "iblf_jax.metrics has them; iblf_jax.testing.check_fold looks at your own.",
+        )
         checks.one_of("MetricResult.name", self.name, tuple(self.fold.units))
         if self.joints is not None:
             _check_choice("MetricResult", self.joints, 1.0)
@@ -330,21 +376,37 @@ class MetricResult:
         """The weighted sum, three times."""
         found = self.fold.finish(acc)[self.name]
         if not jnp.issubdtype(found.dtype, jnp.floating):
-            raise checks.fail("MetricResult.name", self.name, "a result that can be differentiated", f"This one is {found.dtype}.")
+            raise checks.fail(
+                "MetricResult.name",
+                self.name,
+                "a result that can be differentiated",
+                f"This one is {found.dtype}.",
+            )
         value = jnp.sum(self._weights(found.shape) * self._chosen(found))
         return value, value, value[None]
 
     def _chosen(self, found: jax.Array) -> jax.Array:
         if self.joints is not None and found.ndim != 1:
             expected = f"None, as {self.name!r} is not one number a joint"
-            raise checks.fail("MetricResult.joints", self.joints, expected, f"Its shape is {found.shape}.")
+            raise checks.fail(
+                "MetricResult.joints", self.joints, expected, f"Its shape is {found.shape}."
+            )
         return chosen_of(found, self.joints, "MetricResult.joints")
 
     def _weights(self, shape: tuple[int, ...]) -> jax.Array:
         if self.joints is None and jnp.shape(self.weights) not in ((), shape):
             expected = f"one number, or shape {shape} as {self.name!r} has"
-            raise checks.fail("MetricResult.weights", self.weights, expected, f"Its shape is {jnp.shape(self.weights)}.")
-        return self.weights if self.joints is None else weights_of(self.weights, self.joints, shape[0], "MetricResult.weights")
+            raise checks.fail(
+                "MetricResult.weights",
+                self.weights,
+                expected,
+                f"Its shape is {jnp.shape(self.weights)}.",
+            )
+        return (
+            self.weights
+            if self.joints is None
+            else weights_of(self.weights, self.joints, shape[0], "MetricResult.weights")
+        )
 
 
 MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult}
@@ -376,22 +438,40 @@ class Quantities:
         return tuple(part.update(a, sample) for part, a in zip(self.parts, acc, strict=True))
 
     def finish(self, acc) -> dict[str, jax.Array]:
-        """Smooth values and exact values, (K,) each, and the pieces of all, one quantity after the other."""
+        """Smooth values and exact values, (K,) each, and the pieces of all, one quantity after the
+        other.
+        """
         found = [part.finish(a) for part, a in zip(self.parts, acc, strict=True)]
         smooth, exact, pieces = zip(*found, strict=True)
-        return {"tuning_smooth": jnp.stack(smooth), "tuning_exact": jnp.stack(exact), "tuning_pieces": jnp.concatenate(pieces)}
+        return {
+            "tuning_smooth": jnp.stack(smooth),
+            "tuning_exact": jnp.stack(exact),
+            "tuning_pieces": jnp.concatenate(pieces),
+        }
 
     def counts(self, sample: Sample) -> tuple[int, ...]:
         """How many pieces each quantity has, for samples such as this one; shapes are enough."""
-        return tuple(jax.eval_shape(lambda s, part=part: part.finish(part.init(s))[2], sample).size for part in self.parts)
+        return tuple(
+            jax.eval_shape(lambda s, part=part: part.finish(part.init(s))[2], sample).size
+            for part in self.parts
+        )
 
     def curvature(self, acc, sample: Sample) -> tuple[Outer, ...]:
         """One `Outer` for each quantity that offers one."""
-        return tuple(part.curvature(a, sample) for part, a in zip(self.parts, acc, strict=True) if hasattr(part, "curvature"))
+        return tuple(
+            part.curvature(a, sample)
+            for part, a in zip(self.parts, acc, strict=True)
+            if hasattr(part, "curvature")
+        )
 
-    def hessians(self, products: Sequence[jax.Array], pieces: Sequence[jax.Array], slopes: Sequence[jax.Array]) -> jax.Array:
-        """Gauss-Newton matrix of each quantity, (K, D, D), from the products (D, D) of those that have a `curvature`, its pieces (m,) and
-        their slopes (D, m); zero where it offers none.
+    def hessians(
+        self,
+        products: Sequence[jax.Array],
+        pieces: Sequence[jax.Array],
+        slopes: Sequence[jax.Array],
+    ) -> jax.Array:
+        """Gauss-Newton matrix of each quantity, (K, D, D), from the products (D, D) of those that
+        have a `curvature`, its pieces (m,) and their slopes (D, m); zero where it offers none.
         """
         left, none = iter(products), jnp.zeros((slopes[0].shape[0],) * 2, slopes[0].dtype)
         found = []

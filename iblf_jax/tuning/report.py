@@ -1,15 +1,18 @@
-"""The verdict on a tuning: before and after, on runs that it never saw; on the one nominal run where nothing is perturbed.
+"""The verdict on a tuning: before and after, on runs that it never saw; on the one nominal run
+where nothing is perturbed.
 
-Torque, and gains at the end of their range, are in it whatever the objective asked for: what tracks best without a price on torque asks
-for more than any actuator has.
+Torque, and gains at the end of their range, are in it whatever the objective asked for: what tracks
+best without a price on torque asks for more than any actuator has.
 
-Both gains are run on the same fresh draws, so that the change of every number is a mean of paired differences D_i with the interval
+Both gains are run on the same fresh draws, so that the change of every number is a mean of paired
+differences D_i with the interval
 
     mean(D) +- z std(D) / sqrt(N)
 
-(for CVaR, D_i is the difference of the influence functions v + max(L_i - v, 0) / (1 - level), v the quantile).  A change is called
-significant if that interval excludes zero, and not otherwise, in words.  A requirement is kept with probability: it passes if the
-upper Clopper-Pearson limit of its breaking is within what is allowed, fails if the lower one is beyond, and is undecided between.
+(for CVaR, D_i is the difference of the influence functions v + max(L_i - v, 0) / (1 - level), v the
+quantile).  A change is called significant if that interval excludes zero, and not otherwise, in
+words.  A requirement is kept with probability: it passes if the upper Clopper-Pearson limit of its
+  breaking is within what is allowed, fails if the lower one is beyond, and is undecided between.
 """
 
 from __future__ import annotations
@@ -53,7 +56,9 @@ class Change:
     @property
     def significant(self) -> bool | None:
         """Whether the interval excludes zero; None for a single run."""
-        return None if self.low is None or self.high is None else bool(self.low > 0 or self.high < 0)
+        return (
+            None if self.low is None or self.high is None else bool(self.low > 0 or self.high < 0)
+        )
 
     def __str__(self) -> str:
         part = f" ({(self.after / self.before - 1) * 100:+.1f} %)" if self.before else ""
@@ -76,11 +81,13 @@ class Verdict:
     verdict: str
     """"pass", "fail" or "undecided"."""
     value: float = float("nan")
-    """What is limited, after: the mean over the worst allowed share of the runs; a margin as a margin."""
+    """What is limited, after: the mean over the worst allowed share of the runs; a margin as a
+    margin."""
     limit: float = float("nan")
     unit: str = ""
     price: float | None = None
-    """By how much the objective of the tuning would fall if the limit were loosened by one unit; None where that is not known."""
+    """By how much the objective of the tuning would fall if the limit were loosened by one unit;
+    None where that is not known."""
 
     def __str__(self) -> str:
         text = self._verdict()
@@ -98,21 +105,38 @@ class Verdict:
         return f"{text}, {abs(away):.3g} {self.unit} {'above' if away > 0 else 'below'} the limit"
 
     def _of_limits(self) -> str:
-        """Where each joint has a limit of its own, the value is that of the worst joint, in limits."""
+        """Where each joint has a limit of its own, the value is that of the worst joint, in
+        limits.
+        """
         return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
 
     def _price_in_words(self, price: float) -> str:
         if self.unit == OF_LIMIT:
-            return f"; the objective would fall by {price / 100:.3g} for each percent that the limits are loosened by"
-        return f"; the objective would fall by {price:.3g} for each {self.unit} that the limit is loosened by"
+            return (
+                f"; the objective would fall by {price / 100:.3g} for each percent that the limits"
+                " are loosened by"
+            )
+        return (
+            f"; the objective would fall by {price:.3g} for each {self.unit} that the limit is"
+            " loosened by"
+        )
 
     def _verdict(self) -> str:
         if self.after.runs == 1:
-            return f"{self.name}: {'broken' if self.before.count else 'kept'} -> {'broken' if self.after.count else 'kept'}: {self.verdict}"
-        text = f"{self.name} (broken by at most {self.allowed:g} of the runs): {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
+            return (
+                f"{self.name}: {'broken' if self.before.count else 'kept'} ->"
+                f" {'broken' if self.after.count else 'kept'}: {self.verdict}"
+            )
+        text = (
+            f"{self.name} (broken by at most {self.allowed:g} of the runs):"
+            f" {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
+        )
         if self.verdict == "undecided" and self.after.count == 0 and self.allowed > 0:
             need = int(np.ceil(np.log((1 - self.after.confidence) / 2) / np.log1p(-self.allowed)))
-            text += f"; not one run broke it, but {need} such runs are needed to say so with {self.after.confidence:.0%} confidence"
+            text += (
+                f"; not one run broke it, but {need} such runs are needed to say so with"
+                f" {self.after.confidence:.0%} confidence"
+            )
         return text
 
 
@@ -138,7 +162,8 @@ class Report:
     peak_torque: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     """The largest torque of all runs, joint by joint, before and after [N m]."""
     at_limits: tuple[str, ...] | None = None
-    """The tuned numbers that sit at an end of their range, in words; None where the ranges are not known."""
+    """The tuned numbers that sit at an end of their range, in words; None where the ranges are not
+    known."""
     halved: str = ""
     """What the nominal run with the tuned gains gives at dt / 2, in words."""
     notes: tuple[str, ...] = ()
@@ -210,7 +235,9 @@ class Report:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and strings."""
         out = dataclasses.asdict(self)
-        out["changes"] = [{**dataclasses.asdict(c), "significant": c.significant} for c in self.changes]
+        out["changes"] = [
+            {**dataclasses.asdict(c), "significant": c.significant} for c in self.changes
+        ]
         return out
 
 
@@ -245,27 +272,57 @@ def _run(
     backend: str,
     together: int,
 ) -> list[_Sample]:
-    """The same runs of scenarios that differ in what was tuned: drawn ones, or the nominal one where `runs` is 0, so many together.
+    """The same runs of scenarios that differ in what was tuned: drawn ones, or the nominal one
+    where `runs` is 0, so many together.
 
-    They are made by the program of a search's values, and the nominal one replaces what is drawn too: one kernel does for all.
+    They are made by the program of a search's values, and the nominal one replaces what is drawn
+    too: one kernel does for all.
     """
     first = canonical(scenarios[0])
     dtype, (targets, by_path) = first.initial.q.dtype, targets_of(first, perturbations or {})
-    by_path, objective, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, objective, timing["dt"]))
+    by_path, objective, dt = jax.tree.map(
+        lambda x: jnp.asarray(x, dtype), (by_path, objective, timing["dt"])
+    )
     cases = Cases(first, by_path, jax.random.PRNGKey(seed))
-    run = Run(checks.whole_steps(timing["duration"], timing["dt"]), timing["method"], mechanism=known_of(first))
-    points = {path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios]) for path in tuned}
-    index, of = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios)), np.repeat(np.arange(len(scenarios)), runs or 1)
+    run = Run(
+        checks.whole_steps(timing["duration"], timing["dt"]),
+        timing["method"],
+        mechanism=known_of(first),
+    )
+    points = {
+        path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios]) for path in tuned
+    }
+    index, of = (
+        np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios)),
+        np.repeat(np.arange(len(scenarios)), runs or 1),
+    )
     parts = []
     for begin in range(0, len(of), together):
         rows = np.resize(np.arange(len(of))[begin : begin + together], together)
-        varied, made = drawn(cases, {path: x[of[rows]] for path, x in points.items()}, index[rows], targets=targets, nominal=not runs)
-        parts.append(jax.tree.map(np.asarray, (rollouts(first, varied, objective, dt, run=run, backend=backend), made)))
-    whole: tuple[Rollouts, np.ndarray] = jax.tree.map(lambda *x: np.concatenate(x)[: len(of)], *parts)
+        varied, made = drawn(
+            cases,
+            {path: x[of[rows]] for path, x in points.items()},
+            index[rows],
+            targets=targets,
+            nominal=not runs,
+        )
+        parts.append(
+            jax.tree.map(
+                np.asarray, (rollouts(first, varied, objective, dt, run=run, backend=backend), made)
+            )
+        )
+    whole: tuple[Rollouts, np.ndarray] = jax.tree.map(
+        lambda *x: np.concatenate(x)[: len(of)], *parts
+    )
     found, made = whole
     if len(scenarios) > 1:  # once a report
-        tell_of_step(found.status, found.fastest_mode, found.relative_error, timing["dt"], timing["method"])
-    each = (x.reshape(len(scenarios), -1, *x.shape[1:]) for x in (found.exact, found.peak_torque, found.status, made))
+        tell_of_step(
+            found.status, found.fastest_mode, found.relative_error, timing["dt"], timing["method"]
+        )
+    each = (
+        x.reshape(len(scenarios), -1, *x.shape[1:])
+        for x in (found.exact, found.peak_torque, found.status, made)
+    )
     return [_Sample(*x) for x in zip(*each, strict=True)]
 
 
@@ -284,7 +341,13 @@ def _change(name: str, before: np.ndarray, after: np.ndarray, confidence: float)
 
     difference = after - before
     half = stats.norm.ppf(0.5 + confidence / 2) * difference.std(ddof=1) / np.sqrt(len(difference))
-    return Change(name, float(before.mean()), float(after.mean()), float(difference.mean() - half), float(difference.mean() + half))
+    return Change(
+        name,
+        float(before.mean()),
+        float(after.mean()),
+        float(difference.mean() - half),
+        float(difference.mean() + half),
+    )
 
 
 def verdict_of(p: Probability, allowed: float) -> str:
@@ -299,9 +362,9 @@ def _broken(objective: Objective, r: int, sample: _Sample) -> np.ndarray:
     left = sample.status & int(VIOLATED) != 0
     if requirement.event == "violated":
         return left
-    return ~(np.asarray(requirement.excess(jnp.asarray(sample.exact[:, len(objective.terms) + r]))) < 0) | (
-        sample.status & int(Status.NOT_FINITE) != 0
-    )
+    return ~(
+        np.asarray(requirement.excess(jnp.asarray(sample.exact[:, len(objective.terms) + r]))) < 0
+    ) | (sample.status & int(Status.NOT_FINITE) != 0)
 
 
 def make_report(
@@ -343,28 +406,80 @@ def make_report(
     def made(scenarios: tuple[Scenario, ...], runs: int, dt: float) -> list[_Sample]:
         steps = runs * len(scenarios) * checks.whole_steps(timing["duration"], dt)
         at_once = fresh_together(devices.platform(), steps, together)
-        return _run(scenarios, tuned, objective, perturbations, runs, seed, timing | {"dt": dt}, backend, at_once)
+        return _run(
+            scenarios,
+            tuned,
+            objective,
+            perturbations,
+            runs,
+            seed,
+            timing | {"dt": dt},
+            backend,
+            at_once,
+        )
 
     samples = made((before, after), runs if perturbations else 0, timing["dt"])
     both = samples[0].made & samples[1].made
-    terms = [np.stack([np.asarray(t.value(jnp.asarray(s.exact[both, i]))) for i, t in enumerate(objective.terms)], axis=1) for s in samples]
+    terms = [
+        np.stack(
+            [
+                np.asarray(t.value(jnp.asarray(s.exact[both, i])))
+                for i, t in enumerate(objective.terms)
+            ],
+            axis=1,
+        )
+        for s in samples
+    ]
     level = f" {risk.level:g}" if risk.kind == "cvar" else ""
-    changes = [_objective_change(risk, f"objective ({risk.kind}{level})" if len(both) > 1 else "objective", terms, confidence)]
+    changes = [
+        _objective_change(
+            risk,
+            f"objective ({risk.kind}{level})" if len(both) > 1 else "objective",
+            terms,
+            confidence,
+        )
+    ]
     for i, term in enumerate(objective.terms):
-        changes.append(_change(f"{term.name} (mean)" if len(both) > 1 else term.name, terms[0][:, i], terms[1][:, i], confidence))
+        changes.append(
+            _change(
+                f"{term.name} (mean)" if len(both) > 1 else term.name,
+                terms[0][:, i],
+                terms[1][:, i],
+                confidence,
+            )
+        )
         if risk.kind == "cvar" and len(objective.terms) > 1:
-            changes.append(_objective_change(risk, f"{term.name} (cvar{level})", [x[:, i : i + 1] for x in terms], confidence))
+            changes.append(
+                _objective_change(
+                    risk, f"{term.name} (cvar{level})", [x[:, i : i + 1] for x in terms], confidence
+                )
+            )
     verdicts = []
     for r, requirement in enumerate(objective.requirements):
-        found = [probability(_broken(objective, r, s), s.made, confidence, "independent", 1) for s in samples]
+        found = [
+            probability(_broken(objective, r, s), s.made, confidence, "independent", 1)
+            for s in samples
+        ]
         allowed = float(requirement.allowed)
-        # What limits a probability is a margin in the programme: its multiplier is no price of the probability.
+        # What limits a probability is a margin in the programme: its multiplier is no price of the
+        # probability.
         priced = r < len(prices) and requirement.event == "value"
         (sign, unit), price = requirement.measure, prices[r] if priced else None
-        worst = float(worst_share(jnp.asarray(samples[1].exact[samples[1].made, len(objective.terms) + r]), allowed))
+        worst = float(
+            worst_share(
+                jnp.asarray(samples[1].exact[samples[1].made, len(objective.terms) + r]), allowed
+            )
+        )
         shown = sign * worst, sign * float(requirement.limit), unit, price
-        verdicts.append(Verdict(requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed), *shown))
-    left = tuple(probability(s.status & int(VIOLATED) != 0, s.made, confidence, "independent", 1) for s in samples)
+        verdicts.append(
+            Verdict(
+                requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed), *shown
+            )
+        )
+    left = tuple(
+        probability(s.status & int(VIOLATED) != 0, s.made, confidence, "independent", 1)
+        for s in samples
+    )
     margins = tuple(float(s.margin[s.made].min()) for s in samples)
     torques = tuple(tuple(s.torque[s.made].max(axis=0).tolist()) for s in samples)
     full = samples[1] if not perturbations else made((after,), 0, timing["dt"])[0]
@@ -386,14 +501,26 @@ def make_report(
 
 def _at_half_the_step(objective: Objective, full: _Sample, half: _Sample) -> str:
     """The nominal run at dt and at dt / 2, in words: a result that the step made is no result."""
-    values = [float(sum(t.value(jnp.asarray(s.exact[0, i])) for i, t in enumerate(objective.terms))) for s in (full, half)]
+    values = [
+        float(sum(t.value(jnp.asarray(s.exact[0, i])) for i, t in enumerate(objective.terms)))
+        for s in (full, half)
+    ]
     text = f"the nominal run at dt / 2: objective {values[1]:.5g} instead of {values[0]:.5g}"
     text += f", smallest margin {half.margin[0]:.4g} rad, peak torque {np.max(half.torque):.5g} N m"
     apart = abs(values[1] - values[0]) > APART * abs(values[0])
-    lost = any(_broken(objective, r, half)[0] and not _broken(objective, r, full)[0] for r in range(len(objective.requirements)))
+    lost = any(
+        _broken(objective, r, half)[0] and not _broken(objective, r, full)[0]
+        for r in range(len(objective.requirements))
+    )
     if lost:
-        return "WARNING: " + text + "; a requirement is broken there: leave it some room, or take a smaller dt"
-    return "WARNING: " + text + f", more than {APART:.0%} apart: take a smaller dt" if apart else text
+        return (
+            "WARNING: "
+            + text
+            + "; a requirement is broken there: leave it some room, or take a smaller dt"
+        )
+    return (
+        "WARNING: " + text + f", more than {APART:.0%} apart: take a smaller dt" if apart else text
+    )
 
 
 def _objective_change(risk: Risk, name: str, terms: list[np.ndarray], confidence: float) -> Change:

@@ -1,10 +1,11 @@
 """One number from many perturbed runs: the mean, the tail or the worst of their losses.
 
     mean    sum_b L_b / B
-    cvar    mean of the worst (1 - level) share of the runs, at least one: conditional value at risk (expected shortfall)
-    worst   max_b L_b
+    cvar    mean of the worst (1 - level) share of the runs, at least one: conditional value at risk
+    (expected shortfall) worst   max_b L_b
 
-All gains are judged on the same draws (common random numbers), so differences between them are differences of the gains.
+All gains are judged on the same draws (common random numbers), so differences between them are
+differences of the gains.
 
 Source: R. T. Rockafellar, S. Uryasev, J. Risk 2 (2000) 21-41.
 """

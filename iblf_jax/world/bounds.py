@@ -1,11 +1,15 @@
-"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference; bounds on their velocities alike.
+"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference;
+bounds on their velocities alike.
 
-Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the reference.  The law works with
+Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the
+  reference.  The law works with
 the errors' bounds
 
-    k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,                    (paper, below Assumption 2)
+    k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,                    (paper,
+    below Assumption 2)
 
-and with their rates, all taken here, once, by automatic differentiation: `tube_at` returns them as a `Tube`.
+and with their rates, all taken here, once, by automatic differentiation: `tube_at` returns them as
+a `Tube`.
 """
 
 from __future__ import annotations
@@ -25,12 +29,13 @@ from iblf_jax.world.robots import Robot
 class Side(Protocol):
     """What the package asks of one side of the bounds.
 
-    One that is switched at some times also has `jump_times()`, the times at which it or its rate jumps, (m,) [s], as disturbances have:
-    steps of a run are divided there.
+    One that is switched at some times also has `jump_times()`, the times at which it or its rate
+    jumps, (m,) [s], as disturbances have: steps of a run are divided there.
     """
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
-        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for bounds that follow it.
+        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for
+        bounds that follow it.
 
         As a bound on q' it is given q_d' and is in rad/s.
         """
@@ -72,14 +77,17 @@ class Sinusoid:
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound, (n,) [rad]."""
-        return jnp.broadcast_to(self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q_d.shape)
+        return jnp.broadcast_to(
+            self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q_d.shape
+        )
 
 
 @component
 class Funnel:
     """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
 
-    `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a lower one.
+    `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a
+      lower one.
 
     Args:
       initial: distance from the reference at t = 0, () or (n,) [rad].
@@ -100,7 +108,8 @@ class Funnel:
 
 @component
 class Bounds:
-    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9, 0.14))`.
+    """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9,
+    0.14))`.
 
     On positions in rad; on velocities (`Scenario.velocity_bounds`) in rad/s.
 
@@ -115,7 +124,12 @@ class Bounds:
     def check(self) -> None:
         """Raises ValueError for a side that is not one."""
         for name in ("lower", "upper"):
-            checks.conforms(f"Bounds.{name}", getattr(self, name), Side, "A constant bound is iblf_jax.bounds.Constant(value).")
+            checks.conforms(
+                f"Bounds.{name}",
+                getattr(self, name),
+                Side,
+                "A constant bound is iblf_jax.bounds.Constant(value).",
+            )
 
 
 def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
@@ -138,10 +152,16 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       unlimited: bounds of joints without limits, -unlimited and unlimited [rad].
 
     Raises:
-      ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a margin that leaves nothing.
+      ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
+        margin that leaves nothing.
     """
     if not hasattr(robot, "limits"):
-        raise checks.fail("robot", type(robot).__name__, "a robot with joint limits, such as an Arm", "Give bounds of your own.")
+        raise checks.fail(
+            "robot",
+            type(robot).__name__,
+            "a robot with joint limits, such as an Arm",
+            "Give bounds of your own.",
+        )
     kept, far = (
         _distance("margin", margin, robot.n, None),
         0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive"),
@@ -149,7 +169,12 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
     sides = []
     for side, sign in zip(robot.limits, (1.0, -1.0), strict=True):
         if checks.is_concrete(side) and not np.all(np.isfinite(side)) and unlimited is None:
-            raise checks.fail("robot.limits", side, "limits on every joint", "Say what to use where there are none: unlimited=6.3.")
+            raise checks.fail(
+                "robot.limits",
+                side,
+                "limits on every joint",
+                "Say what to use where there are none: unlimited=6.3.",
+            )
         sides.append(jnp.where(jnp.isfinite(side), side + sign * kept, -sign * far))
     lower, upper = sides
     if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
@@ -162,8 +187,11 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
     return Bounds(lower=Constant(lower), upper=Constant(upper))
 
 
-def from_speed_limits(robot: Robot, *, share: float = 1.0, unlimited: float | None = None) -> Bounds:
-    """Constant bounds on the velocities at a share of a robot's largest joint speeds, for `Scenario.velocity_bounds`.
+def from_speed_limits(
+    robot: Robot, *, share: float = 1.0, unlimited: float | None = None
+) -> Bounds:
+    """Constant bounds on the velocities at a share of a robot's largest joint speeds, for
+    `Scenario.velocity_bounds`.
 
         -share speed < q' < share speed
 
@@ -173,13 +201,23 @@ def from_speed_limits(robot: Robot, *, share: float = 1.0, unlimited: float | No
       unlimited: largest speed of joints that have none [rad/s].
 
     Raises:
-      ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a share that is not positive.
+      ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
+        share that is not positive.
     """
     if not hasattr(robot, "speed"):
-        raise checks.fail("robot", type(robot).__name__, "a robot with speed limits, such as an Arm", "Give velocity bounds of your own.")
+        raise checks.fail(
+            "robot",
+            type(robot).__name__,
+            "a robot with speed limits, such as an Arm",
+            "Give velocity bounds of your own.",
+        )
     share = checks.positive_number("share", share, "1")
     far = 0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive")
-    if checks.is_concrete(robot.speed) and not np.all(np.isfinite(robot.speed)) and unlimited is None:
+    if (
+        checks.is_concrete(robot.speed)
+        and not np.all(np.isfinite(robot.speed))
+        and unlimited is None
+    ):
         remedy = "Say what to use where there is none: unlimited=3.0."
         raise checks.fail("robot.speed", robot.speed, "a limit on every joint", remedy)
     most = share * jnp.where(jnp.isfinite(robot.speed), robot.speed, far)
@@ -187,7 +225,9 @@ def from_speed_limits(robot: Robot, *, share: float = 1.0, unlimited: float | No
 
 
 class Tube(NamedTuple):
-    """Reference, bounds and their rates at one time; everything that a barrier needs to know of the world."""
+    """Reference, bounds and their rates at one time; everything that a barrier needs to know of the
+    world.
+    """
 
     q_d: jax.Array
     """Reference, (n,) [rad]."""
@@ -202,7 +242,8 @@ class Tube(NamedTuple):
     dupper: jax.Array
     """Rate of k_uc, (n,) [rad/s]."""
     ddq_d: jax.Array | None = None
-    """Its acceleration, (n,) [rad/s^2], for laws that feed it forward; None in a tube that barriers take alpha from."""
+    """Its acceleration, (n,) [rad/s^2], for laws that feed it forward; None in a tube that barriers
+    take alpha from."""
 
     @property
     def k_l(self) -> jax.Array:
@@ -225,14 +266,16 @@ class Tube(NamedTuple):
         return self.dupper - self.dq_d
 
     def xi(self, q: jax.Array) -> jax.Array:
-        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].                     (2.4), (2.5)"""
+        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].
+        (2.4), (2.5)
+        """
         e1 = q - self.q_d
         return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
 
 
 NARROWEST = 1e-6
-"""rad.  A reference that comes nearer to its bound than this is called infeasible; widths are held above it so that a run
-with a bad reference gives large numbers and a flag instead of NaN."""
+"""rad.  A reference that comes nearer to its bound than this is called infeasible; widths are held
+above it so that a run with a bad reference gives large numbers and a flag instead of NaN."""
 
 
 def positive_width(k: jax.Array) -> jax.Array:
@@ -240,7 +283,9 @@ def positive_width(k: jax.Array) -> jax.Array:
     return jnp.maximum(checks.as_floats("k", k), NARROWEST)
 
 
-def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration: bool = True) -> Tube:
+def tube_at(
+    reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration: bool = True
+) -> Tube:
     """Reference, bounds and their rates at time t, the rates by jvp.
 
         q_d, q_d', q_d",   k_lc, k_uc and their rates
@@ -248,8 +293,8 @@ def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration:
     Args:
       reference, bounds: the components.
       t: time, () [s].
-      acceleration: whether q_d" is wanted; False where the tube is itself differentiated in time, so that a reference need not have a
-        third derivative.
+      acceleration: whether q_d" is wanted; False where the tube is itself differentiated in time,
+        so that a reference need not have a third derivative.
 
     Returns:
       `Tube`; its ddq_d costs nothing where it is not used, as what is not used is not compiled.
@@ -257,8 +302,15 @@ def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration:
     Raises:
       ValueError: something that is no reference, no bounds or no time.
     """
-    checks.offers("reference", reference, ("position",), "a reference, as iblf_jax.references.Reference")
-    checks.offers("bounds", bounds, ("lower", "upper"), "bounds, as iblf_jax.bounds.Bounds(lower=..., upper=...)")
+    checks.offers(
+        "reference", reference, ("position",), "a reference, as iblf_jax.references.Reference"
+    )
+    checks.offers(
+        "bounds",
+        bounds,
+        ("lower", "upper"),
+        "bounds, as iblf_jax.bounds.Bounds(lower=..., upper=...)",
+    )
     t = checks.as_floats("t", t)
     checks.shape_is("t", t, ())
     acceleration = checks.flag("acceleration", acceleration)
@@ -275,8 +327,12 @@ def tube_at(reference: Reference, bounds: Bounds, t: jax.Array, *, acceleration:
     return Tube(q_d, dq_d, lower, upper, dlower, dupper, ddq_d)
 
 
-def speed_limits_at(reference: Reference, bounds: Bounds, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The bounds v_l, v_u on the velocities at time t [s], (n,) each [rad/s]; sides that follow something follow q_d'."""
+def speed_limits_at(
+    reference: Reference, bounds: Bounds, t: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The bounds v_l, v_u on the velocities at time t [s], (n,) each [rad/s]; sides that follow
+    something follow q_d'.
+    """
     dq_d = jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
     return bounds.lower.at(t, dq_d), bounds.upper.at(t, dq_d)
 

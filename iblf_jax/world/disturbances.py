@@ -1,14 +1,15 @@
 """Disturbances: the generalised torque that acts on the plant and that the law does not know.
 
-    M q" + C q' + G = tau + (disturbance)                                        for the simulated plant
+    M q" + C q' + G = tau + (disturbance)                                        for the simulated
+    plant
 
 What the observer should estimate is the lumped uncertain term of (2.1),
 
     f = M0 q" + C0 q' + G0 - tau,
 
-evaluated along the run with the *model*.  It equals the disturbance here when the plant is the model; if the plant has other
-masses, a payload or friction, f holds those as well.  f must be differentiable (Assumption 1), so a disturbance that
-jumps says when: `jump_times`.
+evaluated along the run with the *model*.  It equals the disturbance here when the plant is the
+model; if the plant has other masses, a payload or friction, f holds those as well.  f must be
+differentiable (Assumption 1), so a disturbance that jumps says when: `jump_times`.
 """
 
 from __future__ import annotations
@@ -28,15 +29,20 @@ from iblf_jax.world.robots import Robot
 class Disturbance(Protocol):
     """What the package asks of a disturbance."""
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
-        """Generalised torque on the plant, (n,) [N m], at time t [s] and state q [rad], dq [rad/s]."""
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
+        """Generalised torque on the plant, (n,) [N m], at time t [s] and state q [rad], dq
+        [rad/s].
+        """
         ...
 
     def jump_times(self) -> jax.Array:
         """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is.
 
-        Steps of a run are divided there, so a torque that jumps and does not say so costs accuracy.  How many there are is fixed; the
-        times are computed from leaves with jnp, may differ between runs, and have derivatives.
+        Steps of a run are divided there, so a torque that jumps and does not say so costs accuracy.
+        How many there are is fixed; the times are computed from leaves with jnp, may differ between
+        runs, and have derivatives.
         """
         ...
 
@@ -49,7 +55,9 @@ def _never() -> jax.Array:
 class Nothing:
     """No disturbance."""
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """Zero, (n,) [N m]."""
         return jnp.zeros_like(q)
 
@@ -60,10 +68,12 @@ class Nothing:
 
 @component
 class ModelShaped:
-    """The paper's uncertain term, shaped by the model's own matrices.                                      (4.3)
+    """The paper's uncertain term, shaped by the model's own matrices.
+    (4.3)
 
         f = M0(q) a(t) + C0(q, q') b(t)
-        a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase),   b likewise
+        a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase),   b
+        likewise
 
     `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.
 
@@ -87,10 +97,16 @@ class ModelShaped:
     velocity_phase: Leaf = leaf("rad")
     phase: Leaf = leaf("rad", shape="scalar", default=0.0)
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """f(t, q, q'), (n,) [N m]."""
-        a = self.acceleration_amplitude * jnp.sin(self.acceleration_frequency * t + self.acceleration_phase + self.phase)
-        b = self.velocity_amplitude * jnp.sin(self.velocity_frequency * t + self.velocity_phase + self.phase)
+        a = self.acceleration_amplitude * jnp.sin(
+            self.acceleration_frequency * t + self.acceleration_phase + self.phase
+        )
+        b = self.velocity_amplitude * jnp.sin(
+            self.velocity_frequency * t + self.velocity_phase + self.phase
+        )
         return matvec(model.mass_matrix(q), a) + model.coriolis(q, dq, b)
 
     def jump_times(self) -> jax.Array:
@@ -114,9 +130,13 @@ class Sinusoids:
     phase: Leaf = leaf("rad", default=0.0)
     offset: Leaf = leaf("N m", default=0.0)
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """(n,) [N m]."""
-        return jnp.broadcast_to(self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q.shape)
+        return jnp.broadcast_to(
+            self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q.shape
+        )
 
     def jump_times(self) -> jax.Array:
         """None: it is smooth."""
@@ -135,7 +155,9 @@ class Step:
     size: Leaf = leaf("N m")
     time: Leaf = leaf("s", shape="scalar")
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """(n,) [N m]."""
         return jnp.where(t >= self.time, jnp.broadcast_to(self.size, q.shape), jnp.zeros_like(q))
 
@@ -146,7 +168,8 @@ class Step:
 
 @component
 class TipForce:
-    """A force that acts on the tip, +J(q)^T F(t) with F = offset + amplitude sin(frequency t + phase).
+    """A force that acts on the tip, +J(q)^T F(t) with F = offset + amplitude sin(frequency t +
+    phase).
 
     (The paper's f_ext in (2.1) is the force that the tip exerts, hence its minus sign: F = -f_ext.)
 
@@ -162,7 +185,9 @@ class TipForce:
     phase: Leaf = leaf("rad", shape="any", default=0.0)
     offset: Leaf = leaf("N", shape="any", default=0.0)
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """J(q)^T F(t), (n,) [N m]."""
         J = plant.jacobian(q)
         force = self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
@@ -175,19 +200,23 @@ class TipForce:
 
 @component
 class Friction:
-    """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' / width)).
+    """Viscous and smoothed Coulomb friction in the joints, -(viscous q' + coulomb tanh(q' /
+    width)).
 
     Args:
       viscous: torque per speed, () or (n,) [N m s/rad], >= 0; 0 if not given.
       coulomb: torque at speeds well above the width, () or (n,) [N m], >= 0; 0 if not given.
-      width: velocity over which the Coulomb part changes sign, () or (n,) [rad/s], > 0; smaller is sharper and stiffer; 0.05 if not given.
+      width: velocity over which the Coulomb part changes sign, () or (n,) [rad/s], > 0; smaller is
+        sharper and stiffer; 0.05 if not given.
     """
 
     viscous: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
     coulomb: Leaf = leaf("N m", sign="nonnegative", default=0.0)
     width: Leaf = leaf("rad/s", sign="positive", default=0.05)
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """(n,) [N m]."""
         return -(self.viscous * dq + self.coulomb * jnp.tanh(dq / self.width))
 
@@ -209,12 +238,19 @@ class Sum:
     def check(self) -> None:
         """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""
         if not isinstance(self.parts, tuple | list):
-            raise checks.fail("Sum.parts", self.parts, "a tuple of disturbances", "Put one part into brackets, Sum((part,)).")
+            raise checks.fail(
+                "Sum.parts",
+                self.parts,
+                "a tuple of disturbances",
+                "Put one part into brackets, Sum((part,)).",
+            )
         object.__setattr__(self, "parts", tuple(self.parts))
         for i, part in enumerate(self.parts):
             checks.conforms(f"Sum.parts[{i}]", part, Disturbance)
 
-    def torque(self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot) -> jax.Array:
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
         """The sum over the parts, (n,) [N m]."""
         total = jnp.zeros_like(q)
         for part in self.parts:

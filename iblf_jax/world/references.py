@@ -1,8 +1,8 @@
 """Reference trajectories q_d(t).
 
-A reference says where each joint should be, `position(t)`; its velocity and acceleration are taken by automatic
-differentiation where they are needed, never written by hand.  So a reference must be smooth: the law needs q_d' and q_d",
-and its derivative alpha' is continuous only if q_d" is.
+A reference says where each joint should be, `position(t)`; its velocity and acceleration are taken
+by automatic differentiation where they are needed, never written by hand.  So a reference must be
+smooth: the law needs q_d' and q_d", and its derivative alpha' is continuous only if q_d" is.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 class Reference(Protocol):
     """What the package asks of a reference.
 
-    One that is switched at some times also has `jump_times()`, the times at which q_d, q_d' or q_d" jumps, (m,) [s], as disturbances have:
-    steps of a run are divided there.
+    One that is switched at some times also has `jump_times()`, the times at which q_d, q_d' or q_d"
+    jumps, (m,) [s], as disturbances have: steps of a run are divided there.
     """
 
     def position(self, t: jax.Array) -> jax.Array:
@@ -33,7 +33,8 @@ class Reference(Protocol):
 
 @component
 class Sinusoid:
-    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.                             (4.2)
+    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.
+    (4.2)
 
     Args:
       offset: middle of the motion, () or (n,) [rad].
@@ -84,14 +85,16 @@ class Quintic:
 class WaypointSpline:
     """The quintic spline through waypoints, at rest at the first and the last one and held there.
 
-    It has four continuous derivatives between the ends, and zero velocity and acceleration at them.  It is linear in the
-    waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them or differentiate by them.
+    It has four continuous derivatives between the ends, and zero velocity and acceleration at them.
+    It is linear in the waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them
+    or differentiate by them.
 
     Args:
       times: strictly increasing times of the waypoints, a tuple of m numbers [s].
       waypoints: one row a time, (m, n) [rad].
 
-    Source: C. de Boor, A Practical Guide to Splines, 1978 (basis computed by SciPy's `make_interp_spline`).
+    Source: C. de Boor, A Practical Guide to Splines, 1978 (basis computed by SciPy's
+      `make_interp_spline`).
     """
 
     times: tuple[float, ...] = static()
@@ -103,10 +106,22 @@ class WaypointSpline:
             times = np.asarray(self.times, float)
         except (TypeError, ValueError, OverflowError):
             times = np.zeros(0)
-        if times.ndim != 1 or times.size < 2 or not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
-            raise checks.fail("WaypointSpline.times", self.times, "at least two strictly increasing times [s]")
+        if (
+            times.ndim != 1
+            or times.size < 2
+            or not np.all(np.isfinite(times))
+            or not np.all(np.diff(times) > 0)
+        ):
+            raise checks.fail(
+                "WaypointSpline.times", self.times, "at least two strictly increasing times [s]"
+            )
         if self.waypoints.ndim != 2 or self.waypoints.shape[0] != times.size:
-            raise checks.fail("WaypointSpline.waypoints", self.waypoints, f"shape ({times.size}, n)", "Give one row a time.")
+            raise checks.fail(
+                "WaypointSpline.waypoints",
+                self.waypoints,
+                f"shape ({times.size}, n)",
+                "Give one row a time.",
+            )
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
@@ -123,11 +138,15 @@ class WaypointSpline:
 
 @functools.lru_cache(maxsize=32)
 def _cardinal_splines(times: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are 1 at one waypoint."""
+    """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are
+    1 at one waypoint.
+    """
     from scipy.interpolate import PPoly, make_interp_spline
 
     rest = [(1, np.zeros(len(times))), (2, np.zeros(len(times)))]
-    spline = make_interp_spline(np.asarray(times, float), np.eye(len(times)), k=5, bc_type=(rest, rest))
+    spline = make_interp_spline(
+        np.asarray(times, float), np.eye(len(times)), k=5, bc_type=(rest, rest)
+    )
     pieces = [PPoly.from_spline((spline.t, spline.c[:, j], 5)) for j in range(len(times))]
     distinct = np.concatenate([[True], np.diff(pieces[0].x) > 0])
     starts = np.flatnonzero(np.diff(pieces[0].x) > 0)

@@ -1,11 +1,15 @@
-"""Regions in which points of the robot must stay: half-spaces and spheres, for its tip or the origin of any joint.
+"""Regions in which points of the robot must stay: half-spaces and spheres, for its tip or the
+origin of any joint.
 
-With x(q) the point in the base's frame and h the region's `level`, positive inside and 0 on the wall,
+With x(q) the point in the base's frame and h the region's `level`, positive inside and 0 on the
+wall,
 
-    h' = dh/dq q',   h" = dh/dq q" + c,   c = d/ds (dh/dq q')(q + s q') at s = 0                                  [m/s], [m/s^2]
+    h' = dh/dq q',   h" = dh/dq q" + c,   c = d/ds (dh/dq q')(q + s q') at s = 0
+    [m/s], [m/s^2]
 
-so conditions on h" are linear in the accelerations: `along` gives h, h', dh/dq and c.  What a run has left of a region is the `distance` to
-its wall, whatever the law; a `controllers.SafetyFilter` keeps h.
+so conditions on h" are linear in the accelerations: `along` gives h, h', dh/dq and c.  What a run
+has left of a region is the `distance` to its wall, whatever the law; a `controllers.SafetyFilter`
+keeps h.
 """
 
 from __future__ import annotations
@@ -24,17 +28,23 @@ KEEPS = ("inside", "outside")
 
 
 class Region(Protocol):
-    """What the package asks of a region: a component that also says, in a static field, which point it is for."""
+    """What the package asks of a region: a component that also says, in a static field, which point
+    it is for.
+    """
 
     point: str | int
     """ "tip", or the joint by its name or number whose origin it is."""
 
     def distance(self, x: jax.Array) -> jax.Array:
-        """Distance of a point (2,) or (3,) [m] to the wall, () [m]: positive where it may be, negative beyond."""
+        """Distance of a point (2,) or (3,) [m] to the wall, () [m]: positive where it may be,
+        negative beyond.
+        """
         ...
 
     def level(self, x: jax.Array) -> jax.Array:
-        """A function, () [m], with the distance's sign and, at the wall, its slope, that can be differentiated twice inside."""
+        """A function, () [m], with the distance's sign and, at the wall, its slope, that can be
+        differentiated twice inside.
+        """
         ...
 
 
@@ -43,7 +53,8 @@ class HalfSpace:
     """The half-space  n . x >= offset,  n = normal/|normal|:  h = n . x - offset.
 
     Args:
-      normal: direction from the wall into what is allowed, (2,) or (3,) as the robot's points [1]; its length does not matter.
+      normal: direction from the wall into what is allowed, (2,) or (3,) as the robot's points [1];
+        its length does not matter.
       offset: distance of the wall from the base's origin along the normal, () [m]; 0 if not given.
       point: "tip", or the joint by its name or number whose origin is kept; "tip" if not given.
 
@@ -58,7 +69,12 @@ class HalfSpace:
         """Raises ValueError for a normal without a direction."""
         _is_point("HalfSpace.normal", self.normal)
         if checks.is_concrete(self.normal) and not float(jnp.max(jnp.abs(self.normal))) > 0:
-            raise checks.fail("HalfSpace.normal", self.normal, "a direction, of a length above 0", "Such as [0, 0, 1]: up.")
+            raise checks.fail(
+                "HalfSpace.normal",
+                self.normal,
+                "a direction, of a length above 0",
+                "Such as [0, 0, 1]: up.",
+            )
 
     def distance(self, x: jax.Array) -> jax.Array:
         """N . x - offset, () [m]."""
@@ -73,8 +89,8 @@ class HalfSpace:
 class Sphere:
     """Inside or outside of a sphere, in the plane of a circle.
 
-    Distance and level are |x - centre| - radius outside.  Inside, where the distance radius - |x - centre| has an edge at the centre, the
-    level is (radius^2 - |x - centre|^2)/(2 radius).
+    Distance and level are |x - centre| - radius outside.  Inside, where the distance radius - |x -
+    centre| has an edge at the centre, the level is (radius^2 - |x - centre|^2)/(2 radius).
 
     Args:
       centre: in the base's frame, (2,) or (3,) as the robot's points [m].
@@ -91,14 +107,18 @@ class Sphere:
     point: str | int = static(default=TIP)
 
     def check(self) -> None:
-        """Raises ValueError for a centre that is no point, or another word than inside and outside."""
+        """Raises ValueError for a centre that is no point, or another word than inside and
+        outside.
+        """
         _is_point("Sphere.centre", self.centre)
         checks.one_of("Sphere.keep", self.keep, KEEPS)
 
     def distance(self, x: jax.Array) -> jax.Array:
         """|x - centre| - radius outside, radius - |x - centre| inside, () [m]."""
         square = jnp.sum((x - self.centre) ** 2)
-        away = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0) - self.radius
+        away = (
+            jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0) - self.radius
+        )
         return away if self.keep == "outside" else -away
 
     def level(self, x: jax.Array) -> jax.Array:
@@ -110,11 +130,18 @@ class Sphere:
 
 def _is_point(name: str, value: jax.Array) -> None:
     if jnp.shape(value) not in ((2,), (3,)):
-        raise checks.fail(name, value, "two numbers in the plane, or three in space", f"Its shape is {jnp.shape(value)}.")
+        raise checks.fail(
+            name,
+            value,
+            "two numbers in the plane, or three in space",
+            f"Its shape is {jnp.shape(value)}.",
+        )
 
 
 def row_of(robot: Robot, point: str | int) -> int:
-    """Which row of the robot's skeleton a region's point is; ValueError for a joint that it does not have."""
+    """Which row of the robot's skeleton a region's point is; ValueError for a joint that it does
+    not have.
+    """
     names = joint_names(robot, robot.n)
     if point == TIP and TIP not in names:
         return robot.n
@@ -156,7 +183,9 @@ class Along(NamedTuple):
 
 
 def along(regions: tuple[Region, ...], robot: Robot, q: jax.Array, dq: jax.Array) -> Along:
-    """The levels of all regions as the robot moves through q [rad] at dq [rad/s], (n,) each; by forward mode."""
+    """The levels of all regions as the robot moves through q [rad] at dq [rad/s], (n,) each; by
+    forward mode.
+    """
 
     def levels(q):
         return jnp.stack([region.level(position_of(robot, region.point, q)) for region in regions])

@@ -1,6 +1,7 @@
 """The contract of an actuator: it takes the law's command and gives a torque.
 
-Its state is integrated with the plant.  Friction is the plant's, delay the sampled loop's (`Sampling`).
+Its state is integrated with the plant.  Friction is the plant's, delay the sampled loop's
+(`Sampling`).
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ class Delivered(NamedTuple):
 class Actuator(Protocol):
     """What the package asks of an actuator.
 
-    The command of a law is a torque.  An actuator may take another input, such as a voltage, under a law that
-    commands one; an observer is given the command, so such a loop needs one that does not use it.
+    The command of a law is a torque.  An actuator may take another input, such as a voltage, under
+    a law that commands one; an observer is given the command, so such a loop needs one that does
+    not use it.
 
-    One with limits also has `unlimited`, the same without them: how fast a loop is, is measured on it.  One that changes with time, such
-    as a drive that fails, also has `at(t)`, the actuator as it is at time t [s], and, if it jumps, `jump_times()`, (m,) [s], as
-    disturbances have: steps of a run are divided there.
+    One with limits also has `unlimited`, the same without them: how fast a loop is, is measured on
+      it.  One that changes with time, such
+    as a drive that fails, also has `at(t)`, the actuator as it is at time t [s], and, if it jumps,
+    `jump_times()`, (m,) [s], as disturbances have: steps of a run are divided there.
     """
 
     def init(self, tau: jax.Array) -> State:

@@ -17,7 +17,8 @@ from iblf_jax.core.time import as_at, joined, jump_times_of
 
 @component
 class Chain:
-    """Each is told what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0), Motor(bandwidth=300.0)))`.
+    """Each is told what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0),
+    Motor(bandwidth=300.0)))`.
 
     Args:
       parts: any actuators, a tuple or a list, from the command to the joint; at least one.
@@ -28,10 +29,15 @@ class Chain:
     parts: tuple[Actuator, ...]
 
     def check(self) -> None:
-        """Takes a list for a tuple; raises ValueError for a part that is not an actuator, or none at all."""
+        """Takes a list for a tuple; raises ValueError for a part that is not an actuator, or none
+        at all.
+        """
         if not isinstance(self.parts, tuple | list) or not self.parts:
             raise checks.fail(
-                "Chain.parts", self.parts, "a tuple of actuators", "Such as Chain((Motor(limit=40.0), Motor(bandwidth=300.0)))."
+                "Chain.parts",
+                self.parts,
+                "a tuple of actuators",
+                "Such as Chain((Motor(limit=40.0), Motor(bandwidth=300.0))).",
             )
         object.__setattr__(self, "parts", tuple(self.parts))
         for i, part in enumerate(self.parts):
@@ -40,7 +46,9 @@ class Chain:
     @property
     def unlimited(self) -> Chain:
         """The same without limits."""
-        return dataclasses.replace(self, parts=tuple(getattr(part, "unlimited", part) for part in self.parts))
+        return dataclasses.replace(
+            self, parts=tuple(getattr(part, "unlimited", part) for part in self.parts)
+        )
 
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""
@@ -50,7 +58,9 @@ class Chain:
 
     def jump_times(self) -> jax.Array:
         """The parts' jump times together, (m,) [s]."""
-        return joined([jump_times_of(f"Chain.parts[{i}]", part) for i, part in enumerate(self.parts)])
+        return joined(
+            [jump_times_of(f"Chain.parts[{i}]", part) for i, part in enumerate(self.parts)]
+        )
 
     def init(self, tau: jax.Array) -> Any:
         """The parts' states, each of which delivers the torque."""

@@ -1,4 +1,6 @@
-"""An electric drive: a lag, limits of torque and of its rate, and the line between torque and speed."""
+"""An electric drive: a lag, limits of torque and of its rate, and the line between torque and
+speed.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +17,21 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 
 @component
 class Motor:
-    """v = clip(asked, +-limit);   y' = clip(bandwidth (v - y), +-rate_limit);   tau = clip(y, +-stall (1 - |q'|/no_load_speed)).
+    """v = clip(asked, +-limit);   y' = clip(bandwidth (v - y), +-rate_limit);   tau = clip(y,
+    +-stall (1 - |q'|/no_load_speed)).
 
-    What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the no-load speed.  The lag is integrated with
-    the plant: behind a jump of the command the torque is right to 1e-5 of the jump where dt bandwidth <= 0.2 (rk4), the positions far
+    What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the
+    no-load speed.  The lag is integrated with the plant: behind a jump of the command the torque is
+      right to 1e-5 of the jump where dt bandwidth <= 0.2 (rk4), the positions far
     better.
 
     Args:
       bandwidth: of the current loop, () or (n,) [1/s], > 0; no lag if not given.
       limit: largest torque, () or (n,) [N m], > 0; none if not given.
-      rate_limit: largest rate of the torque, () or (n,) [N m/s], > 0; none if not given.  It needs a bandwidth.
-      stall: torque at a standstill, () or (n,) [N m], > 0; none if not given.  It comes with no_load_speed.
+      rate_limit: largest rate of the torque, () or (n,) [N m/s], > 0; none if not given.  It needs
+        a bandwidth.
+      stall: torque at a standstill, () or (n,) [N m], > 0; none if not given.  It comes with
+        no_load_speed.
       no_load_speed: speed at which no torque is left, () or (n,) [rad/s], > 0; none if not given.
 
     Source: the torque-speed line of a DC motor, any text on drives.
@@ -38,17 +44,26 @@ class Motor:
     no_load_speed: Leaf = leaf("rad/s", sign="positive", default=None)
 
     def check(self) -> None:
-        """Raises ValueError for half a torque-speed line, or a limit of the rate without a bandwidth."""
+        """Raises ValueError for half a torque-speed line, or a limit of the rate without a
+        bandwidth.
+        """
         if (self.stall is None) != (self.no_load_speed is None):
             name = "no_load_speed" if self.no_load_speed is None else "stall"
             raise checks.fail(f"Motor.{name}", None, "stall and no_load_speed together, or neither")
         if self.rate_limit is not None and self.bandwidth is None:
-            raise checks.fail("Motor.bandwidth", None, "a bandwidth, as there is a rate_limit", "Such as bandwidth=1000.0.")
+            raise checks.fail(
+                "Motor.bandwidth",
+                None,
+                "a bandwidth, as there is a rate_limit",
+                "Such as bandwidth=1000.0.",
+            )
 
     @property
     def unlimited(self) -> Motor:
         """The same without limits."""
-        return dataclasses.replace(self, limit=None, rate_limit=None, stall=None, no_load_speed=None)
+        return dataclasses.replace(
+            self, limit=None, rate_limit=None, stall=None, no_load_speed=None
+        )
 
     def init(self, tau: jax.Array) -> Any:
         """The torque that it delivers, (n,) [N m]; no state without a lag."""

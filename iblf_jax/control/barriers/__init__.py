@@ -1,6 +1,8 @@
-"""Barriers: V1, its slope and the virtual velocity of each.  The contract is `Barrier` in `_base.py`.
+"""Barriers: V1, its slope and the virtual velocity of each.  The contract is `Barrier` in
+`_base.py`.
 
-A barrier or a law of your own stays finite at the wall by `guarded_error`, and says so by `guard_is_active`.
+A barrier or a law of your own stays finite at the wall by `guarded_error`, and says so by
+`guard_is_active`.
 """
 
 from iblf_jax.control.barriers._base import Barrier as Barrier

@@ -1,17 +1,21 @@
 """The contract of a barrier, and the guard that keeps every barrier finite at the wall.
 
-A barrier turns the tube around the reference into three functions of one joint's position, written for all n joints at once:
-its Lyapunov function V1, its slope s = dV1/dq, and the virtual velocity alpha that makes s alpha + dV1/dt negative.  The
+A barrier turns the tube around the reference into three functions of one joint's position, written
+for all n joints at once: its Lyapunov function V1, its slope s = dV1/dq, and the virtual velocity
+  alpha that makes s alpha + dV1/dt negative.  The
 backstepping law (`controllers.Backstepping`) needs nothing else.
 
-**At the wall.**  s has a pole at the bound and the wrong sign beyond it: a step too far and the law pushes outward, NaN spreads
-through the batch and its gradient.  So barriers evaluate at a guarded error (`guarded_error`), which is e1 itself for
+**At the wall.**  s has a pole at the bound and the wrong sign beyond it: a step too far and the law
+pushes outward, NaN spreads through the batch and its gradient.  So barriers evaluate at a guarded
+error (`guarded_error`), which is e1 itself for
 |xi| <= 1 - guard and stays at the edge of that range beyond.  There the slope is constant, large, finite and directed inward,
-V1 goes on along its tangent, and both have finite derivatives everywhere.  A virtual velocity that is a nonlinear function of the
-error is evaluated there too and goes on with gain k1, so that it still leads back inside.
+V1 goes on along its tangent, and both have finite derivatives everywhere.  A virtual velocity that
+is a nonlinear function of the error is evaluated there too and goes on with gain k1, so that it
+still leads back inside.
 
-**Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them and nothing else.  A barrier may
-lack them and then claims nothing.  `error_over_slope` is for laws that put a barrier on velocities (`controllers.FullState`).
+**Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them
+and nothing else.  A barrier may lack them and then claims nothing.  `error_over_slope` is for laws
+that put a barrier on velocities (`controllers.FullState`).
 """
 
 from __future__ import annotations
@@ -30,15 +34,20 @@ GUARD = 1e-3
 """Default distance from the wall, in xi, at which the guard takes over."""
 
 CLAIMS = ("decay_rate", "xi_bound", "error_over_slope", "value_unit")
-"""Members that a barrier may lack: then it claims nothing, cannot stand on velocities, or has a V1 without a unit."""
+"""Members that a barrier may lack: then it claims nothing, cannot stand on velocities, or has a V1
+without a unit."""
 
 
 class Barrier(Protocol):
-    """What the package asks of a barrier.  All arrays are (n,), one number a joint, and joints do not mix."""
+    """What the package asks of a barrier.  All arrays are (n,), one number a joint, and joints do
+    not mix.
+    """
 
     @property
     def guard(self) -> float:
-        """A static field: the law is exact for |xi| <= 1 - guard; -infinity for a barrier that needs no guard."""
+        """A static field: the law is exact for |xi| <= 1 - guard; -infinity for a barrier that
+        needs no guard.
+        """
         ...
 
     @property
@@ -48,7 +57,9 @@ class Barrier(Protocol):
 
     @property
     def value_unit(self) -> str:
-        """A class attribute: the unit of V1, "1" or "rad^2"; "1" for a barrier that does not declare it."""
+        """A class attribute: the unit of V1, "1" or "rad^2"; "1" for a barrier that does not
+        declare it.
+        """
         ...
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
@@ -59,12 +70,16 @@ class Barrier(Protocol):
         """S = dV1/dq of each joint."""
         ...
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """Alpha of each joint [rad/s], given the gains k1 [1/s] and o [1/s^2]."""
         ...
 
     def decay_rate(self, k1: jax.Array) -> jax.Array | None:
-        """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard is active, or None for no claim."""
+        """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard
+        is active, or None for no claim.
+        """
         ...
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array | None:
@@ -72,21 +87,25 @@ class Barrier(Protocol):
 
         Args:
           V: level of the Lyapunov function, () or (n,), >= 0.
-          tube: the tube at that time; for several barriers the level at which a wall is reached depends on its width.
+          tube: the tube at that time; for several barriers the level at which a wall is reached
+            depends on its width.
         """
         ...
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
-        """The ratio e1/s, finite at e1 = 0, (n,); None for a barrier whose slope is of a higher order there.
+        """The ratio e1/s, finite at e1 = 0, (n,); None for a barrier whose slope is of a higher
+        order there.
 
-        A class attribute `ratio_jumps = False` states that the ratio is continuous at e1 = 0 in an asymmetric tube, too; without it a law
-        assumes that it may jump there.
+        A class attribute `ratio_jumps = False` states that the ratio is continuous at e1 = 0 in an
+        asymmetric tube, too; without it a law assumes that it may jump there.
         """
         ...
 
 
 def value_unit(barrier: Barrier) -> str:
-    """The unit of a barrier's V1 where its error is a position, "1" if the barrier declares none."""
+    """The unit of a barrier's V1 where its error is a position, "1" if the barrier declares
+    none.
+    """
     return getattr(barrier, "value_unit", "1")
 
 
@@ -99,36 +118,45 @@ def check_guard(owner: str, guard: float) -> None:
     """Raises ValueError unless 0 < guard < 1."""
     if not 0.0 < checks.positive_number(f"{owner}.guard", guard, "1") < 1.0:
         raise checks.fail(
-            f"{owner}.guard", guard, "a number between 0 and 1", f"It is a distance from the wall in xi; the default is {GUARD:g}."
+            f"{owner}.guard",
+            guard,
+            "a number between 0 and 1",
+            f"It is a distance from the wall in xi; the default is {GUARD:g}.",
         )
 
 
 class GuardedError(NamedTuple):
-    """The error at which a barrier is evaluated, and the side of the tube that it is on; each (n,)."""
+    """The error at which a barrier is evaluated, and the side of the tube that it is on; each
+    (n,).
+    """
 
     e: jax.Array
     """e1 inside the guard, the edge of the guarded range beyond it [rad]."""
     beyond: jax.Array
     """e1 - e: zero inside the guard [rad]."""
     k: jax.Array
-    """k_u where e1 > 0, k_l elsewhere [rad].                                                                     (3.15)"""
+    """k_u where e1 > 0, k_l elsewhere [rad].
+    (3.15)"""
     dk: jax.Array
     """Its rate [rad/s]."""
 
 
 def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
-    """The error e1 = q - q_d held inside (1 - guard) of its bound: what a barrier is evaluated at, so that it is finite past its wall.
+    """The error e1 = q - q_d held inside (1 - guard) of its bound: what a barrier is evaluated at,
+    so that it is finite past its wall.
 
         e = e1 where |e1| <= (1 - guard) k, else (1 - guard) k sign(e1),   beyond = e1 - e
-        k = h k_u + (1 - h) k_l,   k' = h k_u' + (1 - h) k_l',   h = 1 if e1 > 0 else 0                          (2.5), (3.15)
+        k = h k_u + (1 - h) k_l,   k' = h k_u' + (1 - h) k_l',   h = 1 if e1 > 0 else 0
+        (2.5), (3.15)
 
-    With V and s of the barrier at e, V + s beyond goes on along its tangent and s stays constant: both are finite, with finite
-    derivatives, at every q.
+    With V and s of the barrier at e, V + s beyond goes on along its tangent and s stays constant:
+    both are finite, with finite derivatives, at every q.
 
     Args:
       tube: reference and bounds at this time, a `bounds.Tube`.
       q: positions, (n,) [rad].
-      guard: distance from the wall in xi, a Python number in (0, 1) [1]; `guard` of the barriers, 1e-3 by default.
+      guard: distance from the wall in xi, a Python number in (0, 1) [1]; `guard` of the barriers,
+        1e-3 by default.
 
     Returns:
       `GuardedError`: e, beyond and k, (n,) [rad], and dk, the rate of k, (n,) [rad/s].
@@ -153,17 +181,25 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
 def _in_tube(tube: Tube, q: jax.Array) -> jax.Array:
     """The position as an array that fits the tube."""
     if not isinstance(tube, Tube):
-        raise checks.fail("tube", tube, "an iblf_jax.bounds.Tube", "iblf_jax.bounds.tube_at(reference, bounds, t) makes one.")
+        raise checks.fail(
+            "tube",
+            tube,
+            "an iblf_jax.bounds.Tube",
+            "iblf_jax.bounds.tube_at(reference, bounds, t) makes one.",
+        )
     q = checks.as_floats("q", q)
     try:
         np.broadcast_shapes(q.shape, jnp.shape(tube.q_d))
     except ValueError:
-        raise checks.fail("q", q, f"one number a joint, shape {jnp.shape(tube.q_d)}", f"Its shape is {q.shape}.") from None
+        raise checks.fail(
+            "q", q, f"one number a joint, shape {jnp.shape(tube.q_d)}", f"Its shape is {q.shape}."
+        ) from None
     return q
 
 
 def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
-    """Whether each joint is so near its wall that the guard holds the slope: what a law answers in `Command.guard_active`.
+    """Whether each joint is so near its wall that the guard holds the slope: what a law answers in
+    `Command.guard_active`.
 
         |xi| > 1 - guard
 
@@ -185,7 +221,8 @@ def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
 
 
 def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:
-    """Kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].                          (3.7), root restored
+    """Kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].                          (3.7),
+    root restored
 
     With the root, kappa + k'/k >= 0 on both sides for every o > 0, which is what the proof needs.
     """
@@ -193,5 +230,7 @@ def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:
 
 
 def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: Leaf) -> jax.Array:
-    """Alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s]; shared by the integral and the logarithmic barrier.     (3.5)"""
+    """Alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s]; shared by the integral and the logarithmic
+    barrier.     (3.5)
+    """
     return tube.dq_d - (k1 + bound_motion_gain(tube, o)) * (q - tube.q_d)

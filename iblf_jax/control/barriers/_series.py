@@ -1,7 +1,8 @@
 """Functions with a removable singularity at zero, finite there with all their derivatives.
 
-Each is a closed form away from zero and a series near it, chosen by a double `where`, so that neither branch ever divides by zero:
-values and derivatives of every order are finite and accurate to rounding, in float32 and float64, forward and reverse.
+Each is a closed form away from zero and a series near it, chosen by a double `where`, so that
+neither branch ever divides by zero: values and derivatives of every order are finite and accurate
+  to rounding, in float32 and float64, forward and reverse.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ def sinc(u: jax.Array) -> jax.Array:
     small = jnp.abs(u) < 0.03
     near, far = jnp.where(small, u, 0.0), jnp.where(small, 1.0, u)
     square = near**2
-    series = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
+    series = 1.0 - square / 6.0 * (
+        1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
+    )
     return jnp.where(small, series, jnp.sin(far) / far)
 
 
@@ -32,4 +35,6 @@ def log_remainder(u: jax.Array) -> jax.Array:
     tail = jnp.full_like(u, 1.0 / 21.0)
     for odd in range(19, 1, -2):
         tail = tail * square + 1.0 / odd
-    return jnp.where(small, 1.0 / rest + 2.0 * near / rest**3 * tail, (-jnp.log1p(-far) - far) / far**2)
+    return jnp.where(
+        small, 1.0 / rest + 2.0 * near / rest**3 * tail, (-jnp.log1p(-far) - far) / far**2
+    )

@@ -24,11 +24,13 @@ class Log:
 
         s = e1^(2p-1) / (k^(2p) - e1^(2p)),   alpha = q_d' - (k1 + kappa) e1
 
-    The slope has a kink at e1 = 0 where k_u and k_l differ: second derivatives of a run leave out what the kink adds.
+    The slope has a kink at e1 = 0 where k_u and k_l differ: second derivatives of a run leave out
+    what the kink adds.
 
     Args:
       p: exponent, a whole number >= 1; 1 if not given.
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
+        if not given.
 
     Source: K. P. Tee, B. Ren, S. S. Ge, Automatica 47 (2011) 2511-2516.
     """
@@ -59,11 +61,15 @@ class Log:
         return x ** (2 * self.p - 1) / (k * (1.0 - x ** (2 * self.p)))
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array | None:
-        """k^2 - e1^2 for p = 1, (n,) [rad^2]; None for p > 1, whose slope vanishes as e1^(2p - 1)."""
+        """k^2 - e1^2 for p = 1, (n,) [rad^2]; None for p > 1, whose slope vanishes as e1^(2p -
+        1).
+        """
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return k**2 - e**2 if self.p == 1 else None
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         return paper_virtual_velocity(tube, q, k1, o)
 
@@ -73,4 +79,6 @@ class Log:
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
         """|xi| <= (1 - exp(-2 p V))^(1/(2p)), (n,) [1]."""
-        return jnp.broadcast_to((-jnp.expm1(-2.0 * self.p * V)) ** (1.0 / (2 * self.p)), tube.q_d.shape)
+        return jnp.broadcast_to(
+            (-jnp.expm1(-2.0 * self.p * V)) ** (1.0 / (2 * self.p)), tube.q_d.shape
+        )

@@ -1,4 +1,6 @@
-"""The nonlinear mapping (uniform barrier): the error over its distances to both walls, driven to zero."""
+"""The nonlinear mapping (uniform barrier): the error over its distances to both walls, driven to
+zero.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,16 @@ from iblf_jax.world.bounds import Tube
 class Mapping:
     """V1 = 1/2 z^2,   z = e1 k_l k_u / ((k_l + e1)(k_u - e1)).
 
-        s = z z_e,   alpha = q_d' - (k1 z + z_t) / z_e,   z_e = k_l k_u (k_l k_u + e1^2) / ((k_l + e1)(k_u - e1))^2
+        s = z z_e,   alpha = q_d' - (k1 z + z_t) / z_e,   z_e = k_l k_u (k_l k_u + e1^2) / ((k_l +
+        e1)(k_u - e1))^2
 
-    z_t is the rate of z at fixed e1.  At e2 = 0, V1' = -k1 z^2.  For k -> infinity z -> e1: unconstrained backstepping, without a change of
-    law ("uniform": one law with and without bounds).
+    z_t is the rate of z at fixed e1.  At e2 = 0, V1' = -k1 z^2.  For k -> infinity z -> e1:
+    unconstrained backstepping, without a change of law ("uniform": one law with and without
+    bounds).
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
+        if not given.
 
     Source: K. Zhao, Y. Song, IEEE Trans. Automatic Control 64 (2019) 1265-1272.
     """
@@ -54,11 +59,14 @@ class Mapping:
         a, b = e / tube.k_l, e / tube.k_u
         return ((1.0 + a) * (1.0 - b)) ** 3 / (1.0 + a * b)
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, _, _ = guarded_error(tube, q, self.guard)
         k_l, k_u = tube.k_l, tube.k_u
-        # z / z_e and z_t / z_e with their poles cancelled; in e/k, so that wide bounds do not overflow
+        # z / z_e and z_t / z_e with their poles cancelled; in e/k, so that wide bounds do not
+        # overflow
         a, b = e / k_l, e / k_u
         scale = 1.0 + a * b
         error = e * (1.0 + a) * (1.0 - b) / scale

@@ -1,4 +1,6 @@
-"""Prescribed performance: the error inside its funnel is mapped onto the whole line, and the mapped error is driven to zero."""
+"""Prescribed performance: the error inside its funnel is mapped onto the whole line, and the mapped
+error is driven to zero.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,13 @@ class PrescribedPerformance:
 
         s = eps eps_e,   alpha = q_d' - (k1 eps + eps_t) / eps_e
 
-    eps_e = 1/2 (1/(k_l + e1) + 1/(k_u - e1)), and eps_t is the rate of eps at fixed e1.  At e2 = 0, V1' = -k1 eps^2.
-    Its bounds are usually a `bounds.Funnel`, r(t) = (r0 - rinf) exp(-l t) + rinf; any bounds do.  For k -> infinity s -> 0 and the
-    gain of alpha is k1.
+    eps_e = 1/2 (1/(k_l + e1) + 1/(k_u - e1)), and eps_t is the rate of eps at fixed e1.  At e2 = 0,
+    V1' = -k1 eps^2. Its bounds are usually a `bounds.Funnel`, r(t) = (r0 - rinf) exp(-l t) + rinf;
+    any bounds do.  For k -> infinity s -> 0 and the gain of alpha is k1.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
+        if not given.
 
     Source: C. P. Bechlioulis, G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099.
     """
@@ -50,14 +53,18 @@ class PrescribedPerformance:
         return _eps(e, tube) * _eps_e(e, tube)
 
     def error_over_slope(self, tube: Tube, q: jax.Array) -> jax.Array:
-        """e1/(eps eps_e), (n,) [rad^2]: eps/e1 = 1/2 (h(-e1/k_l)/k_l + h(e1/k_u)/k_u), h(u) = -ln(1 - u)/u."""
+        """e1/(eps eps_e), (n,) [rad^2]: eps/e1 = 1/2 (h(-e1/k_l)/k_l + h(e1/k_u)/k_u), h(u) = -ln(1
+        - u)/u.
+        """
         e, _, _, _ = guarded_error(tube, q, self.guard)
         a, b = -e / tube.k_l, e / tube.k_u
         rest = log_remainder(jnp.stack([a, b]))
         eps_over_e = 0.5 * ((1.0 + a * rest[0]) / tube.k_l + (1.0 + b * rest[1]) / tube.k_u)
         return 1.0 / (eps_over_e * _eps_e(e, tube))
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, _, _ = guarded_error(tube, q, self.guard)
         k_l, k_u = tube.k_l, tube.k_u
@@ -70,7 +77,9 @@ class PrescribedPerformance:
         return 2.0 * k1
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
-        """|xi| <= (1 - E) / (1 + r E), E = exp(-2 sqrt(2V)), r = narrower / wider side: the worst side's bound, (n,) [1]."""
+        """|xi| <= (1 - E) / (1 + r E), E = exp(-2 sqrt(2V)), r = narrower / wider side: the worst
+        side's bound, (n,) [1].
+        """
         ratio = jnp.minimum(tube.k_l, tube.k_u) / jnp.maximum(tube.k_l, tube.k_u)
         size = 2.0 * jnp.sqrt(2.0 * V)
         return -jnp.expm1(-size) / (1.0 + ratio * jnp.exp(-size))

@@ -17,7 +17,8 @@ class Quadratic:
     """V1 = 1/2 e1^2,   s = e1,   alpha = q_d' - k1 e1.
 
     It knows of no bound, so it keeps none: the unconstrained yardstick.  At e2 = 0, V1' = -2 k1 V1.
-    Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design, 1995.
+    Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
+      1995.
     """
 
     guard: ClassVar[float] = -math.inf
@@ -37,7 +38,9 @@ class Quadratic:
         """1, (n,) [1]."""
         return jnp.ones_like(q)
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         return tube.dq_d - k1 * (q - tube.q_d)
 

@@ -1,24 +1,27 @@
 """The integral barrier on the state itself: the wall acts on the position, not on the error.
 
-With the bounds' centre c(t) and half-width kc(t), x = q - c and y = q_d - c, so that e1 = x - y and |x| < kc.  The barrier weighs the
-error by how near the *position* is to its wall,
+With the bounds' centre c(t) and half-width kc(t), x = q - c and y = q_d - c, so that e1 = x - y and
+|x| < kc.  The barrier weighs the error by how near the *position* is to its wall,
 
     V1 = int_0^e1 s kc^2 / (kc^2 - (s + y)^2) ds,
 
-so it needs no feasibility of the error's own bounds (k_l, k_u), only |y| < kc.  Its partial derivatives are
+so it needs no feasibility of the error's own bounds (k_l, k_u), only |y| < kc.  Its partial
+derivatives are
 
-    dV1/dx = kc^2 e1 / (kc^2 - x^2),   dV1/dy = -e1 rho,   dV1/dkc = (2 V1 - x dV1/dx - y dV1/dy) / kc,
-    rho = kc / (2 e1) ln[ (kc + x)(kc - y) / ((kc - x)(kc + y)) ],
+    dV1/dx = kc^2 e1 / (kc^2 - x^2),   dV1/dy = -e1 rho,   dV1/dkc = (2 V1 - x dV1/dx - y dV1/dy) /
+    kc, rho = kc / (2 e1) ln[ (kc + x)(kc - y) / ((kc - x)(kc + y)) ],
 
-the last because V1 = kc^2 K(x/kc, y/kc).  Hence, with w = V1/e1^2 and g = (kc^2 - x^2)/kc^2, the virtual velocity that gives
-V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) at e2 = 0, for a moving centre and a changing half-width, is
+the last because V1 = kc^2 K(x/kc, y/kc).  Hence, with w = V1/e1^2 and g = (kc^2 - x^2)/kc^2, the
+virtual velocity that gives V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) at e2 = 0, for a moving centre and a
+changing half-width, is
 
     alpha = c' + g rho (y' - y kc'/kc) - k1 e1 + x kc'/kc - 2 e1 w g kc'/kc
           = q_d' - k1 e1 - (1 - g rho) (y' - y kc'/kc) + e1 (1 - 2 g w) kc'/kc.
 
-K is the relative entropy KL(P || Q) of two coins P = (1 + y/kc)/2 and Q = (1 + x/kc)/2, and kc^2 e1^2 / (kc^2 - x^2) is kc^2
-times their chi-square distance.  KL <= ln(1 + chi^2) <= chi^2 for any two distributions, so V1' <= -k1 V1; and k1 is the best such
-constant (reference at the wall).  In the code, kc + x = k_l + e1 and kc - x = k_u - e1: no differences of nearly equal numbers.
+K is the relative entropy KL(P || Q) of two coins P = (1 + y/kc)/2 and Q = (1 + x/kc)/2, and kc^2
+e1^2 / (kc^2 - x^2) is kc^2 times their chi-square distance.  KL <= ln(1 + chi^2) <= chi^2 for any
+two distributions, so V1' <= -k1 V1; and k1 is the best such constant (reference at the wall).  In
+the code, kc + x = k_l + e1 and kc - x = k_u - e1: no differences of nearly equal numbers.
 """
 
 from __future__ import annotations
@@ -62,13 +65,15 @@ class State:
         s = kc^2 e1 / (kc^2 - x^2),   x = q - c
         alpha = q_d' - k1 e1 - (1 - g rho) (y' - y kc'/kc) + e1 (1 - 2 g V1/e1^2) kc'/kc
 
-    (symbols and derivation at the head of this module).  At e2 = 0, V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) <= -k1 V1.  For
-    kc -> infinity it is unconstrained backstepping.
+    (symbols and derivation at the head of this module).  At e2 = 0, V1' = -k1 kc^2 e1^2 / (kc^2 -
+    x^2) <= -k1 V1.  For kc -> infinity it is unconstrained backstepping.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
+        if not given.
 
-    Source: K. P. Tee, S. S. Ge, 51st IEEE CDC (2012) 3239-3244 (constant kc); the compensation of kc'(t) is derived here.
+    Source: K. P. Tee, S. S. Ge, 51st IEEE CDC (2012) 3239-3244 (constant kc); the compensation of
+      kc'(t) is derived here.
     """
 
     guard: float = static(default=GUARD)
@@ -96,7 +101,9 @@ class State:
         e, _, _, _ = guarded_error(tube, q, self.guard)
         return _parts(e, tube.k_l, tube.k_u).g
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, _, _ = guarded_error(tube, q, self.guard)
         kc, g, w, rho = _parts(e, tube.k_l, tube.k_u)

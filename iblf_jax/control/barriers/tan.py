@@ -1,4 +1,6 @@
-"""The tangent barrier: it becomes the quadratic one as the bound goes away, but halves the gain there."""
+"""The tangent barrier: it becomes the quadratic one as the bound goes away, but halves the gain
+there.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,12 @@ class Tan:
 
         s = e1 / cos(theta)^2,   alpha = q_d' + e1 k'/k - k^2/(2 pi e1) (k1 + 2 k'/k) sin(2 theta)
 
-    sin(2 theta)/e1 is removable at e1 = 0 and written as such.  At e2 = 0, V1' = -k1 V1.  For k -> infinity s -> e1 and the gain of
-    alpha is k1/2.
+    sin(2 theta)/e1 is removable at e1 = 0 and written as such.  At e2 = 0, V1' = -k1 V1.  For k ->
+    infinity s -> e1 and the gain of alpha is k1/2.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001 if not given.
+      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
+        if not given.
 
     Source: X. Yu, W. He, H. Li, J. Sun, IEEE Trans. Syst. Man Cybern. Syst. 51 (2021) 6994-7007.
     """
@@ -41,7 +44,10 @@ class Tan:
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""
         e, beyond, k, _ = guarded_error(tube, q, self.guard)
-        return k**2 / math.pi * jnp.sin(0.5 * math.pi * (e / k) ** 2) / _cos_th(e / k) + e / _cos_th(e / k) ** 2 * beyond
+        return (
+            k**2 / math.pi * jnp.sin(0.5 * math.pi * (e / k) ** 2) / _cos_th(e / k)
+            + e / _cos_th(e / k) ** 2 * beyond
+        )
 
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
         """s, (n,) [rad]."""
@@ -53,11 +59,18 @@ class Tan:
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return _cos_th(e / k) ** 2
 
-    def virtual_velocity(self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None) -> jax.Array:
+    def virtual_velocity(
+        self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
+    ) -> jax.Array:
         """alpha, (n,) [rad/s]."""
         e, beyond, k, dk = guarded_error(tube, q, self.guard)
         # k^2/(2 pi e) sin 2th = e/2 sinc(2th)
-        return tube.dq_d + e * dk / k - 0.5 * e * (k1 + 2.0 * dk / k) * sinc(math.pi * (e / k) ** 2) - k1 * beyond
+        return (
+            tube.dq_d
+            + e * dk / k
+            - 0.5 * e * (k1 + 2.0 * dk / k) * sinc(math.pi * (e / k) ** 2)
+            - k1 * beyond
+        )
 
     def decay_rate(self, k1: jax.Array) -> jax.Array:
         """k1: V1' = -k1 V1 at e2 = 0, (n,) [1/s]."""
@@ -65,7 +78,9 @@ class Tan:
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
         """|xi| <= sqrt(2/pi arctan(pi V / k^2)), with the narrower side's k, (n,) [1]."""
-        return jnp.sqrt(2.0 / math.pi * jnp.arctan(math.pi * V / jnp.minimum(tube.k_l, tube.k_u) ** 2))
+        return jnp.sqrt(
+            2.0 / math.pi * jnp.arctan(math.pi * V / jnp.minimum(tube.k_l, tube.k_u) ** 2)
+        )
 
 
 def _cos_th(x: jax.Array) -> jax.Array:

@@ -1,4 +1,6 @@
-"""Tracking laws.  The contract is `Controller` in `_base.py`; `systems.py` has the paper's systems by name."""
+"""Tracking laws.  The contract is `Controller` in `_base.py`; `systems.py` has the paper's systems
+by name.
+"""
 
 from iblf_jax.control.controllers._base import Command as Command
 from iblf_jax.control.controllers._base import Controller as Controller

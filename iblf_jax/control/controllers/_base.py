@@ -1,8 +1,8 @@
 """The contract of a tracking law.
 
-A law knows the model, the reference and the bounds (its `Setting`), measures q and q', is given the observer's estimate, and
-commands a torque.  Everything else that it returns is there to be looked at: its virtual velocity alpha, its Lyapunov function
-V1, whether a guard or a limit was at work.
+A law knows the model, the reference and the bounds (its `Setting`), measures q and q', is given the
+observer's estimate, and commands a torque.  Everything else that it returns is there to be looked
+at: its virtual velocity alpha, its Lyapunov function V1, whether a guard or a limit was at work.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ State = Any
 
 
 class Setting(NamedTuple):
-    """What a law knows of the world; of bounds on the velocities, and of regions, if there are any."""
+    """What a law knows of the world; of bounds on the velocities, and of regions, if there are
+    any.
+    """
 
     model: Robot
     reference: Reference
@@ -35,15 +37,21 @@ class Setting(NamedTuple):
         return _tube(self.reference, self.bounds, t, acceleration)
 
     def speed_limits(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The bounds on the velocities at time t [s], (n,) each [rad/s]; only where there are any."""
+        """The bounds on the velocities at time t [s], (n,) each [rad/s]; only where there are
+        any.
+        """
         return speed_limits_at(self.reference, self.velocity_bounds, t)  # type: ignore[arg-type]
 
     def regions_along(self, q: jax.Array, dq: jax.Array) -> Along:
-        """How the model's points move through the regions at q [rad] and dq [rad/s]; only where there are any."""
+        """How the model's points move through the regions at q [rad] and dq [rad/s]; only where
+        there are any.
+        """
         return along(self.regions, self.model, q, dq)
 
 
-@partial(jax.jit, static_argnums=3, inline=True)  # so that it is traced once for all that ask at a time
+@partial(
+    jax.jit, static_argnums=3, inline=True
+)  # so that it is traced once for all that ask at a time
 def _tube(reference: Reference, bounds: Bounds, t: jax.Array, acceleration: bool) -> Tube:
     return tube_at(reference, bounds, t, acceleration=acceleration)
 
@@ -62,7 +70,8 @@ class Command(NamedTuple):
     saturated: jax.Array
     """bool: the torque was cut to a limit."""
     slack: Any = ()
-    """By how much a filter had to break its own conditions, (n,) [rad/s^2]; `()` for laws that have none."""
+    """By how much a filter had to break its own conditions, (n,) [rad/s^2]; `()` for laws that have
+    none."""
     region_slack: Any = ()
     """The same of its conditions on m regions, (m,) [m/s^2]; `()` where there are none."""
 
@@ -72,26 +81,39 @@ class Controller(Protocol):
 
     A law with a proof of its own may also fit `LyapunovLaw`; then `certify` checks what it states.
 
-    A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it works ("k1", "K2" if it says nothing),
-    which `compare` scales together; `uses_observer = False` if it has no use for f_hat; `needs_velocity_bounds = True` if it cannot do
-    without `Setting.velocity_bounds`; `includes_e2 = True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2;
-    `filters = True` if its commands have a `slack`; `wraps`, the name of the field that holds another law whose paths are then its own
-    ("controller.K2" reaches through); `unit_factors`, the names of leaves that only multiply, of which it may be compiled in which numbers
-    are 1 (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(setting)`, which raises
-    ValueError for what does not fit together where the number of joints is known, and `leaf_units()`, the units of leaves that depend on
-    other fields, by name.
+    A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it
+      works ("k1", "K2" if it says nothing),
+    which `compare` scales together; `uses_observer = False` if it has no use for f_hat;
+    `needs_velocity_bounds = True` if it cannot do without `Setting.velocity_bounds`; `includes_e2 =
+    True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2; `filters =
+    True` if its commands have a `slack`; `wraps`, the name of the field that holds another law
+    whose paths are then its own ("controller.K2" reaches through); `unit_factors`, the names of
+    leaves that only multiply, of which it may be compiled in which numbers are 1
+    (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(setting)`,
+      which raises ValueError for what does not fit together where the number of joints is known,
+      and `leaf_units()`, the units of leaves that depend on other fields, by name.
 
-    A law whose command jumps declares where: `switching(t, q, dq, setting, state)` returns (m,) functions of q or q', and the command
-    jumps where one of them crosses 0 (as sliding-mode laws do, or `FullState` with some barriers).  The derivatives of a run then contain
-    what such a jump does to a perturbation (`engine.switching`); without the method they leave it out.  A law that wraps another
-    passes the call on with `switching_functions`.
+    A law whose command jumps declares where: `switching(t, q, dq, setting, state)` returns (m,)
+      functions of q or q', and the command
+    jumps where one of them crosses 0 (as sliding-mode laws do, or `FullState` with some barriers).
+    The derivatives of a run then contain what such a jump does to a perturbation
+    (`engine.switching`); without the method they leave it out.  A law that wraps another passes the
+    call on with `switching_functions`.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
         ...
 
-    def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
+    def command(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: State,
+    ) -> tuple[Command, State]:
         """The command, and the rate of the law's own state (same structure as the state).
 
         Args:
@@ -104,42 +126,75 @@ class Controller(Protocol):
         ...
 
 
-def switching_functions(law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
-    """The functions at whose zeros a law's command jumps, (m,), or None if it declares none; arguments as `Controller.command`."""
+def switching_functions(
+    law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State
+) -> jax.Array | None:
+    """The functions at whose zeros a law's command jumps, (m,), or None if it declares none;
+    arguments as `Controller.command`.
+    """
     declared = getattr(law, "switching", None)
     return None if declared is None else declared(t, q, dq, setting, state)
 
 
 class LyapunovLaw(Protocol):
-    """What a law that states a claim of its own has besides: a Lyapunov function V and its decay W, for `certify` to check.
+    """What a law that states a claim of its own has besides: a Lyapunov function V and its decay W,
+    for `certify` to check.
 
         V' <= -W + T
 
-    `certify` differentiates V along the vector field of the loop and holds the inequality against every step of a run.  T is what
-    `disturbance_terms` returns.  A law without that method is given what the uncertain term adds to V' whatever the law is,
-    T = dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
+    `certify` differentiates V along the vector field of the loop and holds the inequality against
+    every step of a run.  T is what `disturbance_terms` returns.  A law without that method is given
+    what the uncertain term adds to V' whatever the law is, T = dV/dq' . M0^-1 f_tilde + dV/df_tilde
+    . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
     """
 
-    def lyapunov(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, setting: Setting, state: State) -> jax.Array:
+    def lyapunov(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_tilde: jax.Array,
+        setting: Setting,
+        state: State,
+    ) -> jax.Array:
         """V >= 0, () or (n,).
 
         Args:
           t: time, () [s].
           q, dq: position [rad] and velocity [rad/s], (n,).
-          f_tilde: error of the observer's estimate, f - f_hat, (n,) [N m]; f itself for a law with `uses_observer = False`.
+          f_tilde: error of the observer's estimate, f - f_hat, (n,) [N m]; f itself for a law with
+            `uses_observer = False`.
           setting: model, reference and bounds.
           state: the law's own state.
         """
         ...
 
-    def decay(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, setting: Setting, state: State) -> jax.Array:
-        """W >= 0, () or (n,), in the unit of V a second: how fast V decreases where f_tilde = 0.  Arguments as `lyapunov`."""
+    def decay(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_tilde: jax.Array,
+        setting: Setting,
+        state: State,
+    ) -> jax.Array:
+        """W >= 0, () or (n,), in the unit of V a second: how fast V decreases where f_tilde = 0.
+        Arguments as `lyapunov`.
+        """
         ...
 
     def disturbance_terms(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_tilde: jax.Array, df: jax.Array, setting: Setting, state: State
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_tilde: jax.Array,
+        df: jax.Array,
+        setting: Setting,
+        state: State,
     ) -> jax.Array:
-        """T, () or (n,), in the unit of V a second: what f_tilde and f' may add to V'.  A law may leave this method out.
+        """T, () or (n,), in the unit of V a second: what f_tilde and f' may add to V'.  A law may
+        leave this method out.
 
         Args:
           t, q, dq, f_tilde, setting, state: as `lyapunov`.

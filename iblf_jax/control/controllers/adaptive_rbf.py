@@ -1,15 +1,20 @@
-"""Adaptive radial-basis network with a barrier: no model, no observer, weights that are part of the loop's state.
+"""Adaptive radial-basis network with a barrier: no model, no observer, weights that are part of the
+loop's state.
 
-What the backstepping law takes from the model, M0 alpha' + C0 alpha + G0 - f, a network of Gaussians learns while it runs:
+What the backstepping law takes from the model, M0 alpha' + C0 alpha + G0 - f, a network of
+Gaussians learns while it runs:
 
-    W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),   z = Z over its spans
-    W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
+    W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),   z = Z over
+    its spans W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
 
-The sigma-modification bounds the weights whatever happens: as |S| <= sqrt(nodes), the column of joint i obeys
+The sigma-modification bounds the weights whatever happens: as |S| <= sqrt(nodes), the column of
+  joint i obeys
 |W_hat_i| <= sqrt(nodes) sup|e2_i| / sigma.  The literature puts the centres on a lattice, which in the 4n dimensions of Z has
-nodes^(4n) points; here they are a fixed number of points of a Sobol sequence in the box [-1, 1]^(4n).
+nodes^(4n) points; here they are a fixed number of points of a Sobol sequence in the box [-1,
+1]^(4n).
 
-ASSUMPTION: the source's own node count, centres and gains could not be found; all numbers here are this package's.
+ASSUMPTION: the source's own node count, centres and gains could not be found; all numbers here are
+  this package's.
 """
 
 from __future__ import annotations
@@ -34,14 +39,17 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 class AdaptiveRBF:
     """tau = -w s - K2 e2 + W_hat^T S(Z),   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat).
 
-    s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes, n) [N m].
+    s and alpha are the barrier's; no model is used, and f_hat is not.  The state is W_hat, (nodes,
+    n) [N m].
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
       K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0.
-      o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not given.
+      o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not
+        given.
       Gamma: rate of adaptation of each joint's weights, () or (n,) [N m/rad], > 0; 20 if not given.
-      sigma: leak that bounds the weights, () or (n,) [rad/(N m s)], > 0; what it forgets stays as an error; 0.005 if not given.
+      sigma: leak that bounds the weights, () or (n,) [rad/(N m s)], > 0; what it forgets stays as
+        an error; 0.005 if not given.
       middle: position at the centre of the nodes' box, () or (n,) [rad]; 0.5 if not given.
       span_q: half the box in q, () or (n,) [rad], > 0; 0.5 if not given.
       span_dq: half the box in q' and alpha, () or (n,) [rad/s], > 0; 1 if not given.
@@ -52,7 +60,8 @@ class AdaptiveRBF:
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
         rad^2), > 0; 1, the paper's, if not given.
 
-    Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068; numbers as said at the head of this module.
+    Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068;
+      numbers as said at the head of this module.
     """
 
     k1: Leaf = leaf("1/s", sign="positive")
@@ -75,7 +84,9 @@ class AdaptiveRBF:
     def check(self) -> None:
         """Raises ValueError for a bad barrier or number of nodes; completes `o` and `weight`."""
         checks.positive_integer("AdaptiveRBF.nodes", self.nodes)
-        checks.conforms("AdaptiveRBF.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Log().", CLAIMS)
+        checks.conforms(
+            "AdaptiveRBF.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Log().", CLAIMS
+        )
         fit_o(self)
         fit_weight(self)
 
@@ -89,12 +100,25 @@ class AdaptiveRBF:
 
     def basis(self, q: jax.Array, dq: jax.Array, alpha: jax.Array, dalpha: jax.Array) -> jax.Array:
         """S(Z), (nodes,) [1]."""
-        z = jnp.concatenate([(q - self.middle) / self.span_q, dq / self.span_dq, alpha / self.span_dq, dalpha / self.span_ddq])
+        z = jnp.concatenate(
+            [
+                (q - self.middle) / self.span_q,
+                dq / self.span_dq,
+                alpha / self.span_dq,
+                dalpha / self.span_ddq,
+            ]
+        )
         offset = z - jnp.asarray(sobol_centres(self.nodes, z.size), z.dtype)
         return jnp.exp(-jnp.sum(offset**2, axis=1) / self.width**2)
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: jax.Array
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: jax.Array,
     ) -> tuple[Command, jax.Array]:
         """The torque, what belongs to it, and W_hat'."""
         alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
@@ -110,7 +134,9 @@ class AdaptiveRBF:
 
 @functools.lru_cache(maxsize=16)
 def sobol_centres(nodes: int, dimensions: int) -> np.ndarray:
-    """The first `nodes` points of the unscrambled Sobol sequence, centred in their cells, in [-1, 1]^dimensions."""
+    """The first `nodes` points of the unscrambled Sobol sequence, centred in their cells, in [-1,
+    1]^dimensions.
+    """
     from scipy.stats import qmc
 
     order = math.ceil(math.log2(nodes))

@@ -1,16 +1,20 @@
 """The backstepping law of the paper, for any barrier.
 
-Step one: were q' = alpha(t, q), the barrier's V1 would decay.  Step two: drive e2 = q' - alpha to zero,
+Step one: were q' = alpha(t, q), the barrier's V1 would decay.  Step two: drive e2 = q' - alpha to
+  zero,
 
-    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - w s,                                                         (3.14)
+    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - w s,
+    (3.14)
 
-with s = dV1/dq the barrier's slope ("Con" in the paper) and alpha' the total time derivative of alpha, taken by jvp along
-(1, q').  The paper has w = 1.  Another weight w_i > 0 scales the Lyapunov function of its joint, V1 = sum_i w_i V1_i, and leaves its
-decay rate as it is.  The integral barrier acts on a joint as a spring of 2 w/k^2 at e1 = 0, whatever K2 and kf are: on a joint of
+with s = dV1/dq the barrier's slope ("Con" in the paper) and alpha' the total time derivative of
+alpha, taken by jvp along (1, q').  The paper has w = 1.  Another weight w_i > 0 scales the Lyapunov
+function of its joint, V1 = sum_i w_i V1_i, and leaves its decay rate as it is.  The integral
+barrier acts on a joint as a spring of 2 w/k^2 at e1 = 0, whatever K2 and kf are: on a joint of
 small inertia a sampled loop needs a small weight.
 
-That is the law as `printed`.  Its proof drops 1/2 e2^T M0' e2; the `corrected` reading has C0 alpha in place of
-C0 q', which cancels that term by skew symmetry, and then the claim of Theorem 2 is exact.
+That is the law as `printed`.  Its proof drops 1/2 e2^T M0' e2; the `corrected` reading has C0 alpha
+in place of C0 q', which cancels that term by skew symmetry, and then the claim of Theorem 2 is
+exact.
 """
 
 from __future__ import annotations
@@ -33,13 +37,15 @@ READINGS = ("printed", "corrected")
 
 @component
 class Backstepping:
-    """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).              (3.14)
+    """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).
+    (3.14)
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
-      K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0; the paper's Theorem 2 asks for more than 1/2.
-      o: margin under the root of kappa (3.7), () or (n,) [1/s^2], > 0, for barriers that compensate a moving bound by kappa and for no
-        others; 0.1, the paper's, for these, if not given.
+      K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0; the paper's Theorem 2
+        asks for more than 1/2.
+      o: margin under the root of kappa (3.7), () or (n,) [1/s^2], > 0, for barriers that compensate
+        a moving bound by kappa and for no others; 0.1, the paper's, for these, if not given.
       barrier: any `Barrier`; `Integral()` if not given.
       reading: "printed" or "corrected"; "printed" if not given.
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
@@ -58,9 +64,17 @@ class Backstepping:
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
 
     def check(self) -> None:
-        """Raises ValueError for an unknown reading; completes `o` (0.1, the paper's, if the barrier needs one) and `weight`."""
+        """Raises ValueError for an unknown reading; completes `o` (0.1, the paper's, if the barrier
+        needs one) and `weight`.
+        """
         checks.one_of("Backstepping.reading", self.reading, READINGS)
-        checks.conforms("Backstepping.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().", CLAIMS)
+        checks.conforms(
+            "Backstepping.barrier",
+            self.barrier,
+            Barrier,
+            "Such as iblf_jax.barriers.Integral().",
+            CLAIMS,
+        )
         fit_o(self)
         fit_weight(self)
 
@@ -69,14 +83,19 @@ class Backstepping:
         return {"weight": weight_unit(self.barrier)}
 
     def advice(self) -> list[str]:
-        """What is lost of Theorem 2 where the paper's law, whose weight is 1, has a gain outside its conditions."""
+        """What is lost of Theorem 2 where the paper's law, whose weight is 1, has a gain outside
+        its conditions.
+        """
         if not checks.is_concrete((self.K2, self.weight)):
             return []
         is_papers = np.asarray(self.weight) == 1.0
         if not np.any(is_papers & (np.asarray(self.K2) <= 0.5)):
             return []
         need = "Theorem 2 needs K2 > 1/2 on every joint (3.17) for the paper's envelope of V2"
-        rest = "the corrected law with a momentum observer has the weighted claim of ij.certify for every K2 > 0"
+        rest = (
+            "the corrected law with a momentum observer has the weighted claim of ij.certify for"
+            " every K2 > 0"
+        )
         return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost: {rest}."]
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
@@ -84,21 +103,32 @@ class Backstepping:
         return ()
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque (3.14) and what belongs to it."""
         alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
         tube, model = setting.tube(t), setting.model
         carried = alpha if self.reading == "corrected" else dq
-        feedforward = model.coriolis(q, dq, carried) + model.gravity(q) + matvec(model.mass_matrix(q), dalpha)
-        tau = feedforward - f_hat - self.K2 * (dq - alpha) - self.weight * self.barrier.slope(tube, q)
+        feedforward = (
+            model.coriolis(q, dq, carried) + model.gravity(q) + matvec(model.mass_matrix(q), dalpha)
+        )
+        tau = (
+            feedforward - f_hat - self.K2 * (dq - alpha) - self.weight * self.barrier.slope(tube, q)
+        )
         guard_active = guard_is_active(tube, q, self.barrier.guard)
         value = self.weight * self.barrier.value(tube, q)
         return Command(tau, alpha, value, guard_active, jnp.zeros_like(guard_active)), ()
 
 
 def fit_o(law) -> None:
-    """Fits `o` of a law under construction to its barrier: 0.1, the paper's, if the barrier needs one and none was given.
+    """Fits `o` of a law under construction to its barrier: 0.1, the paper's, if the barrier needs
+    one and none was given.
 
     Raises:
       ValueError: an `o` for a barrier that has no kappa.
@@ -108,7 +138,12 @@ def fit_o(law) -> None:
         object.__setattr__(law, "o", jnp.full_like(law.k1, 0.1))
     if not uses_o and law.o is not None:
         barrier = type(law.barrier).__name__
-        raise checks.fail(f"{type(law).__name__}.o", law.o, f"None with the barrier {barrier}", "That barrier has no kappa; leave `o` out.")
+        raise checks.fail(
+            f"{type(law).__name__}.o",
+            law.o,
+            f"None with the barrier {barrier}",
+            "That barrier has no kappa; leave `o` out.",
+        )
 
 
 def fit_weight(law) -> None:
@@ -122,8 +157,12 @@ def weight_unit(barrier: Barrier) -> str:
     return "N m/rad" if value_unit(barrier) == "rad^2" else "N m rad"
 
 
-def alpha_and_rate(law, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[jax.Array, jax.Array]:
-    """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,), for a law with `barrier`, `k1`, `o`."""
+def alpha_and_rate(
+    law, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting
+) -> tuple[jax.Array, jax.Array]:
+    """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,),
+    for a law with `barrier`, `k1`, `o`.
+    """
 
     def alpha_at(t, q):
         return law.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, law.k1, law.o)

@@ -1,6 +1,7 @@
 """Computed torque: the yardstick that cancels the model and knows of no bound.
 
-With the exact model and estimate the error obeys e1" + Kd e1' + Kp e1 = 0, joint by joint; otherwise M0^-1 f_tilde drives it.
+With the exact model and estimate the error obeys e1" + Kd e1' + Kp e1 = 0, joint by joint;
+otherwise M0^-1 f_tilde drives it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,13 @@ class ComputedTorque:
         return ()
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
         tube, model = setting.tube(t), setting.model

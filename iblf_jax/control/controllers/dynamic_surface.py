@@ -5,9 +5,11 @@ alpha goes through a filter of the first order, and the law follows what comes o
     mu beta' + beta = alpha,   beta(0) = alpha(0),   e2 = q' - beta,
     tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   beta' = (alpha - beta)/mu,
 
-so that alpha' is never formed: neither the reference's acceleration nor the rates of the bounds' rates are needed.  The price is
-the filter's lag, beta - alpha = -mu beta', which drives e1 as an error of the velocity would: about mu |alpha'|/k1 is left of it.  For
-mu -> 0 it is the backstepping law in its corrected reading.  It is claimed to be ultimately bounded; Theorem 2 says nothing of it.
+so that alpha' is never formed: neither the reference's acceleration nor the rates of the bounds'
+rates are needed.  The price is the filter's lag, beta - alpha = -mu beta', which drives e1 as an
+error of the velocity would: about mu |alpha'|/k1 is left of it.  For mu -> 0 it is the backstepping
+  law in its corrected reading.  It is claimed to be ultimately bounded; Theorem 2 says nothing of
+  it.
 """
 
 from __future__ import annotations
@@ -28,20 +30,24 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 
 @component
 class DynamicSurface:
-    """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha,   e2 = q' - beta.
+    """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha,   e2 = q' -
+    beta.
 
     The state is beta, (n,) [rad/s], which stands for alpha in all that is recorded.
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
       K2: diagonal of the velocity error's gain, () or (n,) [N m s/rad], > 0.
-      filter: time constant mu of the filter, () or (n,) [s], > 0; a sampled law needs one longer than half its period.
-      o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not given.
+      filter: time constant mu of the filter, () or (n,) [s], > 0; a sampled law needs one longer
+        than half its period.
+      o: as `Backstepping.o`, () or (n,) [1/s^2], > 0; 0.1 for a barrier that needs it, if not
+        given.
       barrier: any `Barrier`; `Integral()` if not given.
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
         rad^2), > 0; 1, the paper's, if not given.
 
-    Source: D. Swaroop, J. K. Hedrick, P. P. Yip, J. C. Gerdes, IEEE Trans. Automatic Control 45 (2000) 1893-1899; with barriers as at the
+    Source: D. Swaroop, J. K. Hedrick, P. P. Yip, J. C. Gerdes, IEEE Trans. Automatic Control 45
+      (2000) 1893-1899; with barriers as at the
     head of this module.
     """
 
@@ -56,7 +62,13 @@ class DynamicSurface:
 
     def check(self) -> None:
         """Raises ValueError for something that is no barrier; completes `o` and `weight`."""
-        checks.conforms("DynamicSurface.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Integral().", CLAIMS)
+        checks.conforms(
+            "DynamicSurface.barrier",
+            self.barrier,
+            Barrier,
+            "Such as iblf_jax.barriers.Integral().",
+            CLAIMS,
+        )
         fit_o(self)
         fit_weight(self)
 
@@ -66,20 +78,32 @@ class DynamicSurface:
 
     def _alpha(self, t: jax.Array, q: jax.Array, setting: Setting) -> jax.Array:
         """Alpha, (n,) [rad/s]."""
-        return self.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, self.k1, self.o)
+        return self.barrier.virtual_velocity(
+            setting.tube(t, acceleration=False), q, self.k1, self.o
+        )
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> jax.Array:
         """beta(0) = alpha(0), (n,) [rad/s]."""
         return self._alpha(jnp.zeros((), q.dtype), q, setting)
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: jax.Array
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: jax.Array,
     ) -> tuple[Command, jax.Array]:
         """The torque, what belongs to it, and beta'."""
         tube, model, beta = setting.tube(t), setting.model, state
         dbeta = (self._alpha(t, q, setting) - beta) / self.filter
-        feedforward = model.coriolis(q, dq, beta) + model.gravity(q) + matvec(model.mass_matrix(q), dbeta)
-        tau = feedforward - f_hat - self.K2 * (dq - beta) - self.weight * self.barrier.slope(tube, q)
+        feedforward = (
+            model.coriolis(q, dq, beta) + model.gravity(q) + matvec(model.mass_matrix(q), dbeta)
+        )
+        tau = (
+            feedforward - f_hat - self.K2 * (dq - beta) - self.weight * self.barrier.slope(tube, q)
+        )
         guard_active = guard_is_active(tube, q, self.barrier.guard)
         value = self.weight * self.barrier.value(tube, q)
         return Command(tau, beta, value, guard_active, jnp.zeros_like(guard_active)), dbeta

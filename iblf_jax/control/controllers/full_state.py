@@ -1,42 +1,51 @@
 """Bounds on positions and on velocities by barriers: one on e1, one more on e2.
 
-With alpha and alpha' of the first barrier the velocities' bounds v_l(t) < q' < v_u(t) are bounds of e2 = q' - alpha,
+With alpha and alpha' of the first barrier the velocities' bounds v_l(t) < q' < v_u(t) are bounds of
+e2 = q' - alpha,
 
     -K_l < e2 < K_u,   K_u = v_u - alpha,   K_l = alpha - v_l,
 
-which both must be positive: alpha inside the velocities' bounds is to e2 what Assumption 2 is to e1.  So e2 has a tube like e1's, with
-alpha in the place of the reference, and any barrier of the family, phi with its slope s2 = dphi/de2 and the "virtual velocity" a2 of
-that tube, keeps it:
+which both must be positive: alpha inside the velocities' bounds is to e2 what Assumption 2 is to
+  e1.  So e2 has a tube like e1's, with
+alpha in the place of the reference, and any barrier of the family, phi with its slope s2 = dphi/de2
+and the "virtual velocity" a2 of that tube, keeps it:
 
-    q" = a2 - s1 e2/s2 - c s2 + M0^-1 f_tilde,   s2 (a2 - alpha') + dphi/dt <= -(its decay),                                     (F.1)
-    (V1 + phi)' <= -(decay of V1) - (decay of phi) + s2 . M0^-1 f_tilde - c |s2|^2,                                              (F.2)
+    q" = a2 - s1 e2/s2 - c s2 + M0^-1 f_tilde,   s2 (a2 - alpha') + dphi/dt <= -(its decay),
+    (F.1) (V1 + phi)' <= -(decay of V1) - (decay of phi) + s2 . M0^-1 f_tilde - c |s2|^2,
+    (F.2)
 
-as s1 e2/s2 . s2 cancels the cross term s1 . e2 of V1' exactly.  For the integral barrier a2 = alpha' - (K2 + kappa2) e2 and
-e2/s2 = (K^2 - e2^2)/2.  With f_tilde in V2 = V1 + phi + 1/2 |f_tilde|^2, and s2 . M0^-1 f_tilde <= c |s2|^2 + |f_tilde|^2/(4 c lambda^2),
-lambda = lambda_min(M0), the loop with a momentum observer obeys
+as s1 e2/s2 . s2 cancels the cross term s1 . e2 of V1' exactly.  For the integral barrier a2 =
+alpha' - (K2 + kappa2) e2 and e2/s2 = (K^2 - e2^2)/2.  With f_tilde in V2 = V1 + phi + 1/2
+|f_tilde|^2, and s2 . M0^-1 f_tilde <= c |s2|^2 + |f_tilde|^2/(4 c lambda^2), lambda = lambda_min(M0), the loop with a momentum observer obeys
 
-    V2' <= -rho V2 (+ 1/2 |f'|^2),   rho = min(decay rate of V1, that of phi, 2 (kf (- 1/2) - 1/(4 c lambda^2)));               (F.3)
+    V2' <= -rho V2 (+ 1/2 |f'|^2),   rho = min(decay rate of V1, that of phi, 2 (kf (- 1/2) - 1/(4 c
+    lambda^2)));               (F.3)
 
 what stands in brackets is for f' != 0 (case 2).
 
-A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 replaces s1 in (F.1), the cross term cancels as
-before, and all claims hold with this V1.
+A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 replaces
+s1 in (F.1), the cross term cancels as before, and all claims hold with this V1.
 
-The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and K_l differ: there the torque jumps by
-M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation asks for.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
+The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and
+K_l differ: there the torque jumps by M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation asks
+  for.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
 
-**Derivatives across the jump.**  In a continuous loop the derivative of a step that reaches e2_i = 0 is that of the hybrid flow, with the
-jump of a perturbation at the crossing (`engine.switching`, J.1), in every executor and in forward and reverse mode; that of a metric of
-the torque contains the jump of its integrand.  Limits:
+**Derivatives across the jump.**  In a continuous loop the derivative of a step that reaches e2_i =
+0 is that of the hybrid flow, with the jump of a perturbation at the crossing (`engine.switching`,
+J.1), in every executor and in forward and reverse mode; that of a metric of the torque contains the
+jump of its integrand.  Limits:
 
-- Where the torques of both sides drive e2_i towards 0, it slides along 0.  Derivatives of the state are then those of the sliding motion,
-  of first order in dt; those of a metric of the torque leave out how the torque alternates.  Where e2_i touches 0 without crossing it, no
-  derivative exists.
-- A sampled loop holds its torque, so that its derivative needs no such term.  But its metrics, as functions of a gain, jump whenever a
-  crossing moves from one sample to the next, and no derivative contains that.
-- Second derivatives leave out the kink of the barrier's slope at e1 = 0, as those of every law with asymmetric bounds do.
+- Where the torques of both sides drive e2_i towards 0, it slides along 0.  Derivatives of the state
+  are then those of the sliding motion, of first order in dt; those of a metric of the torque leave
+  out how the torque alternates.  Where e2_i touches 0 without crossing it, no derivative exists.
+- A sampled loop holds its torque, so that its derivative needs no such term.  But its metrics, as
+  functions of a gain, jump whenever a crossing moves from one sample to the next, and no derivative
+  contains that.
+- Second derivatives leave out the kink of the barrier's slope at e1 = 0, as those of every law with
+  asymmetric bounds do.
 - A fixed step across the jump is of first order; `numerical_error` contains that error.
-- Other solvers that take `VectorField` step across the jump in their own way: derivatives through them leave the term out.
+- Other solvers that take `VectorField` step across the jump in their own way: derivatives through
+  them leave the term out.
 """
 
 from __future__ import annotations
@@ -61,33 +70,41 @@ WEIGHT_UNITS = {
     ("1", "rad^2"): "rad^2/s^2",
     ("rad^2", "rad^2"): "1/s^2",
 }
-"""Units of V1 and of phi's barrier on positions -> unit of the weight, with which w V1 has the unit of phi."""
+"""Units of V1 and of phi's barrier on positions -> unit of the weight, with which w V1 has the unit
+of phi."""
 
 
 @component
 class FullState:
-    """tau = C0 q' + G0 + M0 (a2 - w s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for the integral barrier.
+    """tau = C0 q' + G0 + M0 (a2 - w s1 e2/s2 - c s2) - f_hat,   a2 = alpha' - (K2 + kappa2) e2 for
+    the integral barrier.
 
-    It keeps the scenario's `velocity_bounds` too, as long as alpha is inside them (`alpha_margin` > 0); symbols at the head of this
-    module.  Its V1 is that of e1 and that of e2.  Symmetric constant bounds with p = 1 logarithms on both are the barriers of the source.
+    It keeps the scenario's `velocity_bounds` too, as long as alpha is inside them (`alpha_margin` >
+    0); symbols at the head of this module.  Its V1 is that of e1 and that of e2.  Symmetric
+    constant bounds with p = 1 logarithms on both are the barriers of the source.
 
-    With `Integral` or `Log` as `velocity_barrier` the torque jumps at e2 = 0 where K_u and K_l differ.  First derivatives of a run contain
-    that jump (head of this module, with the limits).  Hessians leave out the kink of the barrier's slope at e1 = 0.  `Mapping`, `Tan`,
-    `State` and `PrescribedPerformance` have no jump.
+    With `Integral` or `Log` as `velocity_barrier` the torque jumps at e2 = 0 where K_u and K_l
+    differ.  First derivatives of a run contain that jump (head of this module, with the limits).
+    Hessians leave out the kink of the barrier's slope at e1 = 0.  `Mapping`, `Tan`, `State` and
+    `PrescribedPerformance` have no jump.
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
-      K2: gain of the velocity error, () or (n,) [1/s], > 0; an acceleration's, not a torque's as `Backstepping.K2`.
-      c: how hard the slope s2 is resisted while the observer has not found f, () or (n,) [rad^2/s^3] (1/s where phi is in
-        rad^2/s^2), > 0; the claim of case 2 asks for c > 1/(4 (kf - 1/2) lambda_min(M0)^2).
-      o: margin under the roots of both kappas, () or (n,) [1/s^2], > 0, for barriers that have them and for no others; 0.1 for these, if
-        not given.
+      K2: gain of the velocity error, () or (n,) [1/s], > 0; an acceleration's, not a torque's as
+        `Backstepping.K2`.
+      c: how hard the slope s2 is resisted while the observer has not found f, () or (n,)
+        [rad^2/s^3] (1/s where phi is in rad^2/s^2), > 0; the claim of case 2 asks for c > 1/(4 (kf
+        - 1/2) lambda_min(M0)^2).
+      o: margin under the roots of both kappas, () or (n,) [1/s^2], > 0, for barriers that have them
+        and for no others; 0.1 for these, if not given.
       barrier: on e1, any `Barrier`; `Integral()` if not given.
-      velocity_barrier: on e2, any `Barrier` whose slope falls with e2 itself (not `Log` with p > 1); `Integral()` if not given.
-      weight: w of the V1 of e1, () or (n,) [1], > 0; 1 if not given.  Where V1 is in rad^2 its unit has 1/rad^2 besides, where phi is in
-        rad^2/s^2 it has rad^2/s^2.
+      velocity_barrier: on e2, any `Barrier` whose slope falls with e2 itself (not `Log` with p >
+        1); `Integral()` if not given.
+      weight: w of the V1 of e1, () or (n,) [1], > 0; 1 if not given.  Where V1 is in rad^2 its unit
+        has 1/rad^2 besides, where phi is in rad^2/s^2 it has rad^2/s^2.
 
-    Source: W. He, Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (symmetric, constant, logarithms); asymmetric, time-varying
+    Source: W. He, Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (symmetric, constant,
+      logarithms); asymmetric, time-varying
     and for any barrier as derived at the head of this module.
     """
 
@@ -104,17 +121,40 @@ class FullState:
     includes_e2: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raises ValueError for something that is no barrier, or one that cannot bound velocities; completes `o` and `weight`."""
+        """Raises ValueError for something that is no barrier, or one that cannot bound velocities;
+        completes `o` and `weight`.
+        """
         for name in ("barrier", "velocity_barrier"):
-            checks.conforms(f"FullState.{name}", getattr(self, name), Barrier, "Such as iblf_jax.barriers.Integral().", CLAIMS)
+            checks.conforms(
+                f"FullState.{name}",
+                getattr(self, name),
+                Barrier,
+                "Such as iblf_jax.barriers.Integral().",
+                CLAIMS,
+            )
         if _ratio_of(self.velocity_barrier) is None:
-            remedy = "iblf_jax.barriers.Integral() and Log() with p = 1 are such; one of your own needs `error_over_slope`."
-            raise checks.fail("FullState.velocity_barrier", self.velocity_barrier, "one whose slope falls with the error itself", remedy)
-        uses_o = [getattr(barrier, "uses_o", True) for barrier in (self.barrier, self.velocity_barrier)]
+            remedy = (
+                "iblf_jax.barriers.Integral() and Log() with p = 1 are such; one of your own needs"
+                " `error_over_slope`."
+            )
+            raise checks.fail(
+                "FullState.velocity_barrier",
+                self.velocity_barrier,
+                "one whose slope falls with the error itself",
+                remedy,
+            )
+        uses_o = [
+            getattr(barrier, "uses_o", True) for barrier in (self.barrier, self.velocity_barrier)
+        ]
         if any(uses_o) and self.o is None:
             object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
         if not any(uses_o) and self.o is not None:
-            raise checks.fail("FullState.o", self.o, "None with these barriers", "Neither has a kappa; leave `o` out.")
+            raise checks.fail(
+                "FullState.o",
+                self.o,
+                "None with these barriers",
+                "Neither has a kappa; leave `o` out.",
+            )
         fit_weight(self)
 
     def leaf_units(self) -> dict[str, str]:
@@ -125,21 +165,37 @@ class FullState:
         """No state."""
         return ()
 
-    def tubes(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[Tube, Tube]:
-        """The tube of q around the reference, and that of q' around alpha; in the latter "positions" are velocities."""
+    def tubes(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting
+    ) -> tuple[Tube, Tube]:
+        """The tube of q around the reference, and that of q' around alpha; in the latter
+        "positions" are velocities.
+        """
         alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
         (lower, upper), (dlower, dupper) = jax.jvp(setting.speed_limits, (t,), (jnp.ones_like(t),))
         return setting.tube(t), Tube(alpha, dalpha, lower, upper, dlower, dupper)
 
-    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: tuple[()]) -> jax.Array | None:
-        """e2 = q' - alpha, (n,) [rad/s], where the torque jumps at e2 = 0; None for a velocity barrier without a jump."""
+    def switching(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: tuple[()]
+    ) -> jax.Array | None:
+        """e2 = q' - alpha, (n,) [rad/s], where the torque jumps at e2 = 0; None for a velocity
+        barrier without a jump.
+        """
         if not ratio_jumps(self.velocity_barrier):
             return None
-        alpha = self.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, self.k1, self.o)
+        alpha = self.barrier.virtual_velocity(
+            setting.tube(t, acceleration=False), q, self.k1, self.o
+        )
         return dq - alpha
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it; V1 is V1 + phi."""
         (outer, inner), model = self.tubes(t, q, dq, setting), setting.model
@@ -148,8 +204,15 @@ class FullState:
         ratio: Any = second.error_over_slope(inner, dq)
         crossed = self.weight * first.slope(outer, q) * ratio
         wanted = a2 - crossed - self.c * second.slope(inner, dq)
-        tau = model.coriolis(q, dq, dq) + model.gravity(q) + matvec(model.mass_matrix(q), wanted) - f_hat
-        guard_active = guard_is_active(outer, q, first.guard) | guard_is_active(inner, dq, second.guard)
+        tau = (
+            model.coriolis(q, dq, dq)
+            + model.gravity(q)
+            + matvec(model.mass_matrix(q), wanted)
+            - f_hat
+        )
+        guard_active = guard_is_active(outer, q, first.guard) | guard_is_active(
+            inner, dq, second.guard
+        )
         value = self.weight * first.value(outer, q) + second.value(inner, dq)
         return Command(tau, inner.q_d, value, guard_active, jnp.zeros_like(guard_active)), ()
 

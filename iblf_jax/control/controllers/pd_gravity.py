@@ -15,14 +15,15 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 class PDGravity:
     """tau = G0(q) - Kp e1 - Kd e1' - f_hat.
 
-    Classical without an observer (`NoObserver`, f_hat = 0).  alpha is q_d' and V1 = 1/2 Kp e1^2; it claims nothing about the
-    bounds, and convergence only for a reference at rest.
+    Classical without an observer (`NoObserver`, f_hat = 0).  alpha is q_d' and V1 = 1/2 Kp e1^2; it
+    claims nothing about the bounds, and convergence only for a reference at rest.
 
     Args:
       Kp: stiffness, () or (n,) [N m/rad], > 0.
       Kd: damping, () or (n,) [N m s/rad], > 0.
 
-    Source: M. Takegaki, S. Arimoto, ASME J. Dynamic Systems, Measurement and Control 103 (1981) 119-125.
+    Source: M. Takegaki, S. Arimoto, ASME J. Dynamic Systems, Measurement and Control 103 (1981)
+      119-125.
     """
 
     Kp: Leaf = leaf("N m/rad", sign="positive")
@@ -34,7 +35,13 @@ class PDGravity:
         return ()
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: tuple[()]
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
         tube = setting.tube(t)

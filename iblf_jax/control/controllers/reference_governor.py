@@ -1,17 +1,23 @@
-"""An explicit reference governor: a law that knows of no bound is given a reference of its own, which waits where the bound is near.
+"""An explicit reference governor: a law that knows of no bound is given a reference of its own,
+which waits where the bound is near.
 
-With a reference g at rest, PD with gravity compensation and computed torque have a Lyapunov function that never grows,
+With a reference g at rest, PD with gravity compensation and computed torque have a Lyapunov
+function that never grows,
 
-    V = 1/2 q'^T M0 q' + 1/2 (q - g)^T Kp (q - g)      (PD; computed torque has 1 in the place of M0),
+    V = 1/2 q'^T M0 q' + 1/2 (q - g)^T Kp (q - g)      (PD; computed torque has 1 in the place of
+    M0),
 
-and V <= Gamma(g) = 1/2 min_i Kp_i d_i(g)^2 means |q_i - g_i| <= d_i, the distance of g_i to its nearer bound, less a margin.  So g may
-move towards the reference q_d as long as V is below Gamma,
+and V <= Gamma(g) = 1/2 min_i Kp_i d_i(g)^2 means |q_i - g_i| <= d_i, the distance of g_i to its
+nearer bound, less a margin.  So g may move towards the reference q_d as long as V is below Gamma,
 
-    g' = eta max(Gamma - V, 0) (attraction + repulsion),   attraction = (q_d - g)/max(|q_d - g|, width),
-    repulsion_i = max(1 - d_li/width, 0) - max(1 - d_ui/width, 0),   d_l = g - k_lc - margin,   d_u = k_uc - margin - g,
+    g' = eta max(Gamma - V, 0) (attraction + repulsion),   attraction = (q_d - g)/max(|q_d - g|,
+    width), repulsion_i = max(1 - d_li/width, 0) - max(1 - d_ui/width, 0),   d_l = g - k_lc -
+    margin,   d_u = k_uc - margin - g,
 
-and stands still where it is not: V <= Gamma stays true, and with it every bound, for constant bounds, an exact model and f_hat = f.  Bounds
-that move, disturbances and samples are what the margin is for; nothing is claimed of them.  It lags behind a reference that moves.
+and stands still where it is not: V <= Gamma stays true, and with it every bound, for constant
+  bounds, an exact model and f_hat = f.  Bounds
+that move, disturbances and samples are what the margin is for; nothing is claimed of them.  It lags
+behind a reference that moves.
 """
 
 from __future__ import annotations
@@ -57,17 +63,22 @@ class _AtRest:
 
 @component
 class ReferenceGovernor:
-    """The law's torque for a reference g at rest,  g' = eta max(Gamma(g) - V, 0) (attraction + repulsion).
+    """The law's torque for a reference g at rest,  g' = eta max(Gamma(g) - V, 0) (attraction +
+    repulsion).
 
-    Symbols and claim at the head of this module.  Paths reach through: "controller.Kp" is the wrapped law's Kp.
+    Symbols and claim at the head of this module.  Paths reach through: "controller.Kp" is the
+    wrapped law's Kp.
 
     Args:
       law: what is governed, `PDGravity` or `ComputedTorque`.
-      eta: how fast g moves, () or (n,) [rad/(N m s)] (1/(rad s) around computed torque), > 0; 50 if not given.
+      eta: how fast g moves, () or (n,) [rad/(N m s)] (1/(rad s) around computed torque), > 0; 50 if
+        not given.
       margin: distance that is kept from the bounds, () or (n,) [rad], >= 0; 0.02 if not given.
-      width: distance at which walls repel g and over which the attraction ends, () or (n,) [rad], > 0; 0.02 if not given.
+      width: distance at which walls repel g and over which the attraction ends, () or (n,) [rad], >
+        0; 0.02 if not given.
 
-    Source: M. M. Nicotra, E. Garone, IEEE Control Systems Magazine 38 (2018) 89-107; E. Gilbert, I. Kolmanovsky, Automatica 38 (2002)
+    Source: M. M. Nicotra, E. Garone, IEEE Control Systems Magazine 38 (2018) 89-107; E. Gilbert, I.
+      Kolmanovsky, Automatica 38 (2002)
     2063-2073.
     """
 
@@ -81,7 +92,12 @@ class ReferenceGovernor:
         """Raises ValueError for a law that has no such Lyapunov function."""
         if not isinstance(self.law, PDGravity | ComputedTorque):
             remedy = "Such as PDGravity(Kp=60.0, Kd=20.0)."
-            raise checks.fail("ReferenceGovernor.law", type(self.law).__name__, "a PDGravity or a ComputedTorque", remedy)
+            raise checks.fail(
+                "ReferenceGovernor.law",
+                type(self.law).__name__,
+                "a PDGravity or a ComputedTorque",
+                remedy,
+            )
 
     def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> GovernorState:
         """g(0) = q(0), moved inside the margin where it is not."""
@@ -105,21 +121,33 @@ class ReferenceGovernor:
         low, high = self._walls(t, setting)
         return 0.5 * jnp.min(law.Kp * jnp.maximum(jnp.minimum(g - low, high - g), 0.0) ** 2)
 
-    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: GovernorState) -> jax.Array | None:
+    def switching(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: GovernorState
+    ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
         governed = setting._replace(reference=_AtRest(state.g))
         return switching_functions(self.law, t, q, dq, governed, state.law)
 
     def command(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: GovernorState
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: GovernorState,
     ) -> tuple[Command, GovernorState]:
         """The law's command for the reference g, and the rates of g and of the law's state."""
         g, (low, high) = state.g, self._walls(t, setting)
-        command, rate = self.law.command(t, q, dq, f_hat, setting._replace(reference=_AtRest(g)), state.law)
+        command, rate = self.law.command(
+            t, q, dq, f_hat, setting._replace(reference=_AtRest(g)), state.law
+        )
         away = setting.reference.position(t) - g
         # The square root has no slope at 0, where the attraction is away/width.
         square, near = inner(away, away), jnp.min(self.width) ** 2
         attraction = away / jnp.sqrt(jnp.maximum(square, near))
-        repulsion = jnp.maximum(1.0 - (g - low) / self.width, 0.0) - jnp.maximum(1.0 - (high - g) / self.width, 0.0)
+        repulsion = jnp.maximum(1.0 - (g - low) / self.width, 0.0) - jnp.maximum(
+            1.0 - (high - g) / self.width, 0.0
+        )
         free = jnp.maximum(self.level(t, g, setting) - self.energy(q, dq, g, setting), 0.0)
         return command, GovernorState(self.eta * free * (attraction + repulsion), rate)

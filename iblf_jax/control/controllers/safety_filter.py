@@ -1,25 +1,30 @@
-"""A safety filter around any law: the torque nearest to the law's that keeps bounds, by control barrier functions.
+"""A safety filter around any law: the torque nearest to the law's that keeps bounds, by control
+barrier functions.
 
-The bounds are h_u = k_uc - q >= 0 and h_l = q - k_lc >= 0, of relative degree 2.  With a1, a2 > 0 the conditions
-(d/dt + a1)(d/dt + a2) h >= 0 are a box of accelerations,
+The bounds are h_u = k_uc - q >= 0 and h_l = q - k_lc >= 0, of relative degree 2.  With a1, a2 > 0
+the conditions (d/dt + a1)(d/dt + a2) h >= 0 are a box of accelerations,
 
     q" <= k_uc" + (a1 + a2)(k_uc' - q') + a1 a2 (k_uc - q),
     q" >= k_lc" + (a1 + a2)(k_lc' - q') + a1 a2 (k_lc - q),
 
-and bounds on the velocities, of relative degree 1, are one more: v_l' + a3 (v_l - q') <= q" <= v_u' + a3 (v_u - q').  Regions for the tip
-or a joint's origin (`Scenario.regions`) are of relative degree 2 in their level h(q), with b1, b2 > 0 (`regions.along` has dh/dq and c):
+and bounds on the velocities, of relative degree 1, are one more: v_l' + a3 (v_l - q') <= q" <= v_u'
++ a3 (v_u - q').  Regions for the tip or a joint's origin (`Scenario.regions`) are of relative
+degree 2 in their level h(q), with b1, b2 > 0 (`regions.along` has dh/dq and c):
 
     h" + (b1 + b2) h' + b1 b2 h >= 0,    h' = dh/dq q',    h" = dh/dq q" + c.
 
-The conditions on positions may be of other shapes, and with a margin eta: with z = h' + a1 A(h), z' + a2 B(z) >= eta, A(h) = h or atan h,
-B(z) = z or z^3.  An arc tangent bounds the speed towards a bound by pi a1/2 wherever the joint is; a cube is softer the nearer z is to 0.
+The conditions on positions may be of other shapes, and with a margin eta: with z = h' + a1 A(h), z'
++ a2 B(z) >= eta, A(h) = h or atan h, B(z) = z or z^3.  An arc tangent bounds the speed towards a
+bound by pi a1/2 wherever the joint is; a cube is softer the nearer z is to 0.
 
-The model and the observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 - f_hat.  Inside what the conditions keep
-(h >= 0 and z >= 0 at the start) they keep it for as long as they have a common torque, and f_hat is f.
+The model and the observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 -
+f_hat.  Inside what the conditions keep (h >= 0 and z >= 0 at the start) they keep it for as long as
+they have a common torque, and f_hat is f.
 
-Where they have none (within the torque limits, or as a bound runs into another), the torque breaks them by the least slack, the sum of
-squares of the distances to what they allow, in torque or in acceleration as `nearest` says: it is in the command, is recorded, and raises
-`Status.FILTER_INFEASIBLE`.
+Where they have none (within the torque limits, or as a bound runs into another), the torque breaks
+them by the least slack, the sum of squares of the distances to what they allow, in torque or in
+acceleration as `nearest` says: it is in the command, is recorded, and raises
+  `Status.FILTER_INFEASIBLE`.
 """
 
 from __future__ import annotations
@@ -50,16 +55,20 @@ SHAPES2 = ("linear", "cubic")
 class SafetyFilter:
     """The torque nearest to the law's with  q" as the conditions allow (head of this module)  and  |tau| <= limit.
 
-    Nearest in torque, |tau - tau_law|, or in acceleration, |M0^-1 (tau - tau_law)|; the latter without limit and regions is a clip, else it
-    is a quadratic programme (`core.qp`).  Where the law's own torque meets all conditions it is passed on as it is.  Paths reach through:
+    Nearest in torque, |tau - tau_law|, or in acceleration, |M0^-1 (tau - tau_law)|; the latter
+    without limit and regions is a clip, else it is a quadratic programme (`core.qp`).  Where the
+    law's own torque meets all conditions it is passed on as it is.  Paths reach through:
     "controller.K2" is the wrapped law's K2.
 
     Args:
       law: whose torque is filtered, any `Controller`.
-      a1: first rate of the position's conditions, () or (n,) [1/s] ([rad/s] for "atan"), > 0; 10 if not given.
+      a1: first rate of the position's conditions, () or (n,) [1/s] ([rad/s] for "atan"), > 0; 10 if
+        not given.
       a2: second rate of these, () or (n,) [1/s] ([s/rad^2] for "cubic"), > 0; 10 if not given.
-      a3: rate of the velocity's conditions, where the scenario has `velocity_bounds`, () or (n,) [1/s], > 0; 20 if not given.
-      b1: first rate of the regions' conditions, where the scenario has `regions`, () [1/s], > 0; 10 if not given.
+      a3: rate of the velocity's conditions, where the scenario has `velocity_bounds`, () or (n,)
+        [1/s], > 0; 20 if not given.
+      b1: first rate of the regions' conditions, where the scenario has `regions`, () [1/s], > 0; 10
+        if not given.
       b2: second rate of these, () [1/s], > 0; 10 if not given.
       limit: largest torque of each joint, () or (n,) [N m], > 0; none if not given.
       nearest: "torque" or "acceleration"; "torque" if not given.
@@ -67,9 +76,10 @@ class SafetyFilter:
       shape2: B of these, "linear" or "cubic"; "linear" if not given.
       margin: eta of these, () or (n,) [rad/s^2], >= 0; none if not given.
 
-    Source: A. D. Ames, X. Xu, J. W. Grizzle, P. Tabuada, IEEE Trans. Automatic Control 62 (2017) 3861-3876; relative degree 2 as Q. Nguyen,
-    K. Sreenath, American Control Conference 2016, 322-328; shapes and margin as W. Shaw Cortez, D. V. Dimarogonas, Automatica 2022,
-    110620.
+    Source: A. D. Ames, X. Xu, J. W. Grizzle, P. Tabuada, IEEE Trans. Automatic Control 62 (2017)
+      3861-3876; relative degree 2 as Q. Nguyen,
+    K. Sreenath, American Control Conference 2016, 322-328; shapes and margin as W. Shaw Cortez, D.
+    V. Dimarogonas, Automatica 2022, 110620.
     """
 
     law: Controller
@@ -101,9 +111,14 @@ class SafetyFilter:
         """The wrapped law's state."""
         return self.law.init(q, dq, setting)
 
-    def box(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[jax.Array, jax.Array]:
+    def box(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting
+    ) -> tuple[jax.Array, jax.Array]:
         """The accelerations that the conditions allow, lowest and highest, (n,) each [rad/s^2]."""
-        lowest, highest = (ddside + self._room(side - q, dside - dq) for side, dside, ddside in _moving_bounds(t, setting))
+        lowest, highest = (
+            ddside + self._room(side - q, dside - dq)
+            for side, dside, ddside in _moving_bounds(t, setting)
+        )
         if self.margin is not None:
             lowest, highest = lowest + self.margin, highest - self.margin
         if setting.velocity_bounds is not None:
@@ -113,18 +128,30 @@ class SafetyFilter:
         return lowest, highest
 
     def _room(self, h: jax.Array, dh: jax.Array) -> jax.Array:
-        """How much faster than its bound a joint may accelerate towards it, (n,) [rad/s^2]; odd in (h, h'), so for either side."""
+        """How much faster than its bound a joint may accelerate towards it, (n,) [rad/s^2]; odd in
+        (h, h'), so for either side.
+        """
         if self.shape1 == self.shape2 == "linear":
             return (self.a1 + self.a2) * dh + self.a1 * self.a2 * h
         A, dA = (h, 1.0) if self.shape1 == "linear" else (jnp.arctan(h), 1.0 / (1.0 + h * h))
         z = dh + self.a1 * A
         return self.a1 * dA * dh + self.a2 * (z if self.shape2 == "linear" else z**3)
 
-    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+    def switching(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State
+    ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
         return switching_functions(self.law, t, q, dq, setting, state)
 
-    def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
+    def command(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: State,
+    ) -> tuple[Command, State]:
         """The wrapped law's command with its torque filtered, and the slack."""
         command, rate = self.law.command(t, q, dq, f_hat, setting, state)
         model, asked = setting.model, command.tau
@@ -137,26 +164,43 @@ class SafetyFilter:
             wanted = jnp.clip(planned, lowest - slack, highest + slack)
             return command._replace(tau=asked + matvec(M, wanted - planned), slack=slack), rate
         unit = jnp.eye(setting.model.n, dtype=asked.dtype)
-        # What is looked for is the change of the torque or of the acceleration; the columns say what it does to both.
-        torque, acceleration = (unit, jnp.stack([solve_spd(M, row) for row in unit])) if self.nearest == "torque" else (M, unit)
+        # What is looked for is the change of the torque or of the acceleration; the columns say
+        # what it does to both.
+        torque, acceleration = (
+            (unit, jnp.stack([solve_spd(M, row) for row in unit]))
+            if self.nearest == "torque"
+            else (M, unit)
+        )
         rows = [(acceleration, highest - planned, 1.0), (-acceleration, planned - lowest, 1.0)]
         if setting.regions:
             at = setting.regions_along(q, dq)
-            room = matvec(at.slope, planned) + at.bend + (self.b1 + self.b2) * at.rate + self.b1 * self.b2 * at.level
+            room = (
+                matvec(at.slope, planned)
+                + at.bend
+                + (self.b1 + self.b2) * at.rate
+                + self.b1 * self.b2 * at.level
+            )
             rows.append((-matmul(at.slope, acceleration), room, 1.0))
         saturated = command.saturated
         if self.limit is not None:
             rows += [(torque, self.limit - asked, 0.0), (-torque, self.limit + asked, 0.0)]
             saturated = saturated | (jnp.abs(asked) > self.limit)
         found = _nearest(rows)
-        region_slack = found.slack[2 * len(q) : 2 * len(q) + len(setting.regions)] if setting.regions else ()
+        region_slack = (
+            found.slack[2 * len(q) : 2 * len(q) + len(setting.regions)] if setting.regions else ()
+        )
         slack = jnp.maximum(found.slack[: len(q)], found.slack[len(q) : 2 * len(q)])
         tau = asked + matvec(torque, found.x)
-        return command._replace(tau=tau, slack=slack, region_slack=region_slack, saturated=saturated), rate
+        return (
+            command._replace(tau=tau, slack=slack, region_slack=region_slack, saturated=saturated),
+            rate,
+        )
 
 
 def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:
-    """The least change x with  row x <= room  for all rows, each with its room and whether it may be broken; none where all have room."""
+    """The least change x with  row x <= room  for all rows, each with its room and whether it may
+    be broken; none where all have room.
+    """
     room = jnp.concatenate([room for _, room, _ in rows])
     soft = jnp.concatenate([jnp.full_like(room, may_break) for _, room, may_break in rows])
     G = jnp.concatenate([row for row, _, _ in rows])
@@ -166,7 +210,9 @@ def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:
 
 
 def _moving_bounds(t: jax.Array, setting: Setting) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Lower and upper bound of q, each with its first and second rate, (n,) [rad], [rad/s], [rad/s^2]."""
+    """Lower and upper bound of q, each with its first and second rate, (n,) [rad], [rad/s],
+    [rad/s^2].
+    """
 
     def sides(t):
         q_d = setting.reference.position(t)

@@ -1,7 +1,7 @@
 """Actuator limits around any law; the paper leaves them to future work.
 
-The loop gives observer and plant the torque that was applied, so an observer that is told the truth estimates f and not the cut.
-While the torque is cut, no law's claims hold; outside, they do again.
+The loop gives observer and plant the torque that was applied, so an observer that is told the truth
+estimates f and not the cut. While the torque is cut, no law's claims hold; outside, they do again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ SHARPNESS = 8
 
 @component
 class Saturated:
-    """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8) (smooth, for gradients).
+    """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8)
+    (smooth, for gradients).
 
     Paths reach through: "controller.K2" is the wrapped law's K2.
 
@@ -60,16 +61,35 @@ class Saturated:
         """The wrapped law's state."""
         return self.law.init(q, dq, setting)
 
-    def switching(self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State) -> jax.Array | None:
+    def switching(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State
+    ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
         return switching_functions(self.law, t, q, dq, setting, state)
 
-    def command(self, t: jax.Array, q: jax.Array, dq: jax.Array, f_hat: jax.Array, setting: Setting, state: State) -> tuple[Command, State]:
-        """The wrapped law's command with its torque limited; `saturated` says where it asked for more than the limit."""
+    def command(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        f_hat: jax.Array,
+        setting: Setting,
+        state: State,
+    ) -> tuple[Command, State]:
+        """The wrapped law's command with its torque limited; `saturated` says where it asked for
+        more than the limit.
+        """
         command, rate = self.law.command(t, q, dq, f_hat, setting, state)
         asked = command.tau
-        tau = jnp.clip(asked, -self.limit, self.limit) if self.edge == "hard" else self.limit * _smooth_clip(asked / self.limit)
-        return command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)), rate
+        tau = (
+            jnp.clip(asked, -self.limit, self.limit)
+            if self.edge == "hard"
+            else self.limit * _smooth_clip(asked / self.limit)
+        )
+        return (
+            command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)),
+            rate,
+        )
 
 
 UNLIMITED = 1e6
@@ -81,7 +101,8 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
 
     Args:
       law: any.
-      robot: such as `iblf_jax.robots.Arm`; the law is returned as it is if the robot has no `effort`, or an infinite one on every joint.
+      robot: such as `iblf_jax.robots.Arm`; the law is returned as it is if the robot has no
+        `effort`, or an infinite one on every joint.
       edge: as `Saturated.edge`.
 
     Raises:
@@ -89,12 +110,20 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
     """
     effort = getattr(robot, "effort", jnp.inf)
     if not checks.is_concrete(effort):
-        return Saturated(law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge)
+        return Saturated(
+            law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge
+        )
     finite = np.isfinite(effort)
-    return Saturated(law=law, limit=np.where(finite, effort, UNLIMITED), edge=edge) if finite.any() else law
+    return (
+        Saturated(law=law, limit=np.where(finite, effort, UNLIMITED), edge=edge)
+        if finite.any()
+        else law
+    )
 
 
 def _smooth_clip(x: jax.Array) -> jax.Array:
-    """X / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives too."""
+    """X / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives
+    too.
+    """
     m = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), 1.0))
     return (x / m) / ((1.0 / m) ** SHARPNESS + (x / m) ** SHARPNESS) ** (1.0 / SHARPNESS)

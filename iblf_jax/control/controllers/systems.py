@@ -1,7 +1,9 @@
-"""The systems that the paper names, each by its name: which law with which barrier, and the gains of the yardsticks.
+"""The systems that the paper names, each by its name: which law with which barrier, and the gains
+of the yardsticks.
 
-All barrier laws take the same k1, K2 and o, so that they are compared at equal gains; computed torque and PD have their own.  So have the
-laws that keep other constraints, or keep them otherwise: full state, a governor, a filter.
+All barrier laws take the same k1, K2 and o, so that they are compared at equal gains; computed
+torque and PD have their own.  So have the laws that keep other constraints, or keep them otherwise:
+full state, a governor, a filter.
 """
 
 from __future__ import annotations
@@ -37,28 +39,40 @@ YARDSTICKS: dict[str, Callable[[], Controller]] = {
     "computed_torque": lambda: ComputedTorque(Kp=25.0, Kd=10.0),
     "pd": lambda: PDGravity(Kp=60.0, Kd=20.0),
 }
-"""Laws outside the family.  ASSUMPTION: their gains are this package's, chosen to settle about as fast as the paper's law."""
+"""Laws outside the family.  ASSUMPTION: their gains are this package's, chosen to settle about as
+fast as the paper's law."""
 
 FILTER = 0.01
-"""s.  ASSUMPTION: time constant of the dynamic surface by name; small beside 1/k1, and no stiffer than K2 makes the loop."""
+"""s.  ASSUMPTION: time constant of the dynamic surface by name; small beside 1/k1, and no stiffer
+than K2 makes the loop."""
 
 DAMPING = 8.0
-"""rad^2/s^3.  ASSUMPTION: c of the full-state law by name, as in `presets.zhang_yan_2024_full_state`."""
+"""rad^2/s^3.  ASSUMPTION: c of the full-state law by name, as in
+`presets.zhang_yan_2024_full_state`."""
 
 SPEED = 10.0
-"""rad/(N m s).  ASSUMPTION: eta of the governor by name, slow enough for steps of 1 ms beside the paper's bounds."""
+"""rad/(N m s).  ASSUMPTION: eta of the governor by name, slow enough for steps of 1 ms beside the
+paper's bounds."""
 
 LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *YARDSTICKS)
 """Every system of the paper by the name that `law_by_name`, the presets and `compare` take."""
 KEEPERS = ("full_state", "reference_governor", "safety_filter")
-"""Laws for other constraints by the names that these take too: full state (for scenarios with `velocity_bounds`; K2 in 1/s), a reference
-governor around the yardstick "pd", a safety filter around the unconstrained "backstepping"."""
+"""Laws for other constraints by the names that these take too: full state (for scenarios with
+`velocity_bounds`; K2 in 1/s), a reference governor around the yardstick "pd", a safety filter
+around the unconstrained "backstepping"."""
 
 _WITHOUT_OBSERVER = ("adaptive_rbf", "pd", "reference_governor")
 
 
 def law_by_name(
-    name: str, *, k1: Any = 2.0, K2: Any = 20.0, o: Any = 0.1, reading: str = "printed", p: int = 1, weight: Any = 1.0
+    name: str,
+    *,
+    k1: Any = 2.0,
+    K2: Any = 20.0,
+    o: Any = 0.1,
+    reading: str = "printed",
+    p: int = 1,
+    weight: Any = 1.0,
 ) -> Controller:
     """The law of a system.
 
@@ -69,7 +83,8 @@ def law_by_name(
       o: margin under the root of kappa (3.7), () or (n,) [1/s^2], for the barriers that use it.
       reading: "printed" or "corrected", for the backstepping laws.
       p: exponent of the logarithmic barrier.
-      weight: of the barrier, () or (n,), of the laws that have one; in the unit that the law states.
+      weight: of the barrier, () or (n,), of the laws that have one; in the unit that the law
+        states.
 
     Raises:
       ValueError: an unknown name or reading.
@@ -86,12 +101,21 @@ def law_by_name(
     if name == "reference_governor":
         return ReferenceGovernor(law=YARDSTICKS["pd"](), eta=SPEED)
     if name == "safety_filter":
-        return SafetyFilter(law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight), nearest="acceleration")
+        return SafetyFilter(
+            law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight),
+            nearest="acceleration",
+        )
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
     o = o if getattr(barrier, "uses_o", True) else None
     return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, reading=reading, weight=weight)
 
 
 def observer_of(name: str, usual: Observer) -> Observer:
-    """The observer that belongs to a system: `usual`, or none for the laws that are classical without one."""
-    return NoObserver() if checks.word("name", name, "the name of a law") in _WITHOUT_OBSERVER else usual
+    """The observer that belongs to a system: `usual`, or none for the laws that are classical
+    without one.
+    """
+    return (
+        NoObserver()
+        if checks.word("name", name, "the name of a law") in _WITHOUT_OBSERVER
+        else usual
+    )

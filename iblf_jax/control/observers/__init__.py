@@ -7,7 +7,12 @@ from iblf_jax.control.observers.momentum import Momentum as Momentum
 from iblf_jax.control.observers.none import NoObserver as NoObserver
 from iblf_jax.control.observers.printed import Printed as Printed
 
-MEMBERS = {"none": NoObserver, "printed": Printed, "momentum": Momentum, "extended_state": ExtendedState}
+MEMBERS = {
+    "none": NoObserver,
+    "printed": Printed,
+    "momentum": Momentum,
+    "extended_state": ExtendedState,
+}
 """Every observer by the name that a scenario file gives it."""
 
 __all__ = ["MEMBERS", "ExtendedState", "Momentum", "NoObserver", "Observer", "Printed", "State"]

@@ -1,8 +1,8 @@
 """The contract of a disturbance observer.
 
-An observer knows the model, measures q and q', is told the torque that was applied, and gives f_hat, an estimate of the
-lumped uncertain term f of (2.1).  Its state is part of the loop's state and is integrated with the plant; in a sampled loop it goes from
-one period to the next.
+An observer knows the model, measures q and q', is told the torque that was applied, and gives
+f_hat, an estimate of the lumped uncertain term f of (2.1).  Its state is part of the loop's state
+and is integrated with the plant; in a sampled loop it goes from one period to the next.
 """
 
 from __future__ import annotations
@@ -20,19 +20,26 @@ State = Any
 class Observer(Protocol):
     """What the package asks of an observer.
 
-    Two methods more are for sampled loops, which take a step of Euler where there is none: `advance(t, q, dq, tau, model, state, period)`,
-    its state a period [s] later if what it measures and the torque stay as they are; and `at_period(period)`, the same observer with gains
-    for which a step of Euler has the poles that it has over a period.
+    Two methods more are for sampled loops, which take a step of Euler where there is none:
+    `advance(t, q, dq, tau, model, state, period)`, its state a period [s] later if what it measures
+    and the torque stay as they are; and `at_period(period)`, the same observer with gains for which
+    a step of Euler has the poles that it has over a period.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there."""
         ...
 
-    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: State) -> jax.Array:
+    def estimate(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: State
+    ) -> jax.Array:
         """f_hat, (n,) [N m]."""
         ...
 
-    def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: State) -> State:
-        """Rate of the state, given the torque `tau` (n,) [N m] that was applied (after any saturation)."""
+    def derivative(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: State
+    ) -> State:
+        """Rate of the state, given the torque `tau` (n,) [N m] that was applied (after any
+        saturation).
+        """
         ...

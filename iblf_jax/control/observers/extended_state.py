@@ -2,7 +2,8 @@
 
     p' = tau + C0^T q' - G0 + f,   since (M0 q')' = M0 q" + M0' q' and M0' = C0 + C0^T
 
-so a copy of p, corrected by what is measured, estimates f as an additional constant state.  C0^T q' = M0' q' - C0 q'.
+so a copy of p, corrected by what is measured, estimates f as an additional constant state.  C0^T q'
+= M0' q' - C0 q'.
 """
 
 from __future__ import annotations
@@ -31,16 +32,18 @@ class ExtendedStateValues(NamedTuple):
 class ExtendedState:
     """p_hat' = tau + C0^T q' - G0 + f_hat + l1 (p - p_hat),   f_hat' = l2 (p - p_hat),   p = M0 q'.
 
-    Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then f_tilde = f - f_hat obeys
-    f_tilde" + l1 f_tilde' + l2 f_tilde = f" + l1 f': a constant f is found exactly, a changing one with the lag l1/l2.
-    It starts at the measured momentum and f_hat = 0.
+    Give `bandwidth` w, for l1 = 2 w and l2 = w^2 (both poles at -w), or `l1` and `l2`.  Then
+    f_tilde = f - f_hat obeys f_tilde" + l1 f_tilde' + l2 f_tilde = f" + l1 f': a constant f is
+    found exactly, a changing one with the lag l1/l2. It starts at the measured momentum and f_hat =
+    0.
 
     Args:
       bandwidth: w, () or (n,) [1/s], > 0; l1 and l2 count if not given.
       l1: gain of the innovation on p_hat, () or (n,) [1/s], > 0; 2 w if not given.
       l2: gain of the innovation on f_hat, () or (n,) [1/s^2], > 0; w^2 if not given.
 
-    Source: J. Han, IEEE Trans. Industrial Electronics 56 (2009) 900-906; Z. Gao, ACC 2003, 4989-4996 (one bandwidth).
+    Source: J. Han, IEEE Trans. Industrial Electronics 56 (2009) 900-906; Z. Gao, ACC 2003,
+      4989-4996 (one bandwidth).
     """
 
     bandwidth: Leaf = leaf("1/s", sign="positive", default=None)
@@ -53,23 +56,40 @@ class ExtendedState:
         if given not in ((True, False, False), (False, True, True)):
             named = dict(zip(("bandwidth", "l1", "l2"), given, strict=True))
             got = [name for name, there in named.items() if there]
-            raise checks.fail("ExtendedState", got, "either `bandwidth`, or both `l1` and `l2`", "Such as ExtendedState(bandwidth=40.0).")
+            raise checks.fail(
+                "ExtendedState",
+                got,
+                "either `bandwidth`, or both `l1` and `l2`",
+                "Such as ExtendedState(bandwidth=40.0).",
+            )
 
     @property
     def _gains(self) -> tuple[jax.Array, jax.Array]:
         """l1 [1/s] and l2 [1/s^2], (n,)."""
-        return (self.l1, self.l2) if self.bandwidth is None else (2.0 * self.bandwidth, self.bandwidth**2)
+        return (
+            (self.l1, self.l2)
+            if self.bandwidth is None
+            else (2.0 * self.bandwidth, self.bandwidth**2)
+        )
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> ExtendedStateValues:
         """The measured momentum, and no estimate yet."""
         return ExtendedStateValues(matvec(model.mass_matrix(q), dq), jnp.zeros_like(q))
 
-    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: ExtendedStateValues) -> jax.Array:
+    def estimate(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: ExtendedStateValues
+    ) -> jax.Array:
         """f_hat, (n,) [N m]."""
         return state.f_hat
 
     def derivative(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: ExtendedStateValues
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        tau: jax.Array,
+        model: Robot,
+        state: ExtendedStateValues,
     ) -> ExtendedStateValues:
         """p_hat' and f_hat'."""
         l1, l2 = self._gains
@@ -78,11 +98,20 @@ class ExtendedState:
         return ExtendedStateValues(tau + drift + state.f_hat + l1 * innovation, l2 * innovation)
 
     def advance(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: ExtendedStateValues, period: jax.Array
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        tau: jax.Array,
+        model: Robot,
+        state: ExtendedStateValues,
+        period: jax.Array,
     ) -> ExtendedStateValues:
-        """p_hat and f_hat a period later, exact: with z = (p_hat, f_hat), z' = A z + b, so z moves by A^-1 (exp(A period) - 1) z'.
+        """p_hat and f_hat a period later, exact: with z = (p_hat, f_hat), z' = A z + b, so z moves
+        by A^-1 (exp(A period) - 1) z'.
 
-        exp(A T) = exp(-w T) [C + S (A + w)],  w = l1 / 2,  S = sinh(d T) / d,  C = cosh(d T),  d^2 = w^2 - l2.
+        exp(A T) = exp(-w T) [C + S (A + w)],  w = l1 / 2,  S = sinh(d T) / d,  C = cosh(d T),  d^2
+        = w^2 - l2.
         """
         l1, l2 = self._gains
         rate = self.derivative(t, q, dq, tau, model, state)
@@ -94,7 +123,9 @@ class ExtendedState:
         return ExtendedStateValues(state.p_hat + moved_p, state.f_hat + p + l1 * moved_p)
 
     def at_period(self, period: jax.Array) -> ExtendedState:
-        """l1 T = 2 - (z1 + z2) and l2 T^2 = (1 - z1)(1 - z2), with z1, z2 = exp(-w T) (C -+ d S) the poles over T, the period."""
+        """l1 T = 2 - (z1 + z2) and l2 T^2 = (1 - z1)(1 - z2), with z1, z2 = exp(-w T) (C -+ d S)
+        the poles over T, the period.
+        """
         _, fade, C, _ = self._over(period)
         both, product = 2.0 * fade * C, fade**2
         return ExtendedState(l1=(2.0 - both) / period, l2=(1.0 - both + product) / period**2)
@@ -114,10 +145,14 @@ class ExtendedState:
 def _even_cosh(square: jax.Array) -> jax.Array:
     """Cosh of a root, real or not, by its square."""
     root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    return jnp.where(jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.cosh(root), jnp.cos(root)))
+    return jnp.where(
+        jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.cosh(root), jnp.cos(root))
+    )
 
 
 def _even_sinh(square: jax.Array) -> jax.Array:
     """Sinh of a root divided by it, real or not, by its square."""
     root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    return jnp.where(jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.sinh(root), jnp.sin(root)) / root)
+    return jnp.where(
+        jnp.abs(square) < 1e-12, 1.0, jnp.where(square > 0, jnp.sinh(root), jnp.sin(root)) / root
+    )

@@ -16,16 +16,21 @@ from iblf_jax.world.robots import Robot, energy_gradient
 
 @component
 class Momentum:
-    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').        (3.11), corrected
+    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').
+    (3.11), corrected
 
-    Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.  (M0' q' - C0 q' is dT/dq.)
+    Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.  (M0'
+    q' - C0 q' is dT/dq.)
 
     Args:
-      kf: gain, () or (n,) [1/s], > 0; Theorem 2 asks for more than 1/2, and for more than 1 where f changes.
+      kf: gain, () or (n,) [1/s], > 0; Theorem 2 asks for more than 1/2, and for more than 1 where f
+        changes.
       eta0: eta(0), added to what `start` says, () or (n,) [N m]; 0 if not given.
-      start: "zero": eta(0) = eta0, as printed; "matched": eta(0) = eta0 - kf M0 q'(0), so that f_hat(0) = eta0; "zero" if not given.
+      start: "zero": eta(0) = eta0, as printed; "matched": eta(0) = eta0 - kf M0 q'(0), so that
+        f_hat(0) = eta0; "zero" if not given.
 
-    Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for the form.
+    Source: A. De Luca, R. Mattone, ICRA 2005, 999-1004 (generalised momentum); Zhang & Yan 2024 for
+      the form.
     """
 
     kf: Leaf = leaf("1/s", sign="positive")
@@ -44,21 +49,40 @@ class Momentum:
         """eta(0), (n,) [N m]."""
         return initial_eta(self, q, dq, model)
 
-    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
+    def estimate(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array
+    ) -> jax.Array:
         """f_hat, (n,) [N m]."""
         return state + self.kf * matvec(model.mass_matrix(q), dq)
 
-    def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array) -> jax.Array:
+    def derivative(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        tau: jax.Array,
+        model: Robot,
+        state: jax.Array,
+    ) -> jax.Array:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
         return -self.kf * (f_hat + tau + energy_gradient(model, q, dq) - model.gravity(q))
 
     def advance(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: jax.Array, period: jax.Array
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        tau: jax.Array,
+        model: Robot,
+        state: jax.Array,
+        period: jax.Array,
     ) -> jax.Array:
         """Eta a period later, (n,) [N m]: exact, as (3.11) is linear in eta."""
         return held_eta(self, t, q, dq, tau, model, state, period)
 
     def at_period(self, period: jax.Array) -> Momentum:
-        """Kf = (1 - exp(-kf period)) / period: then 1 - kf period is what is left of an error after a period."""
+        """Kf = (1 - exp(-kf period)) / period: then 1 - kf period is what is left of an error after
+        a period.
+        """
         return dataclasses.replace(self, kf=-jnp.expm1(-self.kf * period) / period)

@@ -17,16 +17,33 @@ class NoObserver:
         """No state."""
         return ()
 
-    def estimate(self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: tuple[()]) -> jax.Array:
+    def estimate(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: tuple[()]
+    ) -> jax.Array:
         """Zero, (n,) [N m]."""
         return jnp.zeros_like(q)
 
-    def derivative(self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: tuple[()]) -> tuple[()]:
+    def derivative(
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        tau: jax.Array,
+        model: Robot,
+        state: tuple[()],
+    ) -> tuple[()]:
         """No state, no rate."""
         return ()
 
     def advance(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array, model: Robot, state: tuple[()], period: jax.Array
+        self,
+        t: jax.Array,
+        q: jax.Array,
+        dq: jax.Array,
+        tau: jax.Array,
+        model: Robot,
+        state: tuple[()],
+        period: jax.Array,
     ) -> tuple[()]:
         """No state."""
         return ()

@@ -1,4 +1,6 @@
-"""Sensors: what a law that runs at a period knows of q and q'.  The contracts are `Sensor` and `Velocity` in `_base.py`."""
+"""Sensors: what a law that runs at a period knows of q and q'.  The contracts are `Sensor` and
+`Velocity` in `_base.py`.
+"""
 
 from iblf_jax.control.sensors._base import Measurement as Measurement
 from iblf_jax.control.sensors._base import Sensor as Sensor

@@ -1,7 +1,7 @@
 """The contracts of a sensor, and of the way in which one that reads positions comes to velocities.
 
-A sensor is read once a period, at its start.  What it draws are standard normal numbers, which the loop gives it: they depend on seed, run,
-sample and joint alone.  Torque is never measured.
+A sensor is read once a period, at its start.  What it draws are standard normal numbers, which the
+loop gives it: they depend on seed, run, sample and joint alone.  Torque is never measured.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class Measurement(NamedTuple):
 class Sensor(Protocol):
     """What the package asks of a sensor.
 
-    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on it; and `resolution`, what a count is,
+    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on
+      it; and `resolution`, what a count is,
     () or (n,) [rad], for the default ranges of gains.  It may have a method
     `advice(period)`, a list of warnings.
     """
@@ -40,10 +41,14 @@ class Sensor(Protocol):
         ...
 
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
-        """State before the first sample, given q [rad] and dq [rad/s] there and the period, () [s]."""
+        """State before the first sample, given q [rad] and dq [rad/s] there and the period, ()
+        [s].
+        """
         ...
 
-    def measure(self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State) -> tuple[Measurement, State]:
+    def measure(
+        self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[Measurement, State]:
         """What is measured, and the next state.
 
         Args:
@@ -56,7 +61,9 @@ class Sensor(Protocol):
 
 
 class Velocity(Protocol):
-    """How a velocity follows from measured positions.  It may have a method `advice(period)`, a list of warnings."""
+    """How a velocity follows from measured positions.  It may have a method `advice(period)`, a
+    list of warnings.
+    """
 
     @property
     def draws(self) -> int:
@@ -64,10 +71,14 @@ class Velocity(Protocol):
         ...
 
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> State:
-        """State before the first sample, as if the joint had come to y [rad] with the velocity dq [rad/s]."""
+        """State before the first sample, as if the joint had come to y [rad] with the velocity dq
+        [rad/s].
+        """
         ...
 
-    def estimate(self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State) -> tuple[jax.Array, State]:
+    def estimate(
+        self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[jax.Array, State]:
         """The velocity, (n,) [rad/s], and the next state.
 
         Args:
@@ -81,11 +92,16 @@ class Velocity(Protocol):
 
 
 def above_nyquist(name: str, cutoff: jax.Array, period: jax.Array) -> list[str]:
-    """What to tell a user whose filter is faster than what is sampled; nothing for traced values."""
-    if not checks.is_concrete((cutoff, period)) or not np.any(np.asarray(cutoff) > np.pi / np.asarray(period)):
+    """What to tell a user whose filter is faster than what is sampled; nothing for traced
+    values.
+    """
+    if not checks.is_concrete((cutoff, period)) or not np.any(
+        np.asarray(cutoff) > np.pi / np.asarray(period)
+    ):
         return []
     highest, nyquist = float(np.max(np.asarray(cutoff))), np.pi / float(period)
     name = f"sensor.velocity.{name} = {highest:g} rad/s"
     return [
-        f"{name} is above the Nyquist frequency of sampling.period, {nyquist:.4g} rad/s: it smooths nothing. Lower it, or sample faster."
+        f"{name} is above the Nyquist frequency of sampling.period, {nyquist:.4g} rad/s: it smooths"
+        " nothing. Lower it, or sample faster."
     ]

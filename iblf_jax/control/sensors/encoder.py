@@ -1,4 +1,6 @@
-"""Joint encoders: positions in counts, with an offset and noise, and a velocity that follows from them."""
+"""Joint encoders: positions in counts, with an offset and noise, and a velocity that follows from
+them.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 class Encoder:
     """y = step round((q + offset + noise w) / step),   step = 2 pi / counts,   w standard normal.
 
-    The derivative of y by q is taken as 1, that of what is read before it is rounded: that of the rounding is 0 almost everywhere.
+    The derivative of y by q is taken as 1, that of what is read before it is rounded: that of the
+    rounding is 0 almost everywhere.
 
     Args:
       velocity: how a velocity follows, any of `iblf_jax.sensors.VELOCITIES`.
@@ -35,7 +38,9 @@ class Encoder:
 
     def check(self) -> None:
         """Raises ValueError for a velocity that is none."""
-        checks.conforms("Encoder.velocity", self.velocity, Velocity, "iblf_jax.sensors.VELOCITIES has them.")
+        checks.conforms(
+            "Encoder.velocity", self.velocity, Velocity, "iblf_jax.sensors.VELOCITIES has them."
+        )
 
     @property
     def draws(self) -> int:
@@ -67,9 +72,13 @@ class Encoder:
         """The velocity's, for the position that is read without noise."""
         return self.velocity.init(self._read(q + self.offset), dq, period)
 
-    def measure(self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State) -> tuple[Measurement, State]:
+    def measure(
+        self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[Measurement, State]:
         """The position in counts, and the velocity."""
         noisy = q + self.offset if self.noise is None else q + self.offset + self.noise * normal[0]
         y = self._read(noisy)
-        v, state = self.velocity.estimate(y, dq, normal[int(self.noise is not None) :], period, state)
+        v, state = self.velocity.estimate(
+            y, dq, normal[int(self.noise is not None) :], period, state
+        )
         return Measurement(y, v), state

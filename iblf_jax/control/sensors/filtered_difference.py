@@ -27,7 +27,8 @@ class FilteredDifference:
     Args:
       cutoff: of the low pass, () or (n,) [rad/s], > 0.
 
-    Source: first-order low pass, exact for a difference that is held over a period; any text on digital filters.
+    Source: first-order low pass, exact for a difference that is held over a period; any text on
+      digital filters.
     """
 
     cutoff: Leaf = leaf("rad/s", sign="positive")
@@ -42,7 +43,12 @@ class FilteredDifference:
         return FilteredDifferenceValues(y - period * dq, dq)
 
     def estimate(
-        self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: FilteredDifferenceValues
+        self,
+        y: jax.Array,
+        dq: jax.Array,
+        normal: jax.Array,
+        period: jax.Array,
+        state: FilteredDifferenceValues,
     ) -> tuple[jax.Array, FilteredDifferenceValues]:
         """The filtered difference, (n,) [rad/s]."""
         a = jnp.exp(-self.cutoff * period)

@@ -20,6 +20,8 @@ class Ideal:
         """No state."""
         return ()
 
-    def measure(self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]) -> tuple[Measurement, tuple[()]]:
+    def measure(
+        self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
+    ) -> tuple[Measurement, tuple[()]]:
         """The truth."""
         return Measurement(q, dq), ()

@@ -26,6 +26,8 @@ class Measured:
         """No state."""
         return ()
 
-    def estimate(self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+    def estimate(
+        self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
+    ) -> tuple[jax.Array, tuple[()]]:
         """The velocity and its noise, (n,) [rad/s]."""
         return dq + self.noise * normal[0], ()

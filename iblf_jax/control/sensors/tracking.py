@@ -22,14 +22,16 @@ class TrackingValues(NamedTuple):
 
 @component
 class Tracking:
-    """r = y - q_hat - T v_hat;   q_hat <- y - a^2 r,   v_hat <- v_hat + (1 - a)^2 r / T,   a = exp(-bandwidth T).
+    """r = y - q_hat - T v_hat;   q_hat <- y - a^2 r,   v_hat <- v_hat + (1 - a)^2 r / T,   a =
+    exp(-bandwidth T).
 
     Both poles are at a, so a constant velocity is found without a lag.
 
     Args:
       bandwidth: of the copy, () or (n,) [rad/s], > 0.
 
-    Source: alpha-beta filter, P. R. Kalata, IEEE Trans. Aerospace and Electronic Systems 20 (1984) 174-182, critically damped.
+    Source: alpha-beta filter, P. R. Kalata, IEEE Trans. Aerospace and Electronic Systems 20 (1984)
+      174-182, critically damped.
     """
 
     bandwidth: Leaf = leaf("rad/s", sign="positive")
@@ -44,7 +46,12 @@ class Tracking:
         return TrackingValues(y - period * dq, dq)
 
     def estimate(
-        self, y: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: TrackingValues
+        self,
+        y: jax.Array,
+        dq: jax.Array,
+        normal: jax.Array,
+        period: jax.Array,
+        state: TrackingValues,
     ) -> tuple[jax.Array, TrackingValues]:
         """The copy's velocity, (n,) [rad/s]."""
         a = jnp.exp(-self.bandwidth * period)

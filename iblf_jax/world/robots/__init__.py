@@ -1,4 +1,6 @@
-"""Robots: the plant that moves and the model that the law knows.  The contract is `Robot` in `_base.py`."""
+"""Robots: the plant that moves and the model that the law knows.  The contract is `Robot` in
+`_base.py`.
+"""
 
 from iblf_jax.world.robots._base import Robot as Robot
 from iblf_jax.world.robots._base import at_time as at_time

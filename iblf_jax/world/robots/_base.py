@@ -1,13 +1,16 @@
 """The contract of a robot, and what follows from its energies alone.
 
-    M(q) q" + C(q, q') q' + G(q) = tau + f                                                       (2.1)
+    M(q) q" + C(q, q') q' + G(q) = tau + f
+    (2.1)
 
-A robot is known by its mass matrix M(q) and its potential U(q): then G = dU/dq, and C follows from the Christoffel symbols,
+A robot is known by its mass matrix M(q) and its potential U(q): then G = dU/dq, and C follows from
+the Christoffel symbols,
 
     C(q, v) u = 1/2 [ (dM/dq . v) u + (dM/dq . u) v - d/dq (u^T M v) ],
 
-which makes M' - 2 C skew-symmetric, the property that the proofs of all laws here rest on.  `from_energy` adds these
-methods to a class that has the energies; a class with closed forms (`TwoLink`) or a recursion writes its own.
+which makes M' - 2 C skew-symmetric, the property that the proofs of all laws here rest on.
+`from_energy` adds these methods to a class that has the energies; a class with closed forms
+(`TwoLink`) or a recursion writes its own.
 """
 
 from __future__ import annotations
@@ -26,17 +29,21 @@ T = TypeVar("T")
 
 
 class Robot(Protocol):
-    """What the package asks of a robot with n joints.  All methods are for one configuration, in SI units, and pure.
+    """What the package asks of a robot with n joints.  All methods are for one configuration, in SI
+    units, and pure.
 
-    A member is a component (`iblf_jax.component`) whose inertial parameters are leaves; `payload` [kg], a point mass at
-    the tip, is one of them in every member, so that any robot can carry what its model does not know.
+    A member is a component (`iblf_jax.component`) whose inertial parameters are leaves; `payload`
+    [kg], a point mass at the tip, is one of them in every member, so that any robot can carry what
+    its model does not know.
 
-    Two methods more are used where a member has them, through `at_time` and `friction_torque` below: `at(t)`, the robot as it is at
-    time t [s], for one that changes while it moves, with `jump_times()`, (m,) [s], if it jumps then, as disturbances have (steps of a run
-    are divided there); and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.  Both are of the plant only: law and
-    observer know neither, and (2.1) has them in f.  A third, `energy_gradient(q, v)`, is used by the function of this name where a member
-    has something shorter than the general formula.  A class may name its `geometry_fields`, a tuple of fields whose zeros, ones and equal
-    numbers may be compiled in (`engine.mechanism`).
+    Two methods more are used where a member has them, through `at_time` and `friction_torque`
+    below: `at(t)`, the robot as it is at time t [s], for one that changes while it moves, with
+      `jump_times()`, (m,) [s], if it jumps then, as disturbances have (steps of a run
+    are divided there); and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.
+    Both are of the plant only: law and observer know neither, and (2.1) has them in f.  A third,
+      `energy_gradient(q, v)`, is used by the function of this name where a member
+    has something shorter than the general formula.  A class may name its `geometry_fields`, a tuple
+    of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
     """
 
     @property
@@ -69,7 +76,9 @@ class Robot(Protocol):
         ...
 
     def skeleton(self, q: jax.Array) -> jax.Array:
-        """Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m]; for drawings."""
+        """Positions of the base, each joint and the tip, (n + 1, 2) or (n + 1, 3) [m]; for
+        drawings.
+        """
         ...
 
 
@@ -85,21 +94,28 @@ def _mass_matrix(robot: Robot, q: jax.Array) -> jax.Array:
 
 
 def mass_matrix_at(robot: Robot, q: jax.Array) -> jax.Array:
-    """M(q), (n, n) [kg m^2], compiled once for all robots of one structure: of many joints that takes seconds."""
+    """M(q), (n, n) [kg m^2], compiled once for all robots of one structure: of many joints that
+    takes seconds.
+    """
     keep_programs()
     if checks.is_concrete((robot, q)):
-        robot = jax.tree.map(lambda x: np.asarray(x, q.dtype), robot)  # a number's weak type would compile it again
+        robot = jax.tree.map(
+            lambda x: np.asarray(x, q.dtype), robot
+        )  # a number's weak type would compile it again
     return _mass_matrix(robot, q)
 
 
 def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
-    """What the joints put against their motion, (n,) [N m], against q' in sign: zero, unless the robot has a method of this name."""
+    """What the joints put against their motion, (n,) [N m], against q' in sign: zero, unless the
+    robot has a method of this name.
+    """
     (dq,) = checks.vectors(dq=dq)
     return robot.friction_torque(dq) if hasattr(robot, "friction_torque") else jnp.zeros_like(dq)
 
 
 def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
-    """C(q, v) u from M(q) by automatic differentiation, with the Christoffel symbols (head of this module).
+    """C(q, v) u from M(q) by automatic differentiation, with the Christoffel symbols (head of this
+    module).
 
     Args:
       mass_matrix: function q -> M(q), (n, n) [kg m^2].
@@ -112,7 +128,12 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
       ValueError: something that is no function, or no vectors of one length.
     """
     if not callable(mass_matrix):
-        raise checks.fail("mass_matrix", mass_matrix, "a function q -> M(q)", "Such as robot.mass_matrix, without brackets.")
+        raise checks.fail(
+            "mass_matrix",
+            mass_matrix,
+            "a function q -> M(q)",
+            "Such as robot.mass_matrix, without brackets.",
+        )
     q, v, u = checks.vectors(q=q, v=v, u=u)
     _, M_along_v = jax.jvp(mass_matrix, (q,), (v,))
     _, M_along_u = jax.jvp(mass_matrix, (q,), (u,))
@@ -121,7 +142,9 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 
 
 def joint_names(robot: Any, n: int) -> tuple[str, ...]:
-    """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint 0", "joint 1", ..."""
+    """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint
+    0", "joint 1", ...
+    """
     n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
     names = tuple(map(str, getattr(robot, "joints", ())))
     return names if len(names) == n else tuple(f"joint {i}" for i in range(n))
@@ -139,7 +162,9 @@ def _is_robot(robot: Any) -> None:
 
 
 def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
-    """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v, by the robot's own method if it has one."""
+    """dT/dq with T = 1/2 v^T M(q) v, (n,) [N m]: C(q, v)^T v = M' v - C(q, v) v, by the robot's own
+    method if it has one.
+    """
     _is_robot(robot)
     q, v = checks.vectors(robot.n, q=q, v=v)
     if hasattr(robot, "energy_gradient"):
@@ -148,7 +173,8 @@ def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def from_energy(cls: type[T]) -> type[T]:
-    """Class decorator: adds `coriolis`, `gravity` and `jacobian` to a robot that has `mass_matrix`, `potential`, `tip`.
+    """Class decorator: adds `coriolis`, `gravity` and `jacobian` to a robot that has `mass_matrix`,
+    `potential`, `tip`.
 
     Methods that the class already has are kept.  Apply it below `component`:
 
@@ -161,10 +187,21 @@ def from_energy(cls: type[T]) -> type[T]:
     """
     sources = {"coriolis": "mass_matrix", "gravity": "potential", "jacobian": "tip"}
     if not isinstance(cls, type):
-        raise checks.fail("from_energy", cls, "a class", "Write @iblf_jax.robots.from_energy above it.")
-    missing = [source for method, source in sources.items() if not hasattr(cls, method) and not hasattr(cls, source)]
+        raise checks.fail(
+            "from_energy", cls, "a class", "Write @iblf_jax.robots.from_energy above it."
+        )
+    missing = [
+        source
+        for method, source in sources.items()
+        if not hasattr(cls, method) and not hasattr(cls, source)
+    ]
     if missing:
-        raise checks.fail("from_energy", cls, "a class with mass_matrix(q), potential(q) and tip(q)", f"It lacks {', '.join(missing)}.")
+        raise checks.fail(
+            "from_energy",
+            cls,
+            "a class with mass_matrix(q), potential(q) and tip(q)",
+            f"It lacks {', '.join(missing)}.",
+        )
 
     def coriolis(self, q, v, u):
         """C(q, v) u, (n,) [N m], from M(q) by automatic differentiation."""

@@ -1,20 +1,24 @@
-"""A serial chain of rigid links in space, with revolute and prismatic joints: real arms (`iblf_jax.robots.load`).
+"""A serial chain of rigid links in space, with revolute and prismatic joints: real arms
+(`iblf_jax.robots.load`).
 
-Each joint i has a frame, placed in the frame of the link before it (of the base, for the first) by `position` and `rotation`, and an axis
-in that frame; link i moves with it.  In the world's frame (that of the base), with S_i = (z_i, p_i x z_i) for a revolute and (0, z_i)
-for a prismatic joint, and I_i the inertia of link i about the world's origin:
+Each joint i has a frame, placed in the frame of the link before it (of the base, for the first) by
+`position` and `rotation`, and an axis in that frame; link i moves with it.  In the world's frame
+(that of the base), with S_i = (z_i, p_i x z_i) for a revolute and (0, z_i) for a prismatic joint,
+and I_i the inertia of link i about the world's origin:
 
     J_i = [S_1 ... S_i 0 ... 0],   M = sum_i J_i^T I_i J_i + diag(armature)
-    M_ij = S_i . (I_j + ... + I_n) S_j  for i <= j                                    composite bodies
-    U = - g . sum_i m_i c_i
+    M_ij = S_i . (I_j + ... + I_n) S_j  for i <= j                                    composite
+    bodies U = - g . sum_i m_i c_i
     C = sum_i J_i^T (I_i J_i' + B(I_i, V_i) J_i),   V_i = J_i v
     B(I, V) u = 1/2 (V x* (I u) - I (V x u) + u x* (I V))
 
-x and x* are the rates of a motion and of a wrench that are carried along (`spatial.along`).  B + B^T = I', so M' - 2 C is
-skew-symmetric; C is the one of the Christoffel symbols (Echeandia & Wensing 2021).  All links are computed at once; only the positions
-of the frames go from link to link.
+x and x* are the rates of a motion and of a wrench that are carried along (`spatial.along`).  B +
+B^T = I', so M' - 2 C is skew-symmetric; C is the one of the Christoffel symbols (Echeandia &
+Wensing 2021).  All links are computed at once; only the positions of the frames go from link to
+link.
 
-Friction in the joints acts on the plant (`friction_torque`); the law's M0, C0, G0 hold none, so it is part of f in (2.1).
+Friction in the joints acts on the plant (`friction_torque`); the law's M0, C0, G0 hold none, so it
+is part of f in (2.1).
 """
 
 from __future__ import annotations
@@ -54,7 +58,8 @@ class Pose(NamedTuple):
 
 
 traced_once = partial(jax.jit, inline=True)
-"""For what is asked of an arm alone too: operation by operation it would be hundreds of programs, each compiled by itself."""
+"""For what is asked of an arm alone too: operation by operation it would be hundreds of programs,
+each compiled by itself."""
 
 
 class Frames(NamedTuple):
@@ -68,39 +73,50 @@ class Frames(NamedTuple):
 
 @component
 class Arm:
-    """Serial arm in space with n revolute or prismatic joints; all its parameters are leaves, one row a link.
+    """Serial arm in space with n revolute or prismatic joints; all its parameters are leaves, one
+    row a link.
 
-    "plant.link[forearm].mass" and "plant.joint[elbow].damping" address one link or joint by its name or number.
+    "plant.link[forearm].mass" and "plant.joint[elbow].damping" address one link or joint by its
+    name or number.
 
     Args:
       mass: mass of each link, (n,) [kg], >= 0.
       centre: centres of mass in the links' frames, (n, 3) [m].
       inertia: about the centres, along the links' axes, (n, 6): xx, yy, zz, xy, xz, yz [kg m^2].
       position: origin of each joint's frame in the frame of the link before, (n, 3) [m].
-      rotation: orientation of each joint's frame there, quaternions (w, x, y, z), (4,) or (n, 4) [1]; their length does not matter;
-        the identity if not given.
-      axis: axes of the joints in their frames, (3,) or (n, 3) [1]; their length does not matter; z if not given.
-      armature: inertia of the rotors seen from the joints, added to the diagonal of M, () or (n,) [kg m^2], >= 0; 0 if not given.
+      rotation: orientation of each joint's frame there, quaternions (w, x, y, z), (4,) or (n, 4)
+        [1]; their length does not matter; the identity if not given.
+      axis: axes of the joints in their frames, (3,) or (n, 3) [1]; their length does not matter; z
+        if not given.
+      armature: inertia of the rotors seen from the joints, added to the diagonal of M, () or (n,)
+        [kg m^2], >= 0; 0 if not given.
       damping: viscous friction of each joint, () or (n,) [N m s/rad], >= 0; 0 if not given.
       friction: Coulomb friction of each joint, () or (n,) [N m], >= 0; 0 if not given.
-      friction_width: speed over which the Coulomb friction changes its sign, () or (n,) [rad/s], > 0; smaller is sharper and stiffer; 0.05
-        if not given.
-      tip_position: origin of the tip's frame in the frame of the last link, (3,) [m]; the same origin if not given.
-      tip_rotation: orientation of the tip's frame there, a quaternion (w, x, y, z), (4,) [1]; the identity if not given.
-      g: acceleration of gravity in the base's frame, (3,) [m/s^2]: it says how the arm is mounted; (0, 0, -9.81) if not given.
+      friction_width: speed over which the Coulomb friction changes its sign, () or (n,) [rad/s], >
+        0; smaller is sharper and stiffer; 0.05 if not given.
+      tip_position: origin of the tip's frame in the frame of the last link, (3,) [m]; the same
+        origin if not given.
+      tip_rotation: orientation of the tip's frame there, a quaternion (w, x, y, z), (4,) [1]; the
+        identity if not given.
+      g: acceleration of gravity in the base's frame, (3,) [m/s^2]: it says how the arm is mounted;
+        (0, 0, -9.81) if not given.
       payload: point mass at the tip, () [kg], >= 0; 0 if not given.
-      lower: lower ends of the joints' ranges, () or (n,) [rad]; of the dynamics nothing depends on them; -infinite if not given.
+      lower: lower ends of the joints' ranges, () or (n,) [rad]; of the dynamics nothing depends on
+        them; -infinite if not given.
       upper: upper ends of the joints' ranges, () or (n,) [rad]; infinite if not given.
-      effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; of the dynamics nothing depends on them; infinite if not
-        given.
-      speed: largest speeds of the joints, () or (n,) [rad/s], > 0; of the dynamics nothing depends on them; infinite if not given.
-      carried: a load with an extent of its own, which may be picked up at a time, a `Payload`; nothing if not given.
+      effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; of the dynamics
+        nothing depends on them; infinite if not given.
+      speed: largest speeds of the joints, () or (n,) [rad/s], > 0; of the dynamics nothing depends
+        on them; infinite if not given.
+      carried: a load with an extent of its own, which may be picked up at a time, a `Payload`;
+        nothing if not given.
       kinds: "revolute" or "prismatic", one a joint, (n,); all revolute if not given.
       links: names of the links, from the first that moves, (n,); link1 ... if not given.
       joints: names of the joints, (n,); joint1 ... if not given.
       repaired: what `load(..., repair=True)` changed, a line a link or joint; nothing if not given.
 
-    Source: Featherstone, Rigid Body Dynamics Algorithms, 2008; Echeandia & Wensing 2021 for C; see the head of this module.
+    Source: Featherstone, Rigid Body Dynamics Algorithms, 2008; Echeandia & Wensing 2021 for C; see
+      the head of this module.
     """
 
     mass: Leaf = leaf("kg", sign="nonnegative")
@@ -127,29 +143,69 @@ class Arm:
     joints: tuple[str, ...] = static(default=())
     repaired: tuple[str, ...] = static(default=())
 
-    geometry_fields: ClassVar[tuple[str, ...]] = ("centre", "inertia", "position", "rotation", "axis", "tip_position", "tip_rotation", "g")
-    """Fields of which it may be compiled in which numbers are 0, 1 or -1, and which are equal (`engine.mechanism`)."""
+    geometry_fields: ClassVar[tuple[str, ...]] = (
+        "centre",
+        "inertia",
+        "position",
+        "rotation",
+        "axis",
+        "tip_position",
+        "tip_rotation",
+        "g",
+    )
+    """Fields of which it may be compiled in which numbers are 0, 1 or -1, and which are equal
+    (`engine.mechanism`)."""
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),
         "joint": (
             "joints",
-            ("position", "rotation", "axis", "armature", "damping", "friction", "friction_width", "lower", "upper", "effort", "speed"),
+            (
+                "position",
+                "rotation",
+                "axis",
+                "armature",
+                "damping",
+                "friction",
+                "friction_width",
+                "lower",
+                "upper",
+                "effort",
+                "speed",
+            ),
         ),
     }
-    """What a path may call by name: word -> (the field that holds the names, the fields with one row a name)."""
+    """What a path may call by name: word -> (the field that holds the names, the fields with one
+    row a name)."""
 
     def check(self) -> None:
-        """Gives every field one row a link, and names; raises ValueError if the fields do not fit together."""
+        """Gives every field one row a link, and names; raises ValueError if the fields do not fit
+        together.
+        """
         if jnp.ndim(self.mass) != 1 or not len(self.mass):
             raise checks.fail("Arm.mass", self.mass, "one number a link, (n,)")
         n = self.mass.shape[0]
-        for name, width in (("centre", 3), ("inertia", 6), ("position", 3), ("rotation", 4), ("axis", 3)):
+        for name, width in (
+            ("centre", 3),
+            ("inertia", 6),
+            ("position", 3),
+            ("rotation", 4),
+            ("axis", 3),
+        ):
             value = getattr(self, name)
             if value.shape == (width,) and name in ("rotation", "axis"):
                 object.__setattr__(self, name, jnp.broadcast_to(value, (n, width)))
             else:
                 checks.shape_is(f"Arm.{name}", value, (n, width))
-        for name in ("armature", "damping", "friction", "friction_width", "lower", "upper", "effort", "speed"):
+        for name in (
+            "armature",
+            "damping",
+            "friction",
+            "friction_width",
+            "lower",
+            "upper",
+            "effort",
+            "speed",
+        ):
             value = getattr(self, name)
             if value.ndim == 0:
                 object.__setattr__(self, name, jnp.broadcast_to(value, (n,)))
@@ -159,22 +215,41 @@ class Arm:
             checks.shape_is(f"Arm.{name}", getattr(self, name), (width,))
         for name in ("rotation", "axis", "tip_rotation"):
             value = getattr(self, name)
-            if checks.is_concrete(value) and not np.all(np.linalg.norm(np.asarray(value), axis=-1) > 1e-6):
+            if checks.is_concrete(value) and not np.all(
+                np.linalg.norm(np.asarray(value), axis=-1) > 1e-6
+            ):
                 raise checks.fail(f"Arm.{name}", value, "directions of a length above 0")
-        if checks.is_concrete((self.lower, self.upper)) and not np.all(np.asarray(self.lower) < np.asarray(self.upper)):
-            raise checks.fail("Arm.lower", self.lower, f"ranges below Arm.upper, {np.asarray(self.upper)}")
+        if checks.is_concrete((self.lower, self.upper)) and not np.all(
+            np.asarray(self.lower) < np.asarray(self.upper)
+        ):
+            raise checks.fail(
+                "Arm.lower", self.lower, f"ranges below Arm.upper, {np.asarray(self.upper)}"
+            )
         if self.carried is None:
             object.__setattr__(self, "carried", Payload())
         elif not isinstance(self.carried, Payload):
-            raise checks.fail("Arm.carried", self.carried, "a Payload", "Such as Payload(mass=1.5, centre=[0, 0, 0.1]).")
+            raise checks.fail(
+                "Arm.carried",
+                self.carried,
+                "a Payload",
+                "Such as Payload(mass=1.5, centre=[0, 0, 0.1]).",
+            )
         self._check_names(n)
 
     def _check_names(self, n: int) -> None:
-        for name, default in (("kinds", ("revolute",) * n), ("links", _numbered("link", n)), ("joints", _numbered("joint", n))):
+        for name, default in (
+            ("kinds", ("revolute",) * n),
+            ("links", _numbered("link", n)),
+            ("joints", _numbered("joint", n)),
+        ):
             given = getattr(self, name)
             if isinstance(given, tuple) and not given:
                 object.__setattr__(self, name, default)
-            elif not isinstance(given, tuple) or len(given) != n or not all(isinstance(x, str) and x for x in given):
+            elif (
+                not isinstance(given, tuple)
+                or len(given) != n
+                or not all(isinstance(x, str) and x for x in given)
+            ):
                 raise checks.fail(f"Arm.{name}", given, f"{n} words, one a link")
             elif name != "kinds" and len(set(given)) < n:
                 raise checks.fail(f"Arm.{name}", given, "names that differ")
@@ -200,7 +275,9 @@ class Arm:
         return now
 
     def jump_times(self) -> jax.Array:
-        """When the arm picks up its load, and when all of the load hangs on it, (2,) [s]; (0,) where it does not pick one up."""
+        """When the arm picks up its load, and when all of the load hangs on it, (2,) [s]; (0,)
+        where it does not pick one up.
+        """
         return self.carried.jump_times()
 
     # ------------------------------------------------------------------------------------------------------- where things are
@@ -227,7 +304,9 @@ class Arm:
 
     @traced_once
     def _bodies(self, frames: Frames) -> tuple[jax.Array, jax.Array]:
-        """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the last with all that the tip carries."""
+        """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the
+        last with all that the tip carries.
+        """
         P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
         tip = jnp.concatenate([self._tip_placement(), jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
         corner = jnp.asarray(np.diag([0.0, 0.0, 0.0, 1.0]), P.dtype) * self.payload
@@ -260,7 +339,9 @@ class Arm:
         return self.twist_jacobian(q)[:3]
 
     def twist_jacobian(self, q: jax.Array) -> jax.Array:
-        """The tip's velocity (first three rows) and angular velocity (last three) per unit of joint speed, (6, n)."""
+        """The tip's velocity (first three rows) and angular velocity (last three) per unit of joint
+        speed, (6, n).
+        """
         w, v = jnp.unstack(self._frames(q).allowed, axis=1)
         return jnp.concatenate([(v + spatial.cross(w, self.tip(q)[None])).T, w.T])
 
@@ -274,7 +355,9 @@ class Arm:
         S = frames.allowed
         upper = jnp.sum(S[:, None] * spatial.momentum(composite, S), axis=(-1, -2))
         above, diagonal = np.triu(np.ones((self.n, self.n), bool)), np.eye(self.n, dtype=bool)
-        return jnp.where(above, upper, upper.T) + jnp.where(diagonal, self.armature, jnp.zeros_like(upper))
+        return jnp.where(above, upper, upper.T) + jnp.where(
+            diagonal, self.armature, jnp.zeros_like(upper)
+        )
 
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
@@ -283,7 +366,9 @@ class Arm:
         V = _moving(S, v)
         carried = _moving(spatial.along(V, S), u)
         if u is v:  # the usual case: V x V = 0
-            forces = spatial.momentum(bodies, carried) + spatial.along_wrench(V, spatial.momentum(bodies, V))
+            forces = spatial.momentum(bodies, carried) + spatial.along_wrench(
+                V, spatial.momentum(bodies, V)
+            )
         else:
             U = _moving(S, u)
             L = spatial.momentum(bodies, jnp.stack([carried - 0.5 * spatial.along(V, U), U, V]))
@@ -292,7 +377,9 @@ class Arm:
 
     @traced_once
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the momentum of all beyond it."""
+        """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the
+        momentum of all beyond it.
+        """
         frames = self._frames(q)
         S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
         V = _moving(S, v)
@@ -312,7 +399,9 @@ class Arm:
         return -_felt(frames.allowed, weight)
 
     def friction_torque(self, dq: jax.Array) -> jax.Array:
-        """-(damping q' + friction tanh(q' / friction_width)), (n,) [N m]: what the joints themselves put against the motion."""
+        """-(damping q' + friction tanh(q' / friction_width)), (n,) [N m]: what the joints
+        themselves put against the motion.
+        """
         return -(self.damping * dq + self.friction * jnp.tanh(dq / self.friction_width))
 
 

@@ -1,9 +1,11 @@
 """Reading a robot's description, URDF or MJCF, without trusting it.
 
-A file from elsewhere may be malformed, huge, a bomb of entities, or just not what its ending says.  Here it is read with limits, parsed by
-a parser that knows no entities, and copied: only the elements and attributes that say how links move and what they weigh go on, to the
-library that understands them.  What draws, what collides and what senses stays behind; files that MJCF includes are read here, under
-the same limits.  The only other files are meshes that a body of an MJCF takes its weight from (`meshes`).
+A file from elsewhere may be malformed, huge, a bomb of entities, or just not what its ending says.
+Here it is read with limits, parsed by a parser that knows no entities, and copied: only the
+elements and attributes that say how links move and what they weigh go on, to the library that
+understands them.  What draws, what collides and what senses stays behind; files that MJCF includes
+are read here, under the same limits.  The only other files are meshes that a body of an MJCF takes
+its weight from (`meshes`).
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ def read(path: str | os.PathLike, field: str = "path") -> ET.Element:
       field: what the caller's argument is called in messages.
 
     Raises:
-      ValueError: no such file, not a file, too large, too deep, not XML, or XML that declares entities.
+      ValueError: no such file, not a file, too large, too deep, not XML, or XML that declares
+        entities.
     """
     place = checks.file_path(field, path, "a URDF or MJCF file")
     try:
@@ -65,7 +68,12 @@ def read(path: str | os.PathLike, field: str = "path") -> ET.Element:
         expected = "a URDF or MJCF file"
         if root.tag == "sdf":
             raise checks.fail(field, str(path), expected, "It is SDF.")
-        raise checks.fail(field, str(path), expected, f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.")
+        raise checks.fail(
+            field,
+            str(path),
+            expected,
+            f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.",
+        )
     return root
 
 
@@ -110,7 +118,10 @@ class _Reader:
             if self.elements_left < 0:
                 raise fail(f"more than {MOST} elements")
             if tag.startswith("xacro:"):
-                raise fail(f"<{tag[:40]}> is a macro", "Expand the file first: xacro arm.urdf.xacro > arm.urdf")
+                raise fail(
+                    f"<{tag[:40]}> is a macro",
+                    "Expand the file first: xacro arm.urdf.xacro > arm.urdf",
+                )
             builder.start(tag, attributes)
 
         def end(tag: str) -> None:
@@ -119,24 +130,36 @@ class _Reader:
             builder.end(tag)
 
         def doctype(*_: Any) -> None:
-            raise fail("it declares a document type or entities", "A robot needs none: remove <!DOCTYPE ...>.")
+            raise fail(
+                "it declares a document type or entities",
+                "A robot needs none: remove <!DOCTYPE ...>.",
+            )
 
         parser.StartElementHandler, parser.EndElementHandler = start, end
         parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = doctype
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            raise fail(f"malformed XML, {expat.ErrorString(error.code)}", "Correct it there.") from None
+            raise fail(
+                f"malformed XML, {expat.ErrorString(error.code)}", "Correct it there."
+            ) from None
         except (LookupError, UnicodeError) as error:
             raise fail(f"an encoding that cannot be read, {error}") from None
         return self._with_includes(builder.close(), path, nesting)
 
     def _with_includes(self, root: ET.Element, path: Path, nesting: int) -> ET.Element:
-        """`root` of an MJCF, with the children of each file that it includes in the place of the <include>."""
+        """`root` of an MJCF, with the children of each file that it includes in the place of the
+        <include>.
+        """
         if root.tag != "mujoco":
             return root
         if nesting > MOST_NESTED:
-            raise checks.fail("<include>", str(path), f"at most {MOST_NESTED} files inside each other", "Does it include itself?")
+            raise checks.fail(
+                "<include>",
+                str(path),
+                f"at most {MOST_NESTED} files inside each other",
+                "Does it include itself?",
+            )
         for parent in list(root.iter()):
             for element in [child for child in parent if child.tag == "include"]:
                 file = element.get("file")
@@ -167,20 +190,32 @@ class _Reader:
         self.bytes_left -= len(data)
         if self.bytes_left < 0:
             expected = f"a file of at most {LARGEST >> 20} MiB"
-            raise checks.fail(self.field, str(path), expected, "A description without meshes is far smaller.")
+            raise checks.fail(
+                self.field, str(path), expected, "A description without meshes is far smaller."
+            )
         return data
 
 
 def contents(field: str, path: Path, most: int, expected: str, remedy: str = "") -> bytes:
-    """What a file holds, no more than a byte beyond `most`; ValueError, with `field`, unless it is a file that can be read."""
+    """What a file holds, no more than a byte beyond `most`; ValueError, with `field`, unless it is
+    a file that can be read.
+    """
     try:
         if not path.is_file():
-            found = "It is a directory." if path.is_dir() else "It is not a file." if path.exists() else "Nothing is there."
+            found = (
+                "It is a directory."
+                if path.is_dir()
+                else "It is not a file."
+                if path.exists()
+                else "Nothing is there."
+            )
             raise checks.fail(field, str(path), expected, f"{found} {remedy}".strip())
         with path.open("rb") as file:
             return file.read(most + 1)
     except OSError as error:
-        raise checks.fail(field, str(path), expected, f"It cannot be read: {error}. {remedy}".strip()) from None
+        raise checks.fail(
+            field, str(path), expected, f"It cannot be read: {error}. {remedy}".strip()
+        ) from None
 
 
 def label(element: ET.Element) -> str:
@@ -189,8 +224,17 @@ def label(element: ET.Element) -> str:
     return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag[:40]}>"
 
 
-def floats(where: str, text: str, count: int | None = None, *, most: float = LARGEST_NUMBER, longest: int = 100) -> list[float]:
-    """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as expected, finite and below `most`."""
+def floats(
+    where: str,
+    text: str,
+    count: int | None = None,
+    *,
+    most: float = LARGEST_NUMBER,
+    longest: int = 100,
+) -> list[float]:
+    """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as
+    expected, finite and below `most`.
+    """
     words = [word for word in re.split(f"[{SPACES}]+", text.strip(SPACES)) if word]
     expected = f"{count} numbers" if count and count > 1 else "one number" if count else "numbers"
     if (count is not None and len(words) != count) or not 1 <= len(words) <= longest:

@@ -1,4 +1,6 @@
-"""The links of a chain, all that is welded to them added up, and whether their masses hold its mass matrix positive definite."""
+"""The links of a chain, all that is welded to them added up, and whether their masses hold its mass
+matrix positive definite.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ Pose = tuple[np.ndarray, np.ndarray]
 SINGULAR = 1e-12
 """Share of a joint's inertia, left when the joints beyond it are free, that is rounding."""
 SAMPLES = 8
-"""Configurations, beside zero and the middle of the ranges, at which the mass matrix is looked at."""
+"""Configurations, beside zero and the middle of the ranges, at which the mass matrix is looked
+at."""
 
 
 class Links(NamedTuple):
@@ -58,25 +61,48 @@ class Links(NamedTuple):
                 links = links._compact(i, repairs)
         while (k := links._unresisting(joints)) is not None:
             if not links.moments[k, 3, 3] > 0:
-                raise links._massless(k, "Give it an inertial, lock or fix its joint, or take a tip before it.")
+                raise links._massless(
+                    k, "Give it an inertial, lock or fix its joint, or take a tip before it."
+                )
             links = links._compact(k, repairs)
         for i, P in enumerate(self.moments):
             if not self.between[i] and not P[3, 3] > 0:
                 kept = "no mass, as it is: the mass matrix is positive definite all the same"
-                repairs.meet(Fault(f"link {self.names[i]!r}", "no mass", self._massless(i, "Give it an inertial, or fix its joint."), kept))
+                repairs.meet(
+                    Fault(
+                        f"link {self.names[i]!r}",
+                        "no mass",
+                        self._massless(i, "Give it an inertial, or fix its joint."),
+                        kept,
+                    )
+                )
         return links
 
     def _massless(self, i: int, remedy: str) -> ValueError:
-        return checks.fail(f"link {self.names[i]!r}", Shown("no mass"), "a mass [kg] of each link that moves", remedy)
+        return checks.fail(
+            f"link {self.names[i]!r}",
+            Shown("no mass"),
+            "a mass [kg] of each link that moves",
+            remedy,
+        )
 
     def _compact(self, i: int, repairs: Repairs) -> Links:
-        """The links, with link i as a compact body where it is a point, or a rod along its joint."""
+        """The links, with link i as a compact body where it is a point, or a rod along its
+        joint.
+        """
         P, where = self.moments[i], f"link {self.names[i]!r}: inertia"
         m, J = P[3, 3], _about_centre(P)
         J = np.zeros((3, 3)) if is_nothing(J, m) else J
-        error = checks.fail(where, moments_of(J), "a positive definite inertia [kg m^2]", "A body that moves needs one.")
+        error = checks.fail(
+            where,
+            moments_of(J),
+            "a positive definite inertia [kg m^2]",
+            "A body that moves needs one.",
+        )
         nearest = thickened(J, m * (COMPACT * self._longest()) ** 2)
-        if not np.trace(nearest) > np.trace(J) * (1.0 + ROUNDING):  # all of the file is in one point, or heavier by far beyond
+        if not np.trace(nearest) > np.trace(J) * (
+            1.0 + ROUNDING
+        ):  # all of the file is in one point, or heavier by far beyond
             raise error
         repairs.meet(Fault(where, moments_of(J), error, moments_of(nearest)))
         moments = self.moments.copy()
@@ -84,19 +110,25 @@ class Links(NamedTuple):
         return self._replace(moments=moments)
 
     def _longest(self) -> float:
-        """Xs link, for the longest link; from the base to the first joint where all is in one point."""
+        """Xs link, for the longest link; from the base to the first joint where all is in one
+        point.
+        """
         centres = self.moments[:, :3, 3] / np.maximum(self.moments[:, 3, 3], 1e-300)[:, None]
         places = [p for body, (p, _) in self.frames.items() if self.carrier[body] >= 0]
         longest = float(np.max(np.linalg.norm([*centres, *places, *self.position[1:]], axis=1)))
         return longest if longest > FINEST else float(np.linalg.norm(self.position[0]))
 
     def _unresisting(self, joints: dict[str, Any]) -> int | None:
-        """The link nearest to the tip that, at some configuration, does not resist its joint when those beyond are free; None if all do."""
+        """The link nearest to the tip that, at some configuration, does not resist its joint when
+        those beyond are free; None if all do.
+        """
         turns = np.array([kind == "revolute" for kind in joints["kinds"]])
         wide = np.where(turns, np.pi, 1.0)
         lower, upper = np.clip(joints["lower"], -wide, wide), np.clip(joints["upper"], -wide, wide)
         shares = np.random.default_rng(0).uniform(size=(SAMPLES, len(turns)))
-        q = np.stack([np.zeros(len(turns)), 0.5 * (lower + upper), *(lower + shares * (upper - lower))])
+        q = np.stack(
+            [np.zeros(len(turns)), 0.5 * (lower + upper), *(lower + shares * (upper - lower))]
+        )
         found: list[int] = []
         for M in self._mass_matrices(q, turns, joints["axis"]) + np.diag(joints["armature"]):
             none = SINGULAR * np.diag(M) + np.where(turns, self.moments[:, 3, 3] * FINEST**2, 0.0)
@@ -108,7 +140,9 @@ class Links(NamedTuple):
         return max(found, default=None)
 
     def _mass_matrices(self, q: np.ndarray, turns: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """M_jk = tr(X_j C_k X_k^T), j <= k, at each row of q: C the moments of all beyond, X the 4 x 4 matrices of the joints' motions."""
+        """M_jk = tr(X_j C_k X_k^T), j <= k, at each row of q: C the moments of all beyond, X the 4
+        x 4 matrices of the joints' motions.
+        """
         H, motions, moments = np.broadcast_to(np.eye(4), (len(q), 4, 4)), [], []
         for i, axis in enumerate(axes):
             fixed, X, moved = np.eye(4), np.zeros((4, 4)), np.tile(np.eye(4), (len(q), 1, 1))
@@ -116,7 +150,9 @@ class Links(NamedTuple):
             if turns[i]:
                 x, y, z = axis
                 X[:3, :3] = K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-                moved[:, :3, :3] += np.sin(q[:, i])[:, None, None] * K + (1.0 - np.cos(q[:, i]))[:, None, None] * (K @ K)
+                moved[:, :3, :3] += np.sin(q[:, i])[:, None, None] * K + (1.0 - np.cos(q[:, i]))[
+                    :, None, None
+                ] * (K @ K)
             else:
                 X[:3, 3] = axis
                 moved[:, :3, 3] = q[:, i, None] * axis
@@ -125,7 +161,9 @@ class Links(NamedTuple):
             H = H @ moved
             moments.append(H @ self.moments[i] @ np.swapaxes(H, 1, 2))
         beyond = np.cumsum(moments[::-1], axis=0)[::-1]
-        upper = np.einsum("jbxy,kbyz,kbxz->bjk", np.array(motions), beyond, np.array(motions), optimize=True)
+        upper = np.einsum(
+            "jbxy,kbyz,kbxz->bjk", np.array(motions), beyond, np.array(motions), optimize=True
+        )
         return np.triu(upper) + np.swapaxes(np.triu(upper, 1), 1, 2)
 
     def parameters(self) -> dict[str, Any]:
@@ -133,9 +171,17 @@ class Links(NamedTuple):
         mass = self.moments[:, 3, 3]
         centre = self.moments[:, :3, 3] / np.where(mass > 0, mass, 1.0)[:, None]
         J = np.array([_about_centre(P) for P in self.moments])
-        inertia = np.stack([J[:, i, k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], axis=1)
+        inertia = np.stack(
+            [J[:, i, k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], axis=1
+        )
         rotation = np.array([quaternion(R) for R in self.rotation])
-        return {"mass": mass, "centre": centre, "inertia": inertia, "position": self.position, "rotation": rotation}
+        return {
+            "mass": mass,
+            "centre": centre,
+            "inertia": inertia,
+            "position": self.position,
+            "rotation": rotation,
+        }
 
 
 def _about_centre(P: np.ndarray) -> np.ndarray:

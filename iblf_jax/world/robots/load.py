@@ -1,8 +1,9 @@
 """Robots from files: a serial arm picked out of a URDF or MJCF.
 
-The file is read and checked by `description`, `urdf` and `mjcf`; the `mujoco` package (extra `robots`) makes a tree of bodies of what is
-left.  From the tree a chain is picked, from `base` to `tip`: its joints move, every other joint is locked, and each body is welded to the
-link of the chain that carries it.  The arm's world is the frame of the base.
+The file is read and checked by `description`, `urdf` and `mjcf`; the `mujoco` package (extra
+`robots`) makes a tree of bodies of what is left.  From the tree a chain is picked, from `base` to
+`tip`: its joints move, every other joint is locked, and each body is welded to the link of the
+  chain that carries it.  The arm's world is the frame of the base.
 """
 
 from __future__ import annotations
@@ -35,42 +36,53 @@ def load(
 ) -> Arm:
     """The serial arm of a URDF or MJCF file.
 
-    Fixed joints are fused; joints that are not between base and tip are locked, and their links' masses and inertias stay, with the link
-    that carries them.  A mesh is opened only where a body of an MJCF takes its weight from it.  What is wrong
-    with links that the chain does not carry, and with joints that do not move in it, does not matter; nor do moments of inertia that are
-    off by rounding, 1e-6 of them or m (1 um)^2.
+    Fixed joints are fused; joints that are not between base and tip are locked, and their links'
+    masses and inertias stay, with the link that carries them.  A mesh is opened only where a body
+    of an MJCF takes its weight from it.  What is wrong with links that the chain does not carry,
+    and with joints that do not move in it, does not matter; nor do moments of inertia that are off
+    by rounding, 1e-6 of them or m (1 um)^2.
 
-    With `repair` the rest is mended where a rule says how, with the least change, and listed: with J = V diag(...) V^T an inertia about
-    the centre of mass m,
+    With `repair` the rest is mended where a rule says how, with the least change, and listed: with
+    J = V diag(...) V^T an inertia about the centre of mass m,
 
         S = 1/2 tr(J) 1 - J = V diag(s) V^T,   S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
-    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link, where a link that moves would resist its
-    joint with nothing.  No mass is made up: a link without one is kept so if the mass matrix is positive definite all the same, and
-    refused else.  A range that is none, and a torque or speed below 0, become no limits; friction below 0 becomes 0; a spring is left
-    out, and so is MuJoCo's compensation of a body's gravity; a joint of the chain that is tied to another (a mimic, a coupling) moves by
-    itself.
+    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link,
+    where a link that moves would resist its joint with nothing.  No mass is made up: a link without
+    one is kept so if the mass matrix is positive definite all the same, and refused else.  A range
+    that is none, and a torque or speed below 0, become no limits; friction below 0 becomes 0; a
+    spring is left out, and so is MuJoCo's compensation of a body's gravity; a joint of the chain
+    that is tied to another (a mimic, a coupling) moves by itself.
 
     Args:
       path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.
-      base: name of the link (body) that is held still, and whose frame is the arm's world; the root if not given.
-      tip: name of the link (body, or site of an MJCF) whose frame is the tip; the end of the chain if there is only one.
-      locked: joint name -> position [rad or m] for joints that are not to move; a joint between base and tip may be among them.  Others
-        that are left out are locked at 0 (an MJCF's at `ref`).
+      base: name of the link (body) that is held still, and whose frame is the arm's world; the root
+        if not given.
+      tip: name of the link (body, or site of an MJCF) whose frame is the tip; the end of the chain
+        if there is only one.
+      locked: joint name -> position [rad or m] for joints that are not to move; a joint between
+        base and tip may be among them.  Others that are left out are locked at 0 (an MJCF's at
+        `ref`).
       gravity: (3,) [m/s^2] in the file's world; the file's own, (0, 0, -9.81) if it has none.
-      repair: whether to mend what can be mended; a warning and the arm's `repaired` then say what changed, a line a link or joint.
+      repair: whether to mend what can be mended; a warning and the arm's `repaired` then say what
+        changed, a line a link or joint.
 
     Returns:
-      An Arm, with the names of links and joints, limits, damping, friction, armature, efforts and speeds of the file; its `limits`,
-      `effort` and `speed` are infinite where the file has none (an MJCF has no speeds).
+      An Arm, with the names of links and joints, limits, damping, friction, armature, efforts and
+      speeds of the file; its `limits`, `effort` and `speed` are infinite where the file has none
+      (an MJCF has no speeds).
 
     Raises:
-      ValueError: what is wrong with the file or the chain; the message names the element and the remedy.
+      ValueError: what is wrong with the file or the chain; the message names the element and the
+        remedy.
       ImportError: the extra `robots` is not installed.
 
     Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
     """
-    base, tip = (None if x is None else checks.word(what, x, "the name of a link") for what, x in (("base", base), ("tip", tip)))
+    base, tip = (
+        None if x is None else checks.word(what, x, "the name of a link")
+        for what, x in (("base", base), ("tip", tip))
+    )
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
     repairs = Repairs(checks.flag("repair", repair))
     root = description.read(path)
@@ -100,7 +112,9 @@ def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _Request) -> 
     file = urdf.checked(root)
     tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
     chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
-    return chain.following(file, request.repairs).arm(request.gravity, {}, request.repairs, file.speeds)
+    return chain.following(file, request.repairs).arm(
+        request.gravity, {}, request.repairs, file.speeds
+    )
 
 
 def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
@@ -125,40 +139,68 @@ class _Chain(NamedTuple):
     """Joints that do not, and where they are."""
 
     @staticmethod
-    def picked(tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], repairs: Repairs) -> _Chain:
+    def picked(
+        tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], repairs: Repairs
+    ) -> _Chain:
         """The chain from base to tip."""
         first = 0 if base is None else tree.body(base, "base")
         held = {tree.joint(name): locked_position(name, value) for name, value in locked.items()}
-        last, at_tip = tree.frame(tip) if tip is not None else (tree.only_tip(first, held), (np.zeros(3), np.eye(3)))
+        last, at_tip = (
+            tree.frame(tip)
+            if tip is not None
+            else (tree.only_tip(first, held), (np.zeros(3), np.eye(3)))
+        )
         way = tree.way(first, last)
         if way is None:
-            raise checks.fail("tip", tip, f"a link beyond the base {tree.bodies[first]!r}", "Another base or another tip.")
+            raise checks.fail(
+                "tip",
+                tip,
+                f"a link beyond the base {tree.bodies[first]!r}",
+                "Another base or another tip.",
+            )
         joints = tuple(j for b in way for j in tree.joints_of(b) if j not in held)
         if not joints:
             expected = "a chain with a joint that moves"
-            raise checks.fail("tip", tree.bodies[last], expected, f"Between it and {tree.bodies[first]!r} there is none.")
+            raise checks.fail(
+                "tip",
+                tree.bodies[last],
+                expected,
+                f"Between it and {tree.bodies[first]!r} there is none.",
+            )
         for j in joints:
             tree.check_joint(j, repairs)
         return _Chain(tree, first, last, at_tip, joints, held)
 
     def following(self, file: urdf.Urdf, repairs: Repairs) -> _Chain:
-        """The chain with the mimics that are not in it locked where their joints take them, and what is wrong with its joints met."""
+        """The chain with the mimics that are not in it locked where their joints take them, and
+        what is wrong with its joints met.
+        """
         tree, held = self.tree, dict(self.held)
         moving = {tree.joint_names[j] for j in self.joints}
         for name in file.mimics:
             if name not in moving and tree.joint(name) not in held:
                 held[tree.joint(name)] = self._mimicked(name, file.mimics)
         for j in (*self.joints, *(j for j, position in held.items() if position)):
-            for fault in (file.axes.get(tree.joint_names[j]), *(file.motions[tree.joint_names[j]] if j in self.joints else ())):
+            for fault in (
+                file.axes.get(tree.joint_names[j]),
+                *(file.motions[tree.joint_names[j]] if j in self.joints else ()),
+            ):
                 if fault:
                     repairs.meet(fault)
         for name, mimic in file.mimics.items():
             if name in moving or mimic.master in moving:
                 coupled = name if name in moving else mimic.master
                 remedy = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
-                error = checks.fail(f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", remedy)
+                error = checks.fail(
+                    f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", remedy
+                )
                 repairs.meet(
-                    Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself" if name in moving else "one that is locked")
+                    Fault(
+                        f"joint {name!r}",
+                        mimic.shown,
+                        error,
+                        "one that moves by itself" if name in moving else "one that is locked",
+                    )
                 )
         way = tree.way(0, self.tip) or []
         for b in range(1, tree.model.nbody):
@@ -173,16 +215,26 @@ class _Chain(NamedTuple):
         at = {self.tree.joint_names[j]: position for j, position in self.held.items()}
         while name in mimics and name not in at:
             mimic = mimics[name]
-            offset, factor, name = offset + factor * mimic.offset, factor * mimic.multiplier, mimic.master
+            offset, factor, name = (
+                offset + factor * mimic.offset,
+                factor * mimic.multiplier,
+                mimic.master,
+            )
             if name in seen:
-                raise checks.fail(f"joint {name!r}: mimic", Shown("a ring of mimics"), "a joint that leads")
+                raise checks.fail(
+                    f"joint {name!r}: mimic", Shown("a ring of mimics"), "a joint that leads"
+                )
             seen.add(name)
         return offset + factor * at.get(name, 0.0)
 
-    def arm(self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs, speeds: Mapping[str, float]) -> Arm:
+    def arm(
+        self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs, speeds: Mapping[str, float]
+    ) -> Arm:
         """The Arm, all bodies welded to the links that carry them."""
         tree = self.tree
-        g = np.asarray(tree.gravity if gravity is None else checks.as_floats("gravity", gravity), float)
+        g = np.asarray(
+            tree.gravity if gravity is None else checks.as_floats("gravity", gravity), float
+        )
         checks.shape_is("gravity", g, (3,))
         _, upright = tree.pose(self.base, self.held)
         joints = tree.of_joints(self.joints)

@@ -1,7 +1,8 @@
 """The meshes that bodies of an MJCF are weighed by.
 
-A mesh is opened only where a body has no other weight.  Its file is read here, under a limit, and the library weighs it once apart from
-the rest: so one that is missing or broken is a fault of the bodies that need it, and of no other.
+A mesh is opened only where a body has no other weight.  Its file is read here, under a limit, and
+the library weighs it once apart from the rest: so one that is missing or broken is a fault of the
+  bodies that need it, and of no other.
 """
 
 from __future__ import annotations
@@ -14,17 +15,32 @@ from iblf_jax.world.robots.description import Shown, contents
 
 LARGEST_MESHES = 512 << 20
 """Bytes of the meshes that one model is weighed by, together."""
-OF_MESH = ("name", "file", "content_type", "scale", "refpos", "refquat", "inertia", "maxhullvert", "uservert", "userface")
+OF_MESH = (
+    "name",
+    "file",
+    "content_type",
+    "scale",
+    "refpos",
+    "refquat",
+    "inertia",
+    "maxhullvert",
+    "uservert",
+    "userface",
+)
 OF_GEOM = ("type", "meshname", "typeinertia", "fitscale")
 """What decides whether the library can weigh a geom that has its shape from a mesh."""
 REMEDY = "Or give the body an <inertial>."
 
 
 class Meshes:
-    """The meshes of a specification: each is opened when a geom needs it, and those that none needed leave."""
+    """The meshes of a specification: each is opened when a geom needs it, and those that none
+    needed leave.
+    """
 
     def __init__(self, spec: Any, folder: Path, bare: bool) -> None:
-        """`spec` is the library's, parsed; the files lie in `folder`, under their bare names if `bare`."""
+        """`spec` is the library's, parsed; the files lie in `folder`, under their bare names if
+        `bare`.
+        """
         self.spec, self.folder, self.bare = spec, folder, bare
         self.meshes = {mesh.name: mesh for mesh in spec.meshes}
         self.opened: dict[str, Path | None] = {}
@@ -42,11 +58,15 @@ class Meshes:
                 self.problems[shape] = None
             except ValueError as error:
                 self.problems[shape] = error
-        geom.contype = geom.conaffinity = 0  # it collides with nothing here: no hull of it is needed
+        geom.contype = geom.conaffinity = (
+            0  # it collides with nothing here: no hull of it is needed
+        )
         return self.problems[shape]
 
     def leave(self) -> None:
-        """Takes the meshes that nothing is weighed by out of the specification, and gives it the files of the others."""
+        """Takes the meshes that nothing is weighed by out of the specification, and gives it the
+        files of the others.
+        """
         for name, mesh in self.meshes.items():
             if name not in self.opened:
                 self.spec.delete(mesh)
@@ -56,7 +76,12 @@ class Meshes:
         """Raises unless the library can weigh the geom."""
         if geom.hfieldname or geom.meshname not in self.meshes:
             got = Shown(f"height field {geom.hfieldname!r}") if geom.hfieldname else geom.meshname
-            raise checks.fail("its weight", got, "masses and inertias in numbers, or the name of a <mesh>", "Give the body an <inertial>.")
+            raise checks.fail(
+                "its weight",
+                got,
+                "masses and inertias in numbers, or the name of a <mesh>",
+                "Give the body an <inertial>.",
+            )
         mesh = self.meshes[geom.meshname]
         if geom.meshname not in self.opened:
             self.opened[geom.meshname] = self._open(mesh)
@@ -73,17 +98,24 @@ class Meshes:
             path = self.opened.pop(geom.meshname)
             got = Shown(path or "vertices in the model")
             reason = " ".join(str(error).split())
-            raise checks.fail(f"mesh {mesh.name!r}", got, "a surface around a volume", f"{reason}. {REMEDY}") from None
+            raise checks.fail(
+                f"mesh {mesh.name!r}", got, "a surface around a volume", f"{reason}. {REMEDY}"
+            ) from None
 
     def _open(self, mesh: Any) -> Path | None:
         """Reads the file of a mesh, if it has one."""
         if not mesh.file:
             return None
-        field, path = f"mesh {mesh.name!r}", self.folder / (Path(mesh.file).name if self.bare else mesh.file)
+        field, path = (
+            f"mesh {mesh.name!r}",
+            self.folder / (Path(mesh.file).name if self.bare else mesh.file),
+        )
         left = LARGEST_MESHES - sum(map(len, self.files.values()))
         data = contents(field, path, left, "the path of a mesh, STL, OBJ or MSH", REMEDY)
         if len(data) > left:
-            raise checks.fail(field, str(path), f"meshes of at most {LARGEST_MESHES >> 20} MiB together", REMEDY)
+            raise checks.fail(
+                field, str(path), f"meshes of at most {LARGEST_MESHES >> 20} MiB together", REMEDY
+            )
         mesh.file = f"{len(self.files)}{path.suffix}"
         self.files[mesh.file] = data
         return path

@@ -1,9 +1,10 @@
 """The part of an MJCF that says how bodies move and what they weigh.
 
-A list of elements and attributes goes on; what draws, collides without weighing anything or senses does not.  The library resolves
-defaults and then would refuse a body for what may not matter: so what it would refuse is taken out of its hands before it compiles
-(`Mjcf.taken_out`), to be judged where the body counts.  Of the meshes it gets those that a body takes its weight from, if they can be
-weighed, as bytes that were read here.
+A list of elements and attributes goes on; what draws, collides without weighing anything or senses
+does not.  The library resolves defaults and then would refuse a body for what may not matter: so
+what it would refuse is taken out of its hands before it compiles (`Mjcf.taken_out`), to be judged
+where the body counts.  Of the meshes it gets those that a body takes its weight from, if they can
+be weighed, as bytes that were read here.
 """
 
 from __future__ import annotations
@@ -23,21 +24,30 @@ PLACE = "pos quat axisangle xyaxes zaxis euler"
 ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited inheritrange"
 KEPT = {
     "compiler": (
-        "angle autolimits eulerseq fitaabb inertiafromgeom inertiagrouprange boundmass boundinertia balanceinertia settotalmass alignfree"
+        "angle autolimits eulerseq fitaabb inertiafromgeom inertiagrouprange boundmass boundinertia"
+        " balanceinertia settotalmass alignfree"
     ),
     "option": "gravity",
     "flag": "gravity",
     "default": "class",
     "asset": "",
-    "mesh": "name class file content_type vertex face scale refpos refquat inertia maxhullvert builtin params",
+    "mesh": (
+        "name class file content_type vertex face scale refpos refquat inertia maxhullvert builtin"
+        " params"
+    ),
     "worldbody": "",
     "body": f"name childclass mocap gravcomp {PLACE}",
     "frame": f"name childclass {PLACE}",
     "inertial": f"mass diaginertia fullinertia {PLACE}",
-    "joint": "name class type pos axis range limited ref stiffness damping frictionloss armature actuatorfrcrange actuatorfrclimited",
+    "joint": (
+        "name class type pos axis range limited ref stiffness damping frictionloss armature"
+        " actuatorfrcrange actuatorfrclimited"
+    ),
     "freejoint": "name",
     "site": f"name class {PLACE}",
-    "geom": f"name class type mesh hfield mass density size fromto group shellinertia fitscale {PLACE}",
+    "geom": (
+        f"name class type mesh hfield mass density size fromto group shellinertia fitscale {PLACE}"
+    ),
     "equality": "",
     "connect": "name class active body1 body2 anchor site1 site2",
     "weld": "name class active body1 body2 relpose anchor site1 site2",
@@ -101,27 +111,40 @@ class Mjcf(NamedTuple):
     folder: Path
     """Where its meshes are."""
     bare: bool
-    """Whether they are there under their bare names, without the folders that the file gives them."""
+    """Whether they are there under their bare names, without the folders that the file gives
+    them."""
 
     def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
-        """Gives every body whose weight the library would refuse or cannot know a harmless one, and returns what the file says.
+        """Gives every body whose weight the library would refuse or cannot know a harmless one, and
+        returns what the file says.
 
         Args:
           spec: the library's, parsed and not compiled; it is changed.
 
         Returns:
-          Bodies of it with their weights, along the axes and about the origin of the inertial frame that the library gives them.
+          Bodies of it with their weights, along the axes and about the origin of the inertial frame
+          that the library gives them.
         """
         c, out, meshes = spec.compiler, [], Meshes(spec, self.folder, self.bare)
         bounded = c.boundmass > 0 or c.boundinertia > 0 or c.settotalmass > 0
         low, high = c.inertiagrouprange
         for body in spec.bodies:
             where, from_geoms, fault = f"body {body.name!r}", False, None
-            by_geoms = int(c.inertiafromgeom) == 1 or (int(c.inertiafromgeom) == 2 and not body.explicitinertial)
+            by_geoms = int(c.inertiafromgeom) == 1 or (
+                int(c.inertiafromgeom) == 2 and not body.explicitinertial
+            )
             for geom in list(body.geoms):
-                weightless = body.name == "world" or geom.mass == 0 or (np.isnan(geom.mass) and geom.density == 0)
+                weightless = (
+                    body.name == "world"
+                    or geom.mass == 0
+                    or (np.isnan(geom.mass) and geom.density == 0)
+                )
                 weighs = not weightless and low <= geom.group <= high
-                shaped = bool(geom.meshname or geom.hfieldname) or geom.type.name in ("mjGEOM_MESH", "mjGEOM_SDF", "mjGEOM_HFIELD")
+                shaped = bool(geom.meshname or geom.hfieldname) or geom.type.name in (
+                    "mjGEOM_MESH",
+                    "mjGEOM_SDF",
+                    "mjGEOM_HFIELD",
+                )
                 problem = meshes.problem(geom) if weighs and shaped and by_geoms else None
                 fault = fault or problem
                 if not weighs or problem or (shaped and not by_geoms):
@@ -171,7 +194,12 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
     for element in source:
         tag = element.tag
         if tag in REFUSED:
-            raise checks.fail(f"<{tag}>", Shown("an element that makes bodies"), "bodies written out", REFUSED[tag])
+            raise checks.fail(
+                f"<{tag}>",
+                Shown("an element that makes bodies"),
+                "bodies written out",
+                REFUSED[tag],
+            )
         drives_no_joint = section == "actuator" and element.get("joint") is None
         if tag not in KEPT or drives_no_joint:
             continue
@@ -179,7 +207,13 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
             if name not in WORDS and text not in SWITCHES:
-                limits = {"most": FARTHEST} if name in WIDE else {"longest": LARGEST} if name in LONG else {}
+                limits = (
+                    {"most": FARTHEST}
+                    if name in WIDE
+                    else {"longest": LARGEST}
+                    if name in LONG
+                    else {}
+                )
                 floats(f"{label(element)}: {name}", text, 1 if name in SINGLE else None, **limits)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)
 
@@ -187,25 +221,40 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
 def _tendons(root: ET.Element) -> Tendons:
     """The constraints on tendons, and the joints and sites that each ties together."""
     made = {
-        tendon.get("name"): ({x.get("joint", "") for x in tendon.findall("joint")}, {x.get("site", "") for x in tendon.findall("site")})
+        tendon.get("name"): (
+            {x.get("joint", "") for x in tendon.findall("joint")},
+            {x.get("site", "") for x in tendon.findall("site")},
+        )
         for tendons in root.findall("tendon")
         for tendon in tendons
     }
     ties = {}
     for equality in root.findall("equality"):
         for element in equality.findall("tendon"):
-            ends = [made.get(element.get(which), (set(), set())) for which in ("tendon1", "tendon2")]
+            ends = [
+                made.get(element.get(which), (set(), set())) for which in ("tendon1", "tendon2")
+            ]
             ties[label(element)] = (ends[0][0] | ends[1][0], ends[0][1] | ends[1][1])
     return ties
 
 
 def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
-    """What a body's <inertial> says, or nothing if it has none; None if the library takes it as it is."""
+    """What a body's <inertial> says, or nothing if it has none; None if the library takes it as it
+    is.
+    """
     if not body.explicitinertial:
         return Weight()
     xx, yy, zz, xy, xz, yz = body.fullinertia
-    J = np.diag(body.inertia) if np.isnan(xx) else np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    J = (
+        np.diag(body.inertia)
+        if np.isnan(xx)
+        else np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    )
     moments = np.linalg.eigvalsh(J)
-    if body.mass >= LEAST and moments[0] >= LEAST and (balanced or moments[2] <= moments[0] + moments[1]):
+    if (
+        body.mass >= LEAST
+        and moments[0] >= LEAST
+        and (balanced or moments[2] <= moments[0] + moments[1])
+    ):
         return None
     return judged(where, float(body.mass), J)

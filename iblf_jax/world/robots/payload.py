@@ -1,12 +1,14 @@
 """What an arm carries: a rigid body at its tip, from the start or from a time on.
 
-A load that is picked up is at rest relative to the gripper when it is gripped: it brings its own momentum along, so there is no impulse
-and q' does not jump.  Its weight goes over from where it lay to the gripper within `rise` seconds, by the share
+A load that is picked up is at rest relative to the gripper when it is gripped: it brings its own
+momentum along, so there is no impulse and q' does not jump.  Its weight goes over from where it lay
+to the gripper within `rise` seconds, by the share
 
     s(t) = x^3 (10 - 15 x + 6 x^2),   x = (t - start) / rise, held within 0 and 1,
 
-and the arm moves as one with the mass s m and the inertia s I at each instant: M(q; s) q" + C(q, q'; s) q' + G(q; s) = tau + f.  So f is
-differentiable (Assumption 1).  The law's model does not know a time: a load with a `start` is in the plant only.
+and the arm moves as one with the mass s m and the inertia s I at each instant: M(q; s) q" + C(q,
+q'; s) q' + G(q; s) = tau + f.  So f is differentiable (Assumption 1).  The law's model does not
+know a time: a load with a `start` is in the plant only.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ class Payload:
     Args:
       mass: mass of the load, () [kg], >= 0; 0 if not given.
       centre: its centre of mass in the tip's frame, (3,) [m]; the tip if not given.
-      inertia: about its centre, along the tip's axes, (6,): xx, yy, zz, xy, xz, yz [kg m^2]; 0 if not given.
+      inertia: about its centre, along the tip's axes, (6,): xx, yy, zz, xy, xz, yz [kg m^2]; 0 if
+        not given.
       start: when it is picked up, () [s]; it is there from the start if not given.
       rise: how long its weight takes to come to rest on the gripper, () [s], > 0; 0.1 if not given.
     """
@@ -51,24 +54,34 @@ class Payload:
         return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
     def at(self, t: jax.Array) -> Payload:
-        """The load that counts at time t [s]: itself if it has no start, else with s(t) of its mass and inertia, and no start."""
+        """The load that counts at time t [s]: itself if it has no start, else with s(t) of its mass
+        and inertia, and no start.
+        """
         if self.start is None:
             return self
         share, now = self.share(t), copy.copy(self)
-        for name, value in (("mass", share * self.mass), ("inertia", share * self.inertia), ("start", None)):
+        for name, value in (
+            ("mass", share * self.mass),
+            ("inertia", share * self.inertia),
+            ("start", None),
+        ):
             object.__setattr__(now, name, value)
         return now
 
     def jump_times(self) -> jax.Array:
-        """When the share begins to rise, and when it is 1, (2,) [s]; none for a load that is there from the start.
+        """When the share begins to rise, and when it is 1, (2,) [s]; none for a load that is there
+        from the start.
 
-        The third derivative of the share jumps there.  Within a step that is longer than `rise`, the load itself does.
+        The third derivative of the share jumps there.  Within a step that is longer than `rise`,
+        the load itself does.
         """
         if self.start is None:
             return no_times()
         return jnp.stack([self.start, self.start + self.rise])
 
     def moments(self) -> jax.Array:
-        """Its pseudo-inertia about the tip's origin, (4, 4); zero while it has a start that no `at` has looked at."""
+        """Its pseudo-inertia about the tip's origin, (4, 4); zero while it has a start that no `at`
+        has looked at.
+        """
         P = pseudo_inertia(self.mass, self.centre, self.inertia)
         return P if self.start is None else jnp.zeros_like(P)

@@ -1,12 +1,14 @@
 """A planar chain of n revolute links, from its energies alone.
 
-In absolute link angles theta_i = q_1 + ... + q_i the mass matrix is H_ij = A_ij cos(theta_i - theta_j) + I_i delta_ij, where
-A collects the masses: link k moves with every link before it, at its full length l_i, and with itself at lc_k,
+In absolute link angles theta_i = q_1 + ... + q_i the mass matrix is H_ij = A_ij cos(theta_i -
+theta_j) + I_i delta_ij, where A collects the masses: link k moves with every link before it, at its
+full length l_i, and with itself at lc_k,
 
     A_ij = sum_k m_k a_ki a_kj,    a_ki = l_i for i < k, lc_k for i = k, 0 beyond,
 
-and M = S^T H S with theta = S q.  U = g sum_k m_k sum_i a_ki sin theta_i.  C and G come by automatic differentiation.
-For n = 2 this is the closed form of `TwoLink`, which the tests hold it to.
+and M = S^T H S with theta = S q.  U = g sum_k m_k sum_i a_ki sin theta_i.  C and G come by
+automatic differentiation. For n = 2 this is the closed form of `TwoLink`, which the tests hold it
+to.
 """
 
 from __future__ import annotations
@@ -45,11 +47,18 @@ class PlanarChain:
     payload: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
 
     def check(self) -> None:
-        """Broadcasts scalars to the links; raises ValueError if the fields disagree about their number."""
+        """Broadcasts scalars to the links; raises ValueError if the fields disagree about their
+        number.
+        """
         names = ("mass", "length", "centre", "inertia")
         sizes = {name: getattr(self, name).shape for name in names if getattr(self, name).ndim == 1}
         if not sizes:
-            raise checks.fail("PlanarChain.mass", self.mass, "one number a link, (n,)", "One field must say how many links.")
+            raise checks.fail(
+                "PlanarChain.mass",
+                self.mass,
+                "one number a link, (n,)",
+                "One field must say how many links.",
+            )
         shape = next(iter(sizes.values()))
         if shape[0] == 0:
             raise checks.fail("PlanarChain.mass", self.mass, "at least one link")
@@ -66,10 +75,15 @@ class PlanarChain:
         return self.mass.shape[-1]
 
     def _lever_arms(self) -> tuple[jax.Array, jax.Array]:
-        """Masses (n + 1,) and lever arms a_ki (n + 1, n): the links, then the payload as a mass at the tip."""
+        """Masses (n + 1,) and lever arms a_ki (n + 1, n): the links, then the payload as a mass at
+        the tip.
+        """
         before = np.tril(np.ones((self.n + 1, self.n)), -1)
         own = np.eye(self.n + 1, self.n)
-        arms = jnp.asarray(before, self.length.dtype) * self.length + jnp.asarray(own, self.length.dtype) * self.centre
+        arms = (
+            jnp.asarray(before, self.length.dtype) * self.length
+            + jnp.asarray(own, self.length.dtype) * self.centre
+        )
         masses = jnp.concatenate([self.mass, jnp.atleast_1d(self.payload)])
         return masses, arms
 

@@ -1,16 +1,19 @@
-"""What a file says of a link or joint that cannot be, and the rule by which `load(..., repair=True)` mends it.
+"""What a file says of a link or joint that cannot be, and the rule by which `load(...,
+repair=True)` mends it.
 
 A body's second moments of mass about its centre are, with V orthogonal,
 
     S = int r r^T dm = 1/2 tr(J) 1 - J = V diag(s) V^T,
 
-and no body has a negative s: J is then positive, and no principal moment is above the sum of the two others.  The nearest inertia that a
-body can have (the least change of S, and so of the pseudo-inertia, in the Frobenius norm; mass and centre stay) is
+and no body has a negative s: J is then positive, and no principal moment is above the sum of the
+  two others.  The nearest inertia that a
+body can have (the least change of S, and so of the pseudo-inertia, in the Frobenius norm; mass and
+centre stay) is
 
     S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
-with f = 0; for a link that moves and would resist its joint with nothing, f = m (L / 100)^2, m its mass and L the length of the longest
-link of the chain: a compact body.
+with f = 0; for a link that moves and would resist its joint with nothing, f = m (L / 100)^2, m its
+mass and L the length of the longest link of the chain: a compact body.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ ROUNDING = 1e-6
 FINEST = 1e-6
 """[m]: no link is known to a finer length, so moments of mass FINEST^2 are none."""
 COMPACT = 0.01
-"""Radius of gyration, along each axis, of a link that had no inertia, by the length of the longest."""
+"""Radius of gyration, along each axis, of a link that had no inertia, by the length of the
+longest."""
 
 
 class Fault(NamedTuple):
@@ -52,7 +56,9 @@ class Repairs:
         if not fault.to:
             raise fault.error
         if not self.wanted:
-            raise ValueError(f"{fault.error} Or load it with repair=True, which makes of it: {fault.to}.")
+            raise ValueError(
+                f"{fault.error} Or load it with repair=True, which makes of it: {fault.to}."
+            )
         line = f"{fault.where}: from {fault.got} to {fault.to}"
         if line not in self.lines:
             self.lines.append(line)
@@ -108,17 +114,26 @@ def judged(where: str, mass: float, J: np.ndarray) -> Weight:
     """
     field = f"{where}: inertia"
     if mass < 0:
-        return Weight(fault=Fault(where, f"{mass} kg", checks.fail(f"{where}: mass", mass, "a mass >= 0 kg")))
+        return Weight(
+            fault=Fault(where, f"{mass} kg", checks.fail(f"{where}: mass", mass, "a mass >= 0 kg"))
+        )
     if mass == 0:
         if not np.any(J):
             return Weight()
         remedy = "Give it its mass, or remove its inertia: tools differ in what they make of this."
-        error = checks.fail(f"{where}: inertial", Shown("an inertia without a mass"), "both or neither", remedy)
+        error = checks.fail(
+            f"{where}: inertial", Shown("an inertia without a mass"), "both or neither", remedy
+        )
         nearest = thickened(J, 0.0)
         return Weight(
             0.0,
             J,
-            Fault(field, "an inertia without a mass", error, f"a body that turns but weighs nothing, {moments_of(nearest)}"),
+            Fault(
+                field,
+                "an inertia without a mass",
+                error,
+                f"a body that turns but weighs nothing, {moments_of(nearest)}",
+            ),
             nearest,
         )
     moments, s = np.linalg.eigvalsh(J), np.linalg.eigvalsh(second_moments(J))
@@ -127,7 +142,9 @@ def judged(where: str, mass: float, J: np.ndarray) -> Weight:
         return Weight(mass, J)
     shown, nearest = moments_of(J), thickened(J, 0.0)
     if moments[0] < -rounding:
-        error = checks.fail(field, shown, "a positive definite inertia [kg m^2]", "A body that moves needs one.")
+        error = checks.fail(
+            field, shown, "a positive definite inertia [kg m^2]", "A body that moves needs one."
+        )
     else:
         remedy = "No body has such an inertia: look at the units, the signs and the frame."
         error = checks.fail(field, shown, "none above the sum of the two others", remedy)

@@ -1,17 +1,23 @@
-"""Rigid bodies in space, many at a time: rotations, inertias and the motion of a chain, in plain elementwise products.
+"""Rigid bodies in space, many at a time: rotations, inertias and the motion of a chain, in plain
+elementwise products.
 
-A *motion* is (..., 2, 3): the angular velocity w, and the velocity v of the body's point at the origin of the world.  A *wrench* (a
+A *motion* is (..., 2, 3): the angular velocity w, and the velocity v of the body's point at the
+  origin of the world.  A *wrench* (a
 force, or a momentum) is (..., 2, 3) as well: its moment n about the origin of the world, and f.
 
 A *pseudo-inertia* is the symmetric 4 x 4 matrix of a body's moments about the origin of a frame,
 
-    P = [[Sigma, h], [h^T, m]],   Sigma = int r r^T dm,   h = m c,   rotational inertia J = tr(Sigma) 1 - Sigma.
+    P = [[Sigma, h], [h^T, m]],   Sigma = int r r^T dm,   h = m c,   rotational inertia J =
+    tr(Sigma) 1 - Sigma.
 
-It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], [0, 1]]: no parallel-axis rules.
+It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], [0, 1]]: no
+parallel-axis rules.
 
-Products are written as sums: a call into a matrix library costs more than the arithmetic (`core.linalg`), and what is compiled as one
-function must hold none.  Few operations on whole arrays rather than many on their entries keep the compiler quick, and where an entry is
-known to be zero it is selected or concatenated as such, not multiplied by zero, so that a scalar program drops it.
+Products are written as sums: a call into a matrix library costs more than the arithmetic
+  (`core.linalg`), and what is compiled as one
+function must hold none.  Few operations on whole arrays rather than many on their entries keep the
+compiler quick, and where an entry is known to be zero it is selected or concatenated as such, not
+multiplied by zero, so that a scalar program drops it.
 """
 
 from __future__ import annotations
@@ -59,7 +65,9 @@ def unit(vector: jax.Array) -> jax.Array:
 
 
 def rotation(quaternion: jax.Array) -> jax.Array:
-    """Rotation matrices of quaternions (w, x, y, z) of any length but zero, (..., 4) -> (..., 3, 3)."""
+    """Rotation matrices of quaternions (w, x, y, z) of any length but zero, (..., 4) -> (..., 3,
+    3).
+    """
     q = unit(quaternion)
     w, v, one = q[..., :1, None], q[..., 1:], jnp.eye(3, dtype=q.dtype)
     # Square by square, so that equal ones cancel: a right angle has zeros on the diagonal.
@@ -70,13 +78,21 @@ def rotation(quaternion: jax.Array) -> jax.Array:
 
 
 def pseudo_inertia(mass: jax.Array, centre: jax.Array, inertia: jax.Array) -> jax.Array:
-    """Pseudo-inertias, (..., 4, 4), from masses (...), centres (..., 3) and inertias about these, (..., 6): xx yy zz xy xz yz."""
+    """Pseudo-inertias, (..., 4, 4), from masses (...), centres (..., 3) and inertias about these,
+    (..., 6): xx yy zz xy xz yz.
+    """
     full = inertia[..., np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
     half_trace = 0.5 * jnp.sum(inertia[..., :3], axis=-1)[..., None, None]
     first = mass[..., None] * centre
-    second = half_trace * jnp.eye(3, dtype=full.dtype) - full + first[..., :, None] * centre[..., None, :]
+    second = (
+        half_trace * jnp.eye(3, dtype=full.dtype)
+        - full
+        + first[..., :, None] * centre[..., None, :]
+    )
     below = jnp.concatenate([first, mass[..., None]], axis=-1)
-    return jnp.concatenate([jnp.concatenate([second, first[..., None]], axis=-1), below[..., None, :]], axis=-2)
+    return jnp.concatenate(
+        [jnp.concatenate([second, first[..., None]], axis=-1), below[..., None, :]], axis=-2
+    )
 
 
 def placement(R: jax.Array, p: jax.Array) -> jax.Array:
@@ -85,7 +101,9 @@ def placement(R: jax.Array, p: jax.Array) -> jax.Array:
 
 
 def joined(outer: jax.Array, inner: jax.Array) -> jax.Array:
-    """The placement of what is placed by `inner` in a frame that is placed by `outer`, (..., 3, 4)."""
+    """The placement of what is placed by `inner` in a frame that is placed by `outer`, (..., 3,
+    4).
+    """
     return product(outer[..., :3], inner) + placement(jnp.zeros_like(outer[..., :3]), outer[..., 3])
 
 
@@ -99,16 +117,24 @@ def chained(steps: jax.Array) -> jax.Array:
 
 
 def moved(H: jax.Array, P: jax.Array) -> jax.Array:
-    """Upper rows of the pseudo-inertia H P H^T, (..., 3, 4), of bodies whose frames are at H, (..., 3, 4)."""
+    """Upper rows of the pseudo-inertia H P H^T, (..., 3, 4), of bodies whose frames are at H, (...,
+    3, 4).
+    """
     HP = product(H, P)
     return placement(product(HP, jnp.swapaxes(H, -1, -2)), HP[..., 3])
 
 
 def inertia(upper: jax.Array, mass: jax.Array) -> Inertia:
-    """The blocks by which bodies resist, from the upper rows of their pseudo-inertias, (m, 3, 4), and their masses, (m, 1)."""
+    """The blocks by which bodies resist, from the upper rows of their pseudo-inertias, (m, 3, 4),
+    and their masses, (m, 1).
+    """
     second, diagonal = upper[..., :3], np.eye(3, dtype=bool)
     trace = jnp.sum(jnp.where(diagonal, second, jnp.zeros_like(second)), axis=(-1, -2))
-    return Inertia(jnp.where(diagonal, trace[..., None, None], jnp.zeros_like(second)) - second, upper[..., 3], mass)
+    return Inertia(
+        jnp.where(diagonal, trace[..., None, None], jnp.zeros_like(second)) - second,
+        upper[..., 3],
+        mass,
+    )
 
 
 def momentum(body: Inertia, motion: jax.Array) -> jax.Array:
@@ -119,12 +145,18 @@ def momentum(body: Inertia, motion: jax.Array) -> jax.Array:
 
 
 def along(motion: jax.Array, other: jax.Array) -> jax.Array:
-    """The rate of the motion `other` when it is carried along by `motion`: (w x w', w x v' + v x w')."""
+    """The rate of the motion `other` when it is carried along by `motion`: (w x w', w x v' + v x
+    w').
+    """
     lever = cross(motion[..., 1:, :], other[..., :1, :])
-    return cross(motion[..., :1, :], other) + jnp.concatenate([jnp.zeros_like(lever), lever], axis=-2)
+    return cross(motion[..., :1, :], other) + jnp.concatenate(
+        [jnp.zeros_like(lever), lever], axis=-2
+    )
 
 
 def along_wrench(motion: jax.Array, wrench: jax.Array) -> jax.Array:
     """The rate of a wrench that is carried along by `motion`: (w x n + v x f, w x f)."""
     lever = cross(motion[..., 1:, :], wrench[..., 1:, :])
-    return cross(motion[..., :1, :], wrench) + jnp.concatenate([lever, jnp.zeros_like(lever)], axis=-2)
+    return cross(motion[..., :1, :], wrench) + jnp.concatenate(
+        [lever, jnp.zeros_like(lever)], axis=-2
+    )

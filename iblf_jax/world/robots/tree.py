@@ -20,7 +20,8 @@ from iblf_jax.world.robots.repair import Fault, Repairs, Weight, second_moments
 FREE, BALL, SLIDE, HINGE = range(4)
 CONNECT, WELD, COUPLED = range(3)
 JOINT, FIXED, NO_BIAS = 0, 0, 0
-"""The library's numbers for kinds of joints, of constraints, and of an actuator's transmission, gain and bias."""
+"""The library's numbers for kinds of joints, of constraints, and of an actuator's transmission,
+gain and bias."""
 
 
 def mujoco_package() -> Any:
@@ -28,7 +29,9 @@ def mujoco_package() -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise ImportError('This needs the mujoco package: pip install mujoco, or ".[robots]" in a clone.') from error
+        raise ImportError(
+            'This needs the mujoco package: pip install mujoco, or ".[robots]" in a clone.'
+        ) from error
     return mujoco
 
 
@@ -41,10 +44,13 @@ class Tree:
         """Body -> what it weighs in its inertial frame, where that is not the model's number."""
         names = lambda kind, count: [mujoco.mj_id2name(model, kind, i) for i in range(count)]  # noqa: E731
         objects = mujoco.mjtObj
-        self.bodies = [name or f"body{i}" for i, name in enumerate(names(objects.mjOBJ_BODY, model.nbody))]
+        self.bodies = [
+            name or f"body{i}" for i, name in enumerate(names(objects.mjOBJ_BODY, model.nbody))
+        ]
         self.bodies[0] = root
         self.joint_names = [
-            name or f"{self.bodies[model.jnt_bodyid[j]]}_joint" for j, name in enumerate(names(objects.mjOBJ_JOINT, model.njnt))
+            name or f"{self.bodies[model.jnt_bodyid[j]]}_joint"
+            for j, name in enumerate(names(objects.mjOBJ_JOINT, model.njnt))
         ]
         self.sites = names(objects.mjOBJ_SITE, model.nsite)
         self.equalities = names(objects.mjOBJ_EQUALITY, model.neq)
@@ -53,14 +59,17 @@ class Tree:
         self.gravity = np.zeros(3) if weightless else np.array(model.opt.gravity)
 
     @staticmethod
-    def compiled(text: str, path: str, root: str, taken_out: Callable[[Any], list[tuple[Any, Weight]]]) -> Tree:
+    def compiled(
+        text: str, path: str, root: str, taken_out: Callable[[Any], list[tuple[Any, Weight]]]
+    ) -> Tree:
         """The tree of a checked description.
 
         Args:
           text: the description.
           path: its file, for messages.
           root: name of the body that the library calls the world.
-          taken_out: from the library's specification, before it is compiled, bodies whose weights are not the library's business.
+          taken_out: from the library's specification, before it is compiled, bodies whose weights
+            are not the library's business.
 
         Raises:
           ValueError: what the library does not accept, in its words.
@@ -95,10 +104,15 @@ class Tree:
         """The body of a body or site, and its pose in the body's frame."""
         if name in self.sites and name not in self.bodies:
             i = self.sites.index(name)
-            return int(self.model.site_bodyid[i]), (np.array(self.model.site_pos[i]), matrix(self.model.site_quat[i]))
+            return int(self.model.site_bodyid[i]), (
+                np.array(self.model.site_pos[i]),
+                matrix(self.model.site_quat[i]),
+            )
         if name in self.bodies:
             return self.bodies.index(name), (np.zeros(3), np.eye(3))
-        raise unknown("tip", name, "the name of a link or site", [*self.bodies, *filter(None, self.sites)])
+        raise unknown(
+            "tip", name, "the name of a link or site", [*self.bodies, *filter(None, self.sites)]
+        )
 
     # ---------------------------------------------------------------------------------------------------------------- structure
 
@@ -120,7 +134,8 @@ class Tree:
     def only_tip(self, first: int, held: dict[int, float]) -> int:
         """The body at the end of the only chain that moves, beyond `first`.
 
-        The end is the last body there if the links do not branch behind the last joint, else the link that this joint moves.
+        The end is the last body there if the links do not branch behind the last joint, else the
+        link that this joint moves.
         """
         m = self.model
         beyond = [b for b in range(m.nbody) if b == first or self.way(first, b) is not None]
@@ -129,9 +144,15 @@ class Tree:
         if len(ends) != 1:
             found = ", ".join(repr(self.bodies[b]) for b in ends[:8]) or "none"
             expected = "the name of a link: the chain must have one end"
-            raise checks.fail("tip", None, expected, f"Chains beyond {self.bodies[first]!r} end at: {found}.")
+            raise checks.fail(
+                "tip", None, expected, f"Chains beyond {self.bodies[first]!r} end at: {found}."
+            )
         parents = {int(m.body_parentid[b]) for b in beyond if b}
-        leaves = [b for b in beyond if b not in parents and (b == ends[0] or self.way(ends[0], b) is not None)]
+        leaves = [
+            b
+            for b in beyond
+            if b not in parents and (b == ends[0] or self.way(ends[0], b) is not None)
+        ]
         return leaves[0] if len(leaves) == 1 else ends[0]
 
     def check_joint(self, j: int, repairs: Repairs) -> None:
@@ -140,7 +161,12 @@ class Tree:
         if m.jnt_type[j] not in (HINGE, SLIDE):
             kind = "free" if m.jnt_type[j] == FREE else "ball"
             remedy = "Take a base beyond it." if kind == "free" else "Write it as three hinges."
-            raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), "a hinge or slide between base and tip", remedy)
+            raise checks.fail(
+                f"joint {name!r}",
+                Shown(f"a {kind} joint"),
+                "a hinge or slide between base and tip",
+                remedy,
+            )
         stiffness = float(m.jnt_stiffness[j])
         if stiffness:
             where = f"joint {name!r}: stiffness"
@@ -174,8 +200,12 @@ class Tree:
                 pose = self._held(pose, j, held)
         return pose
 
-    def welded(self, base: int, joints: tuple[int, ...], held: dict[int, float], repairs: Repairs) -> Links:
-        """The links that `joints` move, and each body beyond the base with the link that carries it."""
+    def welded(
+        self, base: int, joints: tuple[int, ...], held: dict[int, float], repairs: Repairs
+    ) -> Links:
+        """The links that `joints` move, and each body beyond the base with the link that carries
+        it.
+        """
         m, origin = self.model, (np.zeros(3), np.eye(3))
         names, position, rotation, between = [], [], [], []
         frames: dict[int, Pose] = {base: origin}
@@ -190,30 +220,49 @@ class Tree:
                 if j not in joints:
                     pose = self._held(pose, j, held)
                     continue
-                anchor, axis, reference = np.array(m.jnt_pos[j]), np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
+                anchor, axis, reference = (
+                    np.array(m.jnt_pos[j]),
+                    np.array(m.jnt_axis[j]),
+                    float(m.qpos0[m.jnt_qposadr[j]]),
+                )
                 p, R = joined(pose, (anchor, np.eye(3)))
                 hinge = m.jnt_type[j] == HINGE
                 position.append(p if hinge else p - R @ axis * reference)
                 rotation.append(R @ turn(axis, -reference) if hinge else R)
                 between.append(j != own[-1])
-                names.append(self.bodies[b] if j == own[-1] else f"{self.bodies[b]}:{self.joint_names[j]}")
+                names.append(
+                    self.bodies[b] if j == own[-1] else f"{self.bodies[b]}:{self.joint_names[j]}"
+                )
                 link, pose = len(names) - 1, (-anchor, np.eye(3))
             frames[b], carrier[b] = pose, link
         moments = np.zeros((len(names), 4, 4))
         for b, link in carrier.items():
             if link >= 0:
                 moments[link] += self._moments(b, frames[b], repairs)
-        return Links(tuple(names), np.array(position), np.array(rotation), moments, tuple(between), frames, carrier)
+        return Links(
+            tuple(names),
+            np.array(position),
+            np.array(rotation),
+            moments,
+            tuple(between),
+            frames,
+            carrier,
+        )
 
     def _moments(self, body: int, pose: Pose, repairs: Repairs) -> np.ndarray:
         """Pseudo-inertia of one body in the frame in which its pose is given."""
         m = self.model
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
-        own = self.weights.get(body) or Weight(float(m.body_mass[body]), np.diag(m.body_inertia[body]))
+        own = self.weights.get(body) or Weight(
+            float(m.body_mass[body]), np.diag(m.body_inertia[body])
+        )
         mass, inertia, *_ = own.repaired(repairs)
         compensated = float(m.body_gravcomp[body])
         if compensated and mass:
-            where, expected = f"body {self.bodies[body]!r}: gravcomp", "0: compensation of gravity is not modelled, it is the law's to do"
+            where, expected = (
+                f"body {self.bodies[body]!r}: gravcomp",
+                "0: compensation of gravity is not modelled, it is the law's to do",
+            )
             error = checks.fail(where, compensated, expected, "Remove it.")
             repairs.meet(Fault(where, str(compensated), error, "0: gravity acts on it"))
         second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
@@ -239,18 +288,36 @@ class Tree:
         }
 
     def _actuators(self, j: int) -> float:
-        """The largest torque (force) that the actuators of a joint give together; infinite if one has no limit or there are none."""
+        """The largest torque (force) that the actuators of a joint give together; infinite if one
+        has no limit or there are none.
+        """
         m, total = self.model, 0.0
-        on_it = [a for a in range(m.nu) if m.actuator_trntype[a] == JOINT and m.actuator_trnid[a, 0] == j]
+        on_it = [
+            a for a in range(m.nu) if m.actuator_trntype[a] == JOINT and m.actuator_trnid[a, 0] == j
+        ]
         for a in on_it:
-            limit = float(np.min(np.abs(m.actuator_forcerange[a]))) if m.actuator_forcelimited[a] else np.inf
-            if m.actuator_ctrllimited[a] and m.actuator_gaintype[a] == FIXED and m.actuator_biastype[a] == NO_BIAS:
-                limit = min(limit, float(np.min(np.abs(m.actuator_ctrlrange[a])) * abs(m.actuator_gainprm[a, 0])))
+            limit = (
+                float(np.min(np.abs(m.actuator_forcerange[a])))
+                if m.actuator_forcelimited[a]
+                else np.inf
+            )
+            if (
+                m.actuator_ctrllimited[a]
+                and m.actuator_gaintype[a] == FIXED
+                and m.actuator_biastype[a] == NO_BIAS
+            ):
+                limit = min(
+                    limit,
+                    float(np.min(np.abs(m.actuator_ctrlrange[a])) * abs(m.actuator_gainprm[a, 0])),
+                )
             total += limit * abs(float(m.actuator_gear[a, 0]))
         return total if on_it else np.inf
 
-    def check_closed(self, links: Links, joints: tuple[int, ...], tendons: Tendons, repairs: Repairs) -> None:
-        """Meets constraints that tie bodies of different links together, or a joint of the chain to another.
+    def check_closed(
+        self, links: Links, joints: tuple[int, ...], tendons: Tendons, repairs: Repairs
+    ) -> None:
+        """Meets constraints that tie bodies of different links together, or a joint of the chain to
+        another.
 
         Args:
           links, joints: the chain.
@@ -266,32 +333,65 @@ class Tree:
             if m.eq_type[e] == COUPLED:
                 self._meet_coupling(where, {first, second} & set(joints), repairs)
             if m.eq_type[e] in (CONNECT, WELD):
-                bodies = [int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x for x in (first, second)]
+                bodies = [
+                    int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x
+                    for x in (first, second)
+                ]
                 self._meet_tie(where, bodies, links, repairs)
         for where, (named, sites) in tendons.items():
             self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
-            self._meet_tie(where, [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites], links, repairs)
+            self._meet_tie(
+                where,
+                [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites],
+                links,
+                repairs,
+            )
 
     def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
         for j in sorted(coupled):
             name = self.joint_names[j]
             remedy = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
-            error = checks.fail(where, Shown(f"joint {name!r} tied to another"), "joints that move by themselves", remedy)
-            repairs.meet(Fault(f"joint {name!r}", f"one tied to another by {where}", error, "one that moves by itself"))
+            error = checks.fail(
+                where,
+                Shown(f"joint {name!r} tied to another"),
+                "joints that move by themselves",
+                remedy,
+            )
+            repairs.meet(
+                Fault(
+                    f"joint {name!r}",
+                    f"one tied to another by {where}",
+                    error,
+                    "one that moves by itself",
+                )
+            )
 
     def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
-        """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its links closes the chain."""
+        """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its
+        links closes the chain.
+        """
         if len({links.carrier.get(b, -1) for b in bodies}) > 1:
             tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
             remedy = "A closed chain has no serial one: cut it open, or lock its joints."
-            to = "no tie: a motion-capture body is no link" if any(self.model.body_mocapid[b] >= 0 for b in bodies) else ""
-            repairs.meet(Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", remedy), to))
+            to = (
+                "no tie: a motion-capture body is no link"
+                if any(self.model.body_mocapid[b] >= 0 for b in bodies)
+                else ""
+            )
+            repairs.meet(
+                Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", remedy), to)
+            )
 
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
     """An error with the names that are near, or all of them."""
     near = difflib.get_close_matches(str(name), known, n=3) or known[:12]
-    return checks.fail(what, name, expected, f"There are {', '.join(map(repr, near))}{' ...' if len(known) > 12 else ''}.")
+    return checks.fail(
+        what,
+        name,
+        expected,
+        f"There are {', '.join(map(repr, near))}{' ...' if len(known) > 12 else ''}.",
+    )
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:

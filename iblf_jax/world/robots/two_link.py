@@ -1,12 +1,14 @@
-"""The planar two-link arm with revolute joints, in closed form: the robot of the paper's simulation.
+"""The planar two-link arm with revolute joints, in closed form: the robot of the paper's
+simulation.
 
-    p1 = m1 lc1^2 + m2 l1^2 + I1,   p2 = m2 lc2^2 + I2,   p3 = m2 l1 lc2,   p4 = m1 lc1 + m2 l1,   p5 = m2 lc2
-    M = [[p1 + p2 + 2 p3 cos q2, p2 + p3 cos q2], [p2 + p3 cos q2, p2]]
+    p1 = m1 lc1^2 + m2 l1^2 + I1,   p2 = m2 lc2^2 + I2,   p3 = m2 l1 lc2,   p4 = m1 lc1 + m2 l1,
+    p5 = m2 lc2 M = [[p1 + p2 + 2 p3 cos q2, p2 + p3 cos q2], [p2 + p3 cos q2, p2]]
     C = [[-p3 q2' sin q2, -p3 (q1' + q2') sin q2], [p3 q1' sin q2, 0]]
     G = [p4 g cos q1 + p5 g cos(q1 + q2), p5 g cos(q1 + q2)]
 
-q1 is measured from the horizontal, q2 from the first link.  A point mass m at the tip adds m l1^2 to p1, m l2^2 to p2,
-m l1 l2 to p3, m l1 to p4 and m l2 to p5.  (Some papers print p4 with lc2 in place of lc1; that is a slip.)
+q1 is measured from the horizontal, q2 from the first link.  A point mass m at the tip adds m l1^2
+to p1, m l2^2 to p2, m l1 l2 to p3, m l1 to p4 and m l2 to p5.  (Some papers print p4 with lc2 in
+place of lc1; that is a slip.)
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ from iblf_jax.world.robots._base import planar_skeleton
 
 
 class LumpedParameters(NamedTuple):
-    """The five numbers through which masses and lengths enter: p1, p2, p3 [kg m^2], p4, p5 [kg m]."""
+    """The five numbers through which masses and lengths enter: p1, p2, p3 [kg m^2], p4, p5 [kg
+    m].
+    """
 
     p1: jax.Array
     p2: jax.Array
@@ -44,7 +48,8 @@ class TwoLink:
       g: acceleration of gravity, () [m/s^2]; 9.81 if not given.
       payload: point mass at the tip, () [kg], >= 0; 0 if not given.
 
-    Source: Zhang & Yan 2024, section 4, which refers to others for the matrices; see the head of this module.
+    Source: Zhang & Yan 2024, section 4, which refers to others for the matrices; see the head of
+      this module.
     """
 
     mass: Leaf = leaf("kg", sign="positive")
@@ -97,7 +102,8 @@ class TwoLink:
     def gravity(self, q: jax.Array) -> jax.Array:
         """G(q), (2,) [N m]."""
         p, c1 = self.lumped(), jnp.cos(q[0])
-        # cos(q1 + q2): M and C need cos q2 and sin q2 too, and a third angle costs more than two products.
+        # cos(q1 + q2): M and C need cos q2 and sin q2 too, and a third angle costs more than two
+        # products.
         outer = p.p5 * self.g * (c1 * jnp.cos(q[1]) - jnp.sin(q[0]) * jnp.sin(q[1]))
         return jnp.stack([p.p4 * self.g * c1 + outer, outer])
 

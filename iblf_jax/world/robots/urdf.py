@@ -1,7 +1,9 @@
-"""The check of a URDF, element by element, and the part of it that says how links move and what they weigh.
+"""The check of a URDF, element by element, and the part of it that says how links move and what
+they weigh.
 
-The copy that goes on holds links and joints; each number has been looked at.  What links weigh, what is wrong with a link or joint, and
-mimic joints go apart: whether they matter is known when the chain is.
+The copy that goes on holds links and joints; each number has been looked at.  What links weigh,
+what is wrong with a link or joint, and mimic joints go apart: whether they matter is known when the
+chain is.
 """
 
 from __future__ import annotations
@@ -46,15 +48,20 @@ class Urdf(NamedTuple):
     places: dict[str, Fault]
     """Link -> what is wrong with where it is: matters for each link that hangs on the base."""
     axes: dict[str, Fault]
-    """Joint -> what is wrong with its kind or axis: matters where it moves, or is locked away from 0."""
+    """Joint -> what is wrong with its kind or axis: matters where it moves, or is locked away from
+    0."""
     motions: dict[str, list[Fault]]
     """Joint -> what is wrong with its range, torque, speed or friction: matters where it moves."""
     speeds: dict[str, float]
     """Joint -> its largest speed, which the library does not keep; none for one without."""
 
     def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
-        """The library's bodies with their weights: it gets none of them, as it would refuse what may not matter."""
-        return [(body, self.weights[body.name]) for body in spec.bodies if body.name in self.weights]
+        """The library's bodies with their weights: it gets none of them, as it would refuse what
+        may not matter.
+        """
+        return [
+            (body, self.weights[body.name]) for body in spec.bodies if body.name in self.weights
+        ]
 
 
 def checked(robot: ET.Element) -> Urdf:
@@ -69,7 +76,10 @@ def checked(robot: ET.Element) -> Urdf:
         raise checks.fail("robot", Shown("no <link>"), "a URDF with links and joints")
     if len(links) > MOST_BODIES:
         raise checks.fail("robot", Shown(f"{len(links)} links"), f"at most {MOST_BODIES}")
-    parent_of = {_end(joint, "child", links): (_end(joint, "parent", links), name) for name, joint in reversed(joints.items())}
+    parent_of = {
+        _end(joint, "child", links): (_end(joint, "parent", links), name)
+        for name, joint in reversed(joints.items())
+    }
     _is_tree(links, joints, parent_of)
     root = next(name for name in links if name not in parent_of)
     found = Urdf("", root, {}, {}, {}, {}, {}, {})
@@ -85,7 +95,9 @@ def checked(robot: ET.Element) -> Urdf:
     for name, mimic in found.mimics.items():
         if mimic.master not in joints:
             error = checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
-            found.motions[name].append(Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself"))
+            found.motions[name].append(
+                Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself")
+            )
     return found._replace(text=ET.tostring(copy, encoding="unicode"))
 
 
@@ -109,19 +121,31 @@ def _end(joint: ET.Element, which: str, links: dict[str, ET.Element]) -> str:
     return str(ends[0].get("link"))
 
 
-def _is_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element], parent_of: dict[str, tuple[str, str]]) -> None:
+def _is_tree(
+    links: dict[str, ET.Element],
+    joints: dict[str, ET.Element],
+    parent_of: dict[str, tuple[str, str]],
+) -> None:
     """Raises where a link has two parents, or none of the links is the root of all."""
     seen: dict[str, str] = {}
     for name, joint in joints.items():
         child = _end(joint, "child", links)
         if child in seen:
             remedy = "A closed chain has no serial one: cut it open at a joint."
-            raise checks.fail(f"link {child!r}", Shown(f"two parents, by joints {seen[child]!r} and {name!r}"), "one parent", remedy)
+            raise checks.fail(
+                f"link {child!r}",
+                Shown(f"two parents, by joints {seen[child]!r} and {name!r}"),
+                "one parent",
+                remedy,
+            )
         seen[child] = name
     roots = [name for name in links if name not in parent_of]
     if len(roots) > 1:
         raise checks.fail(
-            "robot", Shown(f"links without a parent: {', '.join(map(repr, roots[:5]))}"), "one root", "Connect them by joints."
+            "robot",
+            Shown(f"links without a parent: {', '.join(map(repr, roots[:5]))}"),
+            "one root",
+            "Connect them by joints.",
         )
     reached = set(roots)
     children: dict[str, list[str]] = {}
@@ -135,14 +159,19 @@ def _is_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element], parent
     if len(reached) < len(links):
         lost = next(name for name in links if name not in reached)
         raise checks.fail(
-            f"link {lost!r}", Shown("a ring of joints"), "links that hang on one root", "A closed chain: cut it open at a joint."
+            f"link {lost!r}",
+            Shown("a ring of joints"),
+            "links that hang on one root",
+            "A closed chain: cut it open at a joint.",
         )
 
 
 def _one(parent: ET.Element, tag: str) -> ET.Element | None:
     found = parent.findall(tag)
     if len(found) > 1:
-        raise checks.fail(f"{label(parent)}: <{tag}>", Shown(f"{len(found)} of them"), "one at most")
+        raise checks.fail(
+            f"{label(parent)}: <{tag}>", Shown(f"{len(found)} of them"), "one at most"
+        )
     return found[0] if found else None
 
 
@@ -150,7 +179,12 @@ def _origin(parent: ET.Element, where: str) -> tuple[list[float], list[float]]:
     """Position and roll, pitch, yaw of an element's <origin>."""
     origin = _one(parent, "origin")
     xyz, rpy = (
-        floats(f"{where}: origin {name}", origin.get(name, "0 0 0") if origin is not None else "0 0 0", 3) for name in ("xyz", "rpy")
+        floats(
+            f"{where}: origin {name}",
+            origin.get(name, "0 0 0") if origin is not None else "0 0 0",
+            3,
+        )
+        for name in ("xyz", "rpy")
     )
     return xyz, rpy
 
@@ -177,8 +211,18 @@ def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
         if kg <= 0:
             return judged(where, kg, np.zeros((3, 3))), centre
         error = checks.fail(f"{where}: inertial", Shown("no <inertia>"), "an inertia [kg m^2]")
-        return Weight(kg, fault=Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")), centre
-    numbers = (floats(f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1)[0] for name in INERTIA)
+        return (
+            Weight(
+                kg, fault=Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")
+            ),
+            centre,
+        )
+    numbers = (
+        floats(
+            f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1
+        )[0]
+        for name in INERTIA
+    )
     xx, yy, zz, xy, xz, yz = numbers
     R = Rotation.from_euler("xyz", rpy).as_matrix()  # about fixed axes, one after the other
     return judged(where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T), centre
@@ -188,7 +232,11 @@ def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
     """The copy of a joint, with something harmless in the place of what is wrong with it."""
     where, name, kind = label(joint), str(joint.get("name")), joint.get("type", "")
     parent, child = (str(joint.findall(which)[0].get("link")) for which in ("parent", "child"))
-    copy = ET.Element("joint", name=name, type="fixed" if kind == "fixed" else "prismatic" if kind == "prismatic" else "continuous")
+    copy = ET.Element(
+        "joint",
+        name=name,
+        type="fixed" if kind == "fixed" else "prismatic" if kind == "prismatic" else "continuous",
+    )
     xyz, rpy = ZERO, ZERO
     try:
         xyz, rpy = _origin(joint, where)
@@ -224,37 +272,76 @@ def _words(numbers: list[float]) -> str:
 
 def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
     if kind not in MOVING:
-        remedy = "Floating and planar joints are not part of a serial arm." if kind in ("floating", "planar") else ""
-        raise checks.fail(f"{where}: type", kind, "revolute, continuous, prismatic or fixed", remedy)
+        remedy = (
+            "Floating and planar joints are not part of a serial arm."
+            if kind in ("floating", "planar")
+            else ""
+        )
+        raise checks.fail(
+            f"{where}: type", kind, "revolute, continuous, prismatic or fixed", remedy
+        )
     axis = _one(joint, "axis")
-    direction = floats(f"{where}: axis", axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3)
+    direction = floats(
+        f"{where}: axis", axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3
+    )
     if not np.linalg.norm(direction) > 1e-6:
         raise checks.fail(f"{where}: axis", direction, "a direction")
     return direction
 
 
 def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list[Fault]:
-    """Range and largest torque of a joint, into the copy, and its largest speed; what cannot be, and is left out there."""
+    """Range and largest torque of a joint, into the copy, and its largest speed; what cannot be,
+    and is left out there.
+    """
     limit, endless, faults = _one(joint, "limit"), joint.get("type") == "continuous", []
     if limit is None:
         if endless:
             return []
         remedy = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
-        error = checks.fail(f"{where}: limit", Shown("nothing"), "the range of a joint that is not continuous", remedy)
+        error = checks.fail(
+            f"{where}: limit",
+            Shown("nothing"),
+            "the range of a joint that is not continuous",
+            remedy,
+        )
         return [Fault(f"{where}: limit", "nothing", error, "no limits")]
     names = ("effort", "velocity") if endless else ("lower", "upper", "effort", "velocity")
-    values = {name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0] for name in names}
+    values = {
+        name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0]
+        for name in names
+    }
     if not endless and not values["lower"] < values["upper"]:
         got = (values.pop("lower"), values.pop("upper"))
-        faults.append(Fault(f"{where}: limit", str(got), checks.fail(f"{where}: limit", got, "lower < upper"), "no limits"))
+        faults.append(
+            Fault(
+                f"{where}: limit",
+                str(got),
+                checks.fail(f"{where}: limit", got, "lower < upper"),
+                "no limits",
+            )
+        )
     if values["effort"] < 0:
         torque = values.pop("effort")
-        faults.append(Fault(f"{where}: effort", str(torque), checks.fail(f"{where}: effort", torque, "a number >= 0"), "no limit"))
+        faults.append(
+            Fault(
+                f"{where}: effort",
+                str(torque),
+                checks.fail(f"{where}: effort", torque, "a number >= 0"),
+                "no limit",
+            )
+        )
     speed = values.pop("velocity")
     if speed > 0:
         found.speeds[str(joint.get("name"))] = speed
     elif speed < 0:
-        faults.append(Fault(f"{where}: velocity", str(speed), checks.fail(f"{where}: velocity", speed, "a number >= 0"), "no limit"))
+        faults.append(
+            Fault(
+                f"{where}: velocity",
+                str(speed),
+                checks.fail(f"{where}: velocity", speed, "a number >= 0"),
+                "no limit",
+            )
+        )
     if "lower" in values and copy.get("type") == "continuous":
         copy.set("type", "revolute")
     ET.SubElement(copy, "limit", {name: repr(value) for name, value in values.items()})
@@ -266,7 +353,10 @@ def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[
     dynamics, faults = _one(joint, "dynamics"), []
     if dynamics is None:
         return []
-    found = {name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1, most=FARTHEST)[0] for name in ("damping", "friction")}
+    found = {
+        name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1, most=FARTHEST)[0]
+        for name in ("damping", "friction")
+    }
     for name, value in found.items():
         if value < 0:
             error = checks.fail(f"{where}: {name}", value, "a number >= 0")
@@ -280,6 +370,7 @@ def _mimic(joint: ET.Element, where: str, found: Urdf) -> None:
     if mimic is None:
         return
     (multiplier,), (offset,) = (
-        floats(f"{where}: mimic {name}", mimic.get(name, default), 1) for name, default in (("multiplier", "1"), ("offset", "0"))
+        floats(f"{where}: mimic {name}", mimic.get(name, default), 1)
+        for name, default in (("multiplier", "1"), ("offset", "0"))
     )
     found.mimics[str(joint.get("name"))] = Mimic(mimic.get("joint", ""), multiplier, offset)
