@@ -118,7 +118,7 @@ def _verify_entries(folder: Path) -> None:
     """Has JAX use `VerifiedCache` for its folder.
 
     JAX has no public way to hand it a cache.  A release that keeps its own elsewhere is left as it
-    is: its entries are then not verified (`tests/test_toolchain.py` notices).
+    is: its entries are then not verified (`tests/kernels/test_toolchain.py` notices).
     """
     try:
         from jax._src import compilation_cache

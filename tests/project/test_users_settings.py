@@ -16,24 +16,24 @@ from pathlib import Path
 import conftest
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 AGAIN = {
     "the paper": [
-        "test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]",
-        "test_paper.py::test_what_the_paper_shows",
+        "simulation/test_paper.py::test_all_four_variants_at_one_millisecond[integral-printed]",
+        "simulation/test_paper.py::test_what_the_paper_shows",
     ],
-    "shapes": ["test_engine.py::test_every_shape_is_the_same_run[euler-None]"],
+    "shapes": ["engine/test_engine.py::test_every_shape_is_the_same_run[euler-None]"],
     "runs": [
-        "test_transforms.py::test_a_failing_run_leaves_the_others_bit_identical",
-        "test_transforms.py::test_the_same_run_twice_is_bit_identical",
-        "test_monte_carlo.py::test_chunk_changes_nothing[1]",
-        "test_monte_carlo.py::test_number_of_runs_changes_no_run[257]",
-        "test_monte_carlo.py::test_replay_is_bit_identical_and_has_the_trajectory",
-        "test_lowering_math.py::test_native_functions[float64]",
+        "core/test_transforms.py::test_a_failing_run_leaves_the_others_bit_identical",
+        "core/test_transforms.py::test_the_same_run_twice_is_bit_identical",
+        "studies/test_monte_carlo.py::test_chunk_changes_nothing[1]",
+        "studies/test_monte_carlo.py::test_number_of_runs_changes_no_run[257]",
+        "studies/test_monte_carlo.py::test_replay_is_bit_identical_and_has_the_trajectory",
+        "kernels/test_lowering_math.py::test_native_functions[float64]",
     ],
 }
 """Name -> tests."""
-SETTINGS = "test_users_settings.py::test_the_testers_own_flags_come_last"
+SETTINGS = "project/test_users_settings.py::test_the_testers_own_flags_come_last"
 
 
 def test_the_testers_own_flags_come_last():

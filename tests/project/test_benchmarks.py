@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
+FOLDER = Path(__file__).parents[2] / "benchmarks"
 OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
 """They choose JAX's type and devices, of which a process has one; the others spare themselves
 another start."""

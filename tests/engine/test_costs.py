@@ -3,7 +3,7 @@ seconds would flicker.
 
 `tests/data/costs.json` holds them.  After a change that is meant to move them,
 
-    python tests/test_costs.py
+    python tests/engine/test_costs.py
 
 writes the file anew; the difference is what the change costs or gains.  Operations are those of one
 release of JAX, which the file names: another one may write a derivative otherwise (that of a
@@ -30,7 +30,7 @@ import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, observers, references
 from iblf_jax.engine import native
 
-FILE = Path(__file__).parent / "data" / "costs.json"
+FILE = Path(__file__).parents[1] / "data" / "costs.json"
 
 JAX = ".".join(jax.__version__.split(".")[:2])
 
@@ -86,7 +86,7 @@ def test_operations_of_a_step(name):
         for often, counter in changes.items()
     }
     assert found == expected, (
-        f"{name}: {moved} more than in {FILE.name}; if that is meant, `python tests/test_costs.py`"
+        f"{name}: {moved} more than in {FILE.name}; if that is meant, `python tests/engine/test_costs.py`"
         " writes it anew"
     )
 

@@ -13,7 +13,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax import cli
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 COMMANDS = {
     "arm.toml": ["simulate", "--out", "out"],

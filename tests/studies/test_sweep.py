@@ -435,7 +435,13 @@ def test_a_limit_of_the_system_is_a_clear_error(tmp_path, compiled):
         " c.table()\nresource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000));"
         " c.table(store=sys.argv[2])"
     )
-    command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "sweep.zarr")]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        str(Path(cases.__file__).parent),
+        str(tmp_path / "sweep.zarr"),
+    ]
     done = subprocess.run(
         command, env=cases.environment(compiled), capture_output=True, text=True, timeout=300
     )

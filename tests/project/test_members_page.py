@@ -8,7 +8,7 @@ import pytest
 
 from iblf_jax import barriers, controllers, observers
 
-PAGE = runpy.run_path(str(Path(__file__).resolve().parent.parent / "docs" / "members.py"))
+PAGE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "members.py"))
 
 
 def test_the_page_is_not_stale():

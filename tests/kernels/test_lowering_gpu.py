@@ -1,7 +1,7 @@
 """The gpu backend: the kernel on a GPU or, without one, its logic on a CPU; its source through
 NVRTC; and what happens without a device.
 
-    JAX_PLATFORMS=cuda,cpu python -m pytest tests/test_lowering_gpu.py
+    JAX_PLATFORMS=cuda,cpu python -m pytest tests/kernels/test_lowering_gpu.py
 
 runs on a GPU what elsewhere runs on the CPU.
 """

@@ -527,7 +527,7 @@ def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
     """A file of the version before `weights`: tracking, peak_torque, a metric, and two
     requirements."""
     found = ij.load_tuning(
-        Path(__file__).parent / "data" / "tuning_before_weights.json"
+        Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
     ).setup.objective
     weights = [np.asarray(quantity.weights).tolist() for quantity in found.quantities]
     assert weights == [[1.0, 0.25], [1.0, 3.0], [0.0, 2.0], [0.0, 1.0], 1.0]
