@@ -148,8 +148,8 @@ def mpc_row(base: ij.Scenario, starts: np.ndarray, duration: float) -> list:
             after = jax.tree.map(
                 lambda x, a, b, c, d: x + h / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4
             )
-            q, dq, tube = x[0], x[1], base.setting.tube(now)
-            slow, fast = base.setting.speed_limits(now)
+            q, dq, tube = x[0], x[1], base.context.tube(now)
+            slow, fast = base.context.speed_limits(now)
             margin = [
                 jnp.min(jnp.minimum(q - tube.lower, tube.upper - q)),
                 jnp.min(jnp.minimum(dq - slow, fast - dq)),
@@ -166,8 +166,8 @@ def mpc_row(base: ij.Scenario, starts: np.ndarray, duration: float) -> list:
     @jax.jit
     def ahead(t):
         def at(t):
-            tube = base.setting.tube(t)
-            return tube.q_d, tube.dq_d, tube.lower, tube.upper, *base.setting.speed_limits(t)
+            tube = base.context.tube(t)
+            return tube.q_d, tube.dq_d, tube.lower, tube.upper, *base.context.speed_limits(t)
 
         return jax.vmap(at)(t + PERIOD * jnp.arange(HORIZON + 1, dtype=h.dtype))
 

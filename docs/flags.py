@@ -85,13 +85,13 @@ class PowerOfE2:
     K2: Any = ij.leaf("N m s/rad", sign="positive")
     c: Any = ij.leaf("N m", sign="positive")
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         """No state."""
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
+    def command(self, t, q, dq, f_hat, context, state):
         """The torque."""
-        tube, model = setting.tube(t), setting.model
+        tube, model = context.tube(t), context.model
         alpha = tube.dq_d - 2.0 * (q - tube.q_d)
         e2 = dq - alpha
         wanted = tube.ddq_d - 2.0 * (dq - tube.dq_d)
@@ -104,7 +104,7 @@ class PowerOfE2:
 def _at_rest() -> ij.Scenario:
     """It starts at e2 = 0."""
     scenario = _paper(controller=PowerOfE2(K2=5.0, c=2.0))
-    tube = scenario.setting.tube(jnp.zeros(()))
+    tube = scenario.context.tube(jnp.zeros(()))
     return ij.with_parts(scenario, initial=ij.Initial(tube.q_d, tube.dq_d))
 
 

@@ -43,10 +43,10 @@ class Wrapping:
     law: ij.controllers.Controller
 
     def init(
-        self, q: jax.Array, dq: jax.Array, setting: ij.controllers.Setting
+        self, q: jax.Array, dq: jax.Array, context: ij.controllers.LawContext
     ) -> ij.controllers.State:
         """The wrapped law's state."""
-        return self.law.init(q, dq, setting)
+        return self.law.init(q, dq, context)
 
     def command(
         self,
@@ -54,11 +54,11 @@ class Wrapping:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: ij.controllers.Setting,
+        context: ij.controllers.LawContext,
         state: ij.controllers.State,
     ) -> tuple[ij.controllers.Command, ij.controllers.State]:
         """The wrapped law's command."""
-        return self.law.command(t, q, dq, f_hat, setting, state)
+        return self.law.command(t, q, dq, f_hat, context, state)
 
 
 def of_own_parts(scenario: ij.Scenario, sample: ij.metrics.Sample, tube: ij.bounds.Tube) -> None:

@@ -530,7 +530,7 @@ def _xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | Non
     return (
         None
         if stated is None
-        else jax.vmap(lambda t, V: stated(V / law.weight, scenario.setting.tube(t)))(t, V)
+        else jax.vmap(lambda t, V: stated(V / law.weight, scenario.context.tube(t)))(t, V)
     )
 
 
@@ -561,7 +561,7 @@ def _e2_bound(
     return (
         None
         if stated is None
-        else jax.vmap(lambda t, q, dq, V: stated(V, law.tubes(t, q, dq, scenario.setting)[1]))(
+        else jax.vmap(lambda t, q, dq, V: stated(V, law.tubes(t, q, dq, scenario.context)[1]))(
             t, q, dq, V
         )
     )

@@ -128,7 +128,7 @@ def terms_at(
       ahead: their rates.
     """
     law: Any = stating_law(scenario)
-    setting, q, dq = scenario.setting, state.q, state.dq
+    context, q, dq = scenario.context, state.q, state.dq
     uses_estimate = getattr(law, "uses_observer", True)
     f_tilde, df_tilde = now["disturbance"], ahead["disturbance"]
     if uses_estimate:
@@ -136,17 +136,17 @@ def terms_at(
         df_tilde = df_tilde - ahead["disturbance_estimate"]
 
     def lyapunov(t, q, dq, f_tilde, own):
-        return jnp.sum(law.lyapunov(t, q, dq, f_tilde, setting, own))
+        return jnp.sum(law.lyapunov(t, q, dq, f_tilde, context, own))
 
     point = (t, q, dq, f_tilde, state.controller)
     rates = (jnp.ones_like(t), along.q, along.dq, df_tilde, along.controller)
     V, dV = jax.jvp(lyapunov, point, rates)
-    decay = jnp.sum(law.decay(t, q, dq, f_tilde, setting, state.controller))
+    decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, state.controller))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
     if hasattr(law, "disturbance_terms"):
         df = ahead["disturbance"]
-        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, setting, state.controller))
+        terms = jnp.sum(law.disturbance_terms(t, q, dq, f_tilde, df, context, state.controller))
     else:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ ahead["disturbance"]
     size = _size(M0, slopes, rates, now) + jnp.abs(decay) + jnp.abs(terms)
@@ -174,7 +174,7 @@ def _limited(scenario: Scenario, law: Any, t: jax.Array, state: LoopState, now) 
     if law is scenario.controller:
         return jnp.zeros((), bool)
     f_hat = now["disturbance_estimate"]
-    command, _ = law.command(t, state.q, state.dq, f_hat, scenario.setting, state.controller)
+    command, _ = law.command(t, state.q, state.dq, f_hat, scenario.context, state.controller)
     own = command.tau
     return jnp.any(jnp.abs(now["tau"] - own) > UNCHANGED * jnp.finfo(own.dtype).eps * jnp.abs(own))
 

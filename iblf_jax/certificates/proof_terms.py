@@ -122,7 +122,7 @@ def _probe(scenario: Scenario, t: jax.Array, state: LoopState):
     law = law_of(scenario)
     barrier_slope = jnp.zeros_like(state.q)
     if isinstance(law, Backstepping | FullState):
-        barrier_slope = law.weight * law.barrier.slope(scenario.setting.tube(t), state.q)
+        barrier_slope = law.weight * law.barrier.slope(scenario.context.tube(t), state.q)
     smooth = {
         name: getattr(sample, name)
         for name in ("V", "disturbance", "disturbance_estimate", "tau", "alpha", "xi", "e2", "dq_d")
@@ -220,7 +220,7 @@ def _seen(
 def _full(scenario: Scenario, t: jax.Array, state: LoopState, M0, ahead, f_tilde) -> FullTerms:
     """The terms of (F.2) at one state."""
     law: FullState = law_of(scenario)
-    outer, inner = law.tubes(t, state.q, state.dq, scenario.setting)
+    outer, inner = law.tubes(t, state.q, state.dq, scenario.context)
     s2, V1, phi = (
         law.velocity_barrier.slope(inner, state.dq),
         law.weight * law.barrier.value(outer, state.q),
@@ -244,7 +244,7 @@ def _limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Arr
     law = law_of(scenario)
     if law is scenario.controller or not isinstance(law, Backstepping | FullState):
         return jnp.zeros((), bool)
-    own = law.command(t, state.q, state.dq, now["disturbance_estimate"], scenario.setting, ())[
+    own = law.command(t, state.q, state.dq, now["disturbance_estimate"], scenario.context, ())[
         0
     ].tau
     return jnp.any(jnp.abs(now["tau"] - own) > UNCHANGED * jnp.finfo(own.dtype).eps * jnp.abs(own))
@@ -306,7 +306,7 @@ def _sizes(
     )
     if isinstance(law, FullState):
         terms += _full_sizes(law, scenario, t, state, M0, torque, fast)
-    tube = scenario.setting.tube(t)
+    tube = scenario.context.tube(t)
     width = jnp.minimum(tube.k_l, tube.k_u)
     weight = getattr(law, "weight", jnp.ones_like(width))
     reach = (
@@ -321,7 +321,7 @@ def _full_sizes(
     law: FullState, scenario: Scenario, t: jax.Array, state: LoopState, M0, torque, fast
 ) -> jax.Array:
     """Sizes of the terms of phi', added up, () [1/s]."""
-    inner, barrier = law.tubes(t, state.q, state.dq, scenario.setting)[1], law.velocity_barrier
+    inner, barrier = law.tubes(t, state.q, state.dq, scenario.context)[1], law.velocity_barrier
     gap = (
         jnp.clip(1.0 - jnp.abs(inner.xi(state.dq)), max(barrier.guard, 0.0), 1.0)
         if barrier.guard > 0

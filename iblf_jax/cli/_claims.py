@@ -211,7 +211,7 @@ def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
     import jax
 
     def at(t, q):
-        tube = run.scenario.setting.tube(t)
+        tube = run.scenario.context.tube(t)
         return barrier.value(tube, q), tube.xi(q)
 
     V1, xi = jax.jit(jax.vmap(at))(run.t, run.q)

@@ -100,7 +100,7 @@ def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
     observer = stepping_observer(scenario).init(q, dq, scenario.model)
     filtered = () if velocity is None else velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
     return Memory(
-        scenario.controller.init(q, dq, scenario.setting), observer, filtered
+        scenario.controller.init(q, dq, scenario.context), observer, filtered
     ), scenario.model.gravity(q)
 
 
@@ -115,7 +115,7 @@ def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Outp
             told.q, told.dq, normal, scenario.sampling.period, memory.velocity
         )
     answer = answered(scenario, told.t, Measurement(told.q, dq), memory.controller, memory.observer)
-    command, tube = answer.command, scenario.setting.tube(told.t)
+    command, tube = answer.command, scenario.context.tube(told.t)
     infeasible = jnp.zeros((), bool)
     for slack in jax.tree.leaves((command.slack, command.region_slack)):
         infeasible |= jnp.any(slack > 0)

@@ -343,7 +343,7 @@ def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
 @jax.jit
 def _reference(scenario: Scenario, t: jax.Array) -> tuple[jax.Array, ...]:
     """The scenario's own reference and its derivatives at times (K,), (K, n) each."""
-    tube = jax.vmap(scenario.setting.tube)(t)
+    tube = jax.vmap(scenario.context.tube)(t)
     return tube.q_d, tube.dq_d, tube.ddq_d  # type: ignore[return-value]
 
 

@@ -166,7 +166,7 @@ def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """
 
     def at(t):
-        tube = scenario.setting.tube(t)
+        tube = scenario.context.tube(t)
         return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
 
     return jax.tree.map(

@@ -136,8 +136,8 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     """The switching functions of the scenario's law at a state, (m,), or None if its command does
     not jump.
     """
-    law, setting = scenario.controller, scenario.setting
-    return switching_functions(law, t, state.q, state.dq, setting, state.controller)
+    law, context = scenario.controller, scenario.context
+    return switching_functions(law, t, state.q, state.dq, context, state.controller)
 
 
 def with_hybrid_derivative(

@@ -229,7 +229,7 @@ def _ranges(scenario: Any) -> dict[str, np.ndarray]:
         found = {
             name: np.where(np.isfinite(x), x, np.array([-1e9, 1e9])) for name, x in found.items()
         }
-    tube = scenario.setting.tube(jnp.zeros((), scenario.initial.q.dtype))
+    tube = scenario.context.tube(jnp.zeros((), scenario.initial.q.dtype))
     low, high = np.asarray(tube.lower), np.asarray(tube.upper)
     wide = np.where(np.isfinite(high - low), np.maximum(1.0, high - low), np.inf)
     found["the scenario's bounds and 8 times their width around them"] = np.stack(

@@ -135,7 +135,7 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
             "Make one with ij.presets or ij.Scenario.",
         )
     t = np.linspace(0.0, checks.positive_number("duration", duration, "s"), POINTS)
-    tube = jax.vmap(scenario.setting.tube)(jnp.asarray(t, scenario.initial.q.dtype))
+    tube = jax.vmap(scenario.context.tube)(jnp.asarray(t, scenario.initial.q.dtype))
     figure = _style.new_figure(7.2, 0.6 + 1.4 * scenario.n)
     panels = figure.subplots(scenario.n, 1, sharex=True, squeeze=False)[:, 0]
     for i, (axes, name) in enumerate(

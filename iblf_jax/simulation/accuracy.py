@@ -315,7 +315,7 @@ def unseen(scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Arra
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
         return scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
 
-    tube = at_all(scenario.setting.tube, times)
+    tube = at_all(scenario.context.tube, times)
     ends = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
     rates = jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper], axis=-1)
     # The first stage of every method is at the start of the step.

@@ -37,7 +37,7 @@ from iblf_jax.world.regions import margins
 from iblf_jax.world.robots import at_time, friction_torque
 
 
-class Said(NamedTuple):
+class LawSignals(NamedTuple):
     """What a law says at an instant, besides its torque."""
 
     alpha: jax.Array
@@ -49,9 +49,9 @@ class Said(NamedTuple):
     region_slack: Any = ()
 
 
-def said_by(command: Command, f_hat: jax.Array) -> Said:
+def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
     """What a command says besides its torque."""
-    return Said(
+    return LawSignals(
         command.alpha,
         command.V1,
         f_hat,
@@ -62,7 +62,7 @@ def said_by(command: Command, f_hat: jax.Array) -> Said:
     )
 
 
-class Held(NamedTuple):
+class SampledState(NamedTuple):
     """What a sampled loop keeps from sample to sample, besides the states of law and observer."""
 
     commands: jax.Array
@@ -71,7 +71,7 @@ class Held(NamedTuple):
     """State of the sensor."""
     measured: Measurement
     """What the sensor told last."""
-    said: Said
+    said: LawSignals
 
 
 class LoopState(NamedTuple):
@@ -83,7 +83,7 @@ class LoopState(NamedTuple):
     observer: Any
     actuator: Any = ()
     held: Any = ()
-    """A `Held` where the law is sampled."""
+    """A `SampledState` where the law is sampled."""
 
 
 @partial(jax.jit, inline=True)  # so that it is traced once for all the places that ask for it
@@ -93,7 +93,7 @@ def initial_state(scenario: Scenario) -> LoopState:
     state = LoopState(
         q,
         dq,
-        scenario.controller.init(q, dq, scenario.setting),
+        scenario.controller.init(q, dq, scenario.context),
         stepping_observer(scenario).init(q, dq, scenario.model),
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
@@ -104,7 +104,7 @@ def initial_state(scenario: Scenario) -> LoopState:
         return state
     zero, no = jnp.zeros_like(q), jnp.zeros((n,), bool)
     command = jax.eval_shape(
-        scenario.controller.command, zero[0], q, dq, zero, scenario.setting, state.controller
+        scenario.controller.command, zero[0], q, dq, zero, scenario.context, state.controller
     )[0]
     slack, region_slack = jax.tree.map(
         lambda x: jnp.zeros(x.shape, x.dtype), (command.slack, command.region_slack)
@@ -112,11 +112,11 @@ def initial_state(scenario: Scenario) -> LoopState:
     commands = jnp.repeat(still[None], scenario.sampling.queue + 1, axis=0)
     sensor = scenario.sensor.init(q, dq, scenario.sampling.period)
     return state._replace(
-        held=Held(
+        held=SampledState(
             commands,
             sensor,
             Measurement(q, dq),
-            Said(zero, zero, zero, no, no, slack, region_slack),
+            LawSignals(zero, zero, zero, no, no, slack, region_slack),
         )
     )
 
@@ -155,7 +155,7 @@ def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Arra
     return state._replace(
         controller=answer.controller,
         observer=answer.observer,
-        held=Held(commands, sensor, measured, said_by(answer.command, answer.f_hat)),
+        held=SampledState(commands, sensor, measured, law_signals(answer.command, answer.f_hat)),
     )
 
 
@@ -185,7 +185,7 @@ def answered(
     sampling: Any = scenario.sampling
     q, dq, stepping = measured.q, measured.dq, stepping_observer(scenario)
     f_hat = stepping.estimate(t, q, dq, scenario.model, observer)
-    command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.setting, controller)
+    command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.context, controller)
     after = _advanced(sampling, stepping, (t, q, dq, command.tau, scenario.model, observer))
     moved = jax.tree.map(lambda x, dx: x + sampling.period * dx, controller, rate)
     return Answer(command, f_hat, moved, after)
@@ -336,9 +336,9 @@ def evaluate(
     if scenario.sampling is None:
         f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
         command, controller_rate = scenario.controller.command(
-            t, q, dq, f_hat, scenario.setting, state.controller
+            t, q, dq, f_hat, scenario.context, state.controller
         )
-        asked, said = command.tau, said_by(command, f_hat)
+        asked, said = command.tau, law_signals(command, f_hat)
     else:
         asked, said = state.held.commands[0] if torque is None else torque, state.held.said
     delivered = as_at(scenario.actuator, t).deliver(asked, dq, state.actuator)
@@ -359,7 +359,7 @@ def observed(
     ddq: jax.Array,
     tau: jax.Array,
     limited: jax.Array,
-    said: Said,
+    said: LawSignals,
 ) -> Sample:
     """The sample at time t of a loop whose robot moves like this, whatever moves it.
 
@@ -372,7 +372,7 @@ def observed(
       limited: whether the actuator gave less than was asked, (n,) bool.
       said: what the law says.
     """
-    model, tube = scenario.model, scenario.setting.tube(t)
+    model, tube = scenario.model, scenario.context.tube(t)
     M0, G0 = model.mass_matrix(q), model.gravity(q)
     f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
     e2, f_tilde = dq - said.alpha, f - said.f_hat
@@ -380,7 +380,7 @@ def observed(
         V = jnp.sum(said.V1) + 0.5 * inner(f_tilde, f_tilde)
     else:
         V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
-    limits = () if scenario.velocity_bounds is None else scenario.setting.speed_limits(t)
+    limits = () if scenario.velocity_bounds is None else scenario.context.speed_limits(t)
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),

@@ -16,7 +16,7 @@ import numpy as np
 
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
-from iblf_jax.control.controllers import Controller, Setting
+from iblf_jax.control.controllers import Controller, LawContext
 from iblf_jax.control.observers import NoObserver, Observer
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
@@ -226,9 +226,16 @@ class Scenario:
         return joined([jump_times_of(name, part, dtype) for name, part in parts.items()], dtype)
 
     @property
-    def setting(self) -> Setting:
+    def context(self) -> LawContext:
         """What the law knows: model, reference, bounds and regions."""
-        return Setting(self.model, self.reference, self.bounds, self.velocity_bounds, self.regions)
+        return LawContext(
+            self.model, self.reference, self.bounds, self.velocity_bounds, self.regions
+        )
+
+    @property
+    def setting(self) -> LawContext:
+        """The name that earlier versions gave `context`."""
+        return self.context
 
     def _repr_html_(self) -> str:
         from iblf_jax import reports
@@ -375,7 +382,7 @@ def canonical(scenario: Scenario) -> Scenario:
     if checks.is_concrete(scenario):
         _check_start(scenario)
         for law in layers(scenario.controller):
-            getattr(law, "check_start", lambda setting: None)(scenario.setting)
+            getattr(law, "check_start", lambda context: None)(scenario.context)
         advice = [
             text
             for part in (scenario.controller, scenario.observer)

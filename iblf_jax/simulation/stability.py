@@ -136,11 +136,11 @@ def room_around(scenario: Scenario, t: jax.Array, plant: LoopState, size: int) -
     """The largest sizes of differences of what `closed_loop.surroundings` gives, (size,): small
     near bounds, WIDEST elsewhere.
     """
-    tube = scenario.setting.tube(t, acceleration=False)
+    tube = scenario.context.tube(t, acceleration=False)
     side = jnp.minimum(plant.q - tube.lower, tube.upper - plant.q)
     near = [jnp.clip(ROOM * side, 0.0, WIDEST_MOVE)]
     if scenario.velocity_bounds is not None:
-        slow, fast = scenario.setting.speed_limits(t)
+        slow, fast = scenario.context.speed_limits(t)
         side = jnp.minimum(plant.dq - slow, fast - plant.dq)
         near.append(jnp.clip(ROOM * side, 0.0, WIDEST))
     rest = jnp.full((size - sum(x.size for x in near),), WIDEST, plant.q.dtype)

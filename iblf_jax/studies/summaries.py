@@ -62,7 +62,7 @@ def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, 
         tube = tube_at(made.reference, made.bounds, zero)
         found = {"rad": jnp.minimum(q - tube.lower, tube.upper - q)}
         if made.velocity_bounds is not None:
-            low, high = made.setting.speed_limits(zero)
+            low, high = made.context.speed_limits(zero)
             found["rad/s"] = jnp.minimum(dq - low, high - dq)
         if made.regions:
             found["m"] = margins(made.regions, made.plant, q)

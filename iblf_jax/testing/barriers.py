@@ -75,10 +75,10 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
         findings.stop_if_any()
         n = number_of_joints(findings, barrier, n)
         barrier = fitted_to(in_dtype(barrier, "float64"), n, "barrier")
-        setting = in_dtype(scenario_of(n), "float64").setting
+        context = in_dtype(scenario_of(n), "float64").context
         k1 = _joint_by_joint(n, 2.0, 3.0)
         o = _joint_by_joint(n, 0.1, 0.2) if uses_o else None
-        tube = setting.tube(jnp.asarray(1.0))
+        tube = context.tube(jnp.asarray(1.0))
         q = tube.q_d + _joint_by_joint(n, 0.2, -0.15)
         calls: dict[str, tuple] = {
             "value(tube, q)": (barrier.value, (tube, q)),
@@ -100,8 +100,8 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
         probe(findings, outputs, barrier, (tube, q, k1, o))
         _joints_apart(findings, barrier, tube, q, k1, o)
         for t in TIMES:
-            tube = setting.tube(jnp.asarray(t))
-            numbers = _numbers(barrier, setting, jnp.asarray(t), k1, o, jnp.asarray(XI))
+            tube = context.tube(jnp.asarray(t))
+            numbers = _numbers(barrier, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
             _at_every_xi(findings, numbers, guard)
             _claims(findings, barrier, tube, k1, numbers, guard)
 
@@ -113,14 +113,14 @@ def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
 
 @jax.jit
 def _numbers(
-    barrier: Any, setting: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array
+    barrier: Any, context: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array
 ) -> dict[str, jax.Array]:
     """The barrier at every xi, with its derivatives by q in both modes, and the rate of V1 along q'
     = alpha.
     """
 
     def at(xi):
-        tube: Tube = setting.tube(t)
+        tube: Tube = context.tube(t)
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
 
         def functions(q):
@@ -136,7 +136,7 @@ def _numbers(
         one_by_one = jnp.eye(3)[:, :, None] * ones
         reverse = jax.vmap(pull)(tuple(one_by_one[:, i] for i in range(3)))[0]
         rate = jax.jvp(
-            lambda t, q: barrier.value(setting.tube(t), q), (t, q), (jnp.ones_like(t), alpha)
+            lambda t, q: barrier.value(context.tube(t), q), (t, q), (jnp.ones_like(t), alpha)
         )[1]
         return {
             "V1": V1,

@@ -51,9 +51,9 @@ def _command(
     scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Torque, alpha and V1 without a disturbance."""
-    setting = scenario.setting
-    state = law.init(scenario.initial.q, scenario.initial.dq, setting)
-    command = law.command(jnp.asarray(TIME), q, dq, jnp.zeros_like(q), setting, state)[0]
+    context = scenario.context
+    state = law.init(scenario.initial.q, scenario.initial.dq, context)
+    command = law.command(jnp.asarray(TIME), q, dq, jnp.zeros_like(q), context, state)[0]
     return command.tau, command.alpha, command.V1
 
 
@@ -62,7 +62,7 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
 
     @jax.jit
     def slope(scenario, e2):
-        law, tube = scenario.controller, scenario.setting.tube(jnp.asarray(TIME))
+        law, tube = scenario.controller, scenario.context.tube(jnp.asarray(TIME))
         q = tube.q_d + 0.3 * tube.k_u
         alpha = _command(scenario, law, q, tube.dq_d)[1]
         one = jnp.ones_like(alpha)
@@ -135,10 +135,10 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
     @jax.jit
     def answers(scenario, xis):
         def at(xi):
-            law, setting, t = scenario.controller, scenario.setting, jnp.asarray(TIME)
-            tube = setting.tube(t)
+            law, context, t = scenario.controller, scenario.context, jnp.asarray(TIME)
+            tube = context.tube(t)
             q, dq = tube.q_d, tube.dq_d
-            limits: Any = () if scenario.velocity_bounds is None else setting.speed_limits(t)
+            limits: Any = () if scenario.velocity_bounds is None else context.speed_limits(t)
             if axis == "xi":
                 q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
             else:

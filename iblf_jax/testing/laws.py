@@ -73,16 +73,16 @@ def check_law(
             _structure(findings, in_dtype(base, dtype))
         findings.stop_if_any()
         t = jnp.asarray(0.7)
-        tube = base.setting.tube(t)
+        tube = base.context.tube(t)
         q, dq = tube.q_d + 0.3 * tube.k_u, tube.dq_d - 0.2
         f_hat = jnp.linspace(0.1, 0.2, base.n)
 
-        def outputs(law, t, q, dq, f_hat, setting):
-            command, rate = law.command(t, q, dq, f_hat, setting, law.init(q, dq, setting))
+        def outputs(law, t, q, dq, f_hat, context):
+            command, rate = law.command(t, q, dq, f_hat, context, law.init(q, dq, context))
             named = {f"its state's rate, leaf {i}": x for i, x in enumerate(jax.tree.leaves(rate))}
             return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1, **named}
 
-        probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.setting))
+        probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.context))
         check_claims(findings, base)
         is_defined_beyond = check_at_the_bounds(findings, base)
         findings.stop_if_any()
@@ -91,18 +91,18 @@ def check_law(
 
 
 def _structure(findings: Findings, scenario: Scenario) -> None:
-    law, setting, q, dq = (
+    law, context, q, dq = (
         scenario.controller,
-        scenario.setting,
+        scenario.context,
         scenario.initial.q,
         scenario.initial.dq,
     )
     t, kind = jnp.zeros((), q.dtype), f" ({q.dtype})"
-    state = shape_of(findings, "init(q, dq, setting)" + kind, law.init, q, dq, setting)
+    state = shape_of(findings, "init(q, dq, context)" + kind, law.init, q, dq, context)
     if state is None:
         return
-    label = "command(t, q, dq, f_hat, setting, state)" + kind
-    answer = shape_of(findings, label, law.command, t, q, dq, jnp.zeros_like(q), setting, state)
+    label = "command(t, q, dq, f_hat, context, state)" + kind
+    answer = shape_of(findings, label, law.command, t, q, dq, jnp.zeros_like(q), context, state)
     if answer is None:
         return
     if not (isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)):

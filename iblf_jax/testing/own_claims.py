@@ -35,17 +35,17 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
         _shapes(findings, in_dtype(scenario, dtype))
     findings.stop_if_any()
     t, q, dq, f_tilde = _near_the_reference(scenario, np.random.default_rng(5))
-    setting = scenario.setting
+    context = scenario.context
 
-    def outputs(law, t, q, dq, f_tilde, setting):
-        own = law.init(q, dq, setting)
-        return {name: getattr(law, name)(t, q, dq, f_tilde, setting, own) for name in REQUIRED}
+    def outputs(law, t, q, dq, f_tilde, context):
+        own = law.init(q, dq, context)
+        return {name: getattr(law, name)(t, q, dq, f_tilde, context, own) for name in REQUIRED}
 
-    probe(findings, outputs, law, (t, q[0], dq[0], f_tilde, setting))
+    probe(findings, outputs, law, (t, q[0], dq[0], f_tilde, context))
 
     @jax.jit
     def sums(q, dq):
-        found = outputs(law, t, q, dq, jnp.zeros_like(q), setting)
+        found = outputs(law, t, q, dq, jnp.zeros_like(q), context)
         return jax.tree.map(jnp.sum, found)
 
     for name, values in jax.vmap(sums)(q, dq).items():
@@ -60,7 +60,7 @@ def _near_the_reference(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """A time, and states and an error of the estimate there: (), (STATES, n), (STATES, n), (n,)."""
     t = jnp.asarray(0.7)
-    tube = scenario.setting.tube(t)
+    tube = scenario.context.tube(t)
     q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
     width = jnp.minimum(tube.k_l, tube.k_u)
     inside = tube.q_d + jnp.clip(q, -0.9 * width, 0.9 * width)
@@ -69,16 +69,16 @@ def _near_the_reference(
 
 def _shapes(findings: Findings, scenario: Scenario) -> None:
     law: Any = scenario.controller
-    setting, q, dq = scenario.setting, scenario.initial.q, scenario.initial.dq
+    context, q, dq = scenario.context, scenario.initial.q, scenario.initial.dq
     t, zero = jnp.zeros((), q.dtype), jnp.zeros_like(q)
-    own = law.init(q, dq, setting)
-    arguments = (t, q, dq, zero, setting, own)
+    own = law.init(q, dq, context)
+    arguments = (t, q, dq, zero, context, own)
     calls: dict[str, tuple[Any, tuple]] = {}
     for name in REQUIRED:
-        calls[f"{name}(t, q, dq, f_tilde, setting, state)"] = (getattr(law, name), arguments)
+        calls[f"{name}(t, q, dq, f_tilde, context, state)"] = (getattr(law, name), arguments)
     if hasattr(law, "disturbance_terms"):
-        label = "disturbance_terms(t, q, dq, f_tilde, df, setting, state)"
-        calls[label] = (law.disturbance_terms, (t, q, dq, zero, zero, setting, own))
+        label = "disturbance_terms(t, q, dq, f_tilde, df, context, state)"
+        calls[label] = (law.disturbance_terms, (t, q, dq, zero, zero, context, own))
     for label, (call, args) in calls.items():
         got = shape_of(findings, label, call, *args)
         if got is not None:

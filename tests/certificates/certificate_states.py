@@ -87,7 +87,7 @@ def _rebuilt(part, **changes):
 @jax.vmap
 def _position(scenario: ij.Scenario, t, xi, dq):
     """The position with this relative error, and M0 q' there."""
-    tube = scenario.setting.tube(t)
+    tube = scenario.context.tube(t)
     q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
     return q, scenario.model.mass_matrix(q) @ dq
 

@@ -52,7 +52,7 @@ def proven_rate(scenario, t, state, proof):
     """V2' of the integral barrier as the proof writes it, (3.8) and (3.24), with the terms that it
     drops."""
     law, kf = scenario.controller, scenario.observer.kf
-    tube = scenario.setting.tube(t)
+    tube = scenario.context.tube(t)
     above = state.q > tube.q_d
     k, dk = jnp.where(above, tube.k_u, tube.k_l), jnp.where(above, tube.dk_u, tube.dk_l)
     kappa = jnp.sqrt((tube.dk_u / tube.k_u) ** 2 + (tube.dk_l / tube.k_l) ** 2 + law.o)
@@ -163,7 +163,7 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
     M0 = np.asarray(jax.vmap(lambda scenario, q: scenario.model.mass_matrix(q))(batch, state.q))
     V1 = V - w_f * half_square - 0.5 * np.einsum("ti,tij,tj->t", proof.e2, M0, proof.e2)
     one = jax.vmap(
-        lambda scenario, t, q: scenario.controller.barrier.value(scenario.setting.tube(t), q)
+        lambda scenario, t, q: scenario.controller.barrier.value(scenario.context.tube(t), q)
     )(batch, t, state.q)
     np.testing.assert_allclose(
         V1,
@@ -667,17 +667,17 @@ class Passive:
     late: ij.Leaf = ij.leaf("1/s", shape="scalar", default=0.0)
     """What it states too much, from t = 0.05 s on."""
 
-    def errors(self, t, q, dq, setting):
-        tube = setting.tube(t)
+    def errors(self, t, q, dq, context):
+        tube = context.tube(t)
         e, de = q - tube.q_d, dq - tube.dq_d
         return e, de, de + self.slope * e, tube.ddq_d - self.slope * de
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        _, _, r, dv = self.errors(t, q, dq, setting)
-        model, no = setting.model, jnp.zeros(q.shape, bool)
+    def command(self, t, q, dq, f_hat, context, state):
+        _, _, r, dv = self.errors(t, q, dq, context)
+        model, no = context.model, jnp.zeros(q.shape, bool)
         tau = (
             model.mass_matrix(q) @ dv
             + model.coriolis(q, dq, dq - r)
@@ -687,12 +687,12 @@ class Passive:
         )
         return ij.controllers.Command(tau, dq - r, 0.0 * q, no, no), ()
 
-    def lyapunov(self, t, q, dq, f_tilde, setting, state):
-        e, _, r, _ = self.errors(t, q, dq, setting)
-        return 0.5 * r @ (setting.model.mass_matrix(q) @ r) + jnp.sum(self.slope * self.K * e**2)
+    def lyapunov(self, t, q, dq, f_tilde, context, state):
+        e, _, r, _ = self.errors(t, q, dq, context)
+        return 0.5 * r @ (context.model.mass_matrix(q) @ r) + jnp.sum(self.slope * self.K * e**2)
 
-    def decay(self, t, q, dq, f_tilde, setting, state):
-        e, de, _, _ = self.errors(t, q, dq, setting)
+    def decay(self, t, q, dq, f_tilde, context, state):
+        e, de, _, _ = self.errors(t, q, dq, context)
         return self.share * jnp.sum(self.K * (de**2 + (self.slope * e) ** 2)) + jnp.where(
             t > 0.05, self.late, 0.0
         )
@@ -786,13 +786,13 @@ def test_an_own_V_with_the_error_of_the_estimate_in_it(paper):
 
         kf: ij.Leaf = ij.leaf("1/s", default=20.0)
 
-        def lyapunov(self, t, q, dq, f_tilde, setting, state):
+        def lyapunov(self, t, q, dq, f_tilde, context, state):
             return (
-                Passive.lyapunov(self, t, q, dq, f_tilde, setting, state) + 0.5 * f_tilde @ f_tilde
+                Passive.lyapunov(self, t, q, dq, f_tilde, context, state) + 0.5 * f_tilde @ f_tilde
             )
 
-        def decay(self, t, q, dq, f_tilde, setting, state):
-            return Passive.decay(self, t, q, dq, f_tilde, setting, state) + jnp.sum(
+        def decay(self, t, q, dq, f_tilde, context, state):
+            return Passive.decay(self, t, q, dq, f_tilde, context, state) + jnp.sum(
                 self.kf * f_tilde**2
             )
 
@@ -818,16 +818,16 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
         gamma: ij.Leaf = ij.leaf("1/s", sign="positive")
         uses_observer: ClassVar[bool] = False
 
-        def init(self, q, dq, setting):
+        def init(self, q, dq, context):
             return {"d": 0.3 + 0.0 * q}
 
-        def errors(self, t, q, dq, setting):
-            tube = setting.tube(t)
+        def errors(self, t, q, dq, context):
+            tube = context.tube(t)
             return dq - tube.dq_d + 2.0 * (q - tube.q_d), tube.ddq_d - 2.0 * (dq - tube.dq_d)
 
-        def command(self, t, q, dq, f_hat, setting, state):
-            r, dv = self.errors(t, q, dq, setting)
-            model, no = setting.model, jnp.zeros(q.shape, bool)
+        def command(self, t, q, dq, f_hat, context, state):
+            r, dv = self.errors(t, q, dq, context)
+            model, no = context.model, jnp.zeros(q.shape, bool)
             tau = (
                 model.mass_matrix(q) @ dv
                 + model.coriolis(q, dq, dq - r)
@@ -837,15 +837,15 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
             )
             return ij.controllers.Command(tau, dq - r, 0.0 * q, no, no), {"d": self.gamma * r}
 
-        def lyapunov(self, t, q, dq, f_tilde, setting, state):
-            r, _ = self.errors(t, q, dq, setting)
-            return 0.5 * r * (setting.model.mass_matrix(q) @ r) + 0.5 * state["d"] ** 2 / self.gamma
+        def lyapunov(self, t, q, dq, f_tilde, context, state):
+            r, _ = self.errors(t, q, dq, context)
+            return 0.5 * r * (context.model.mass_matrix(q) @ r) + 0.5 * state["d"] ** 2 / self.gamma
 
-        def decay(self, t, q, dq, f_tilde, setting, state):
-            return self.K * self.errors(t, q, dq, setting)[0] ** 2
+        def decay(self, t, q, dq, f_tilde, context, state):
+            return self.K * self.errors(t, q, dq, context)[0] ** 2
 
-        def disturbance_terms(self, t, q, dq, f_tilde, df, setting, state):
-            return self.errors(t, q, dq, setting)[0] * f_tilde
+        def disturbance_terms(self, t, q, dq, f_tilde, df, context, state):
+            return self.errors(t, q, dq, context)[0] * f_tilde
 
     certificate = certify(
         dataclasses.replace(paper, controller=Adaptive(K=6.0, gamma=[2.0, 3.0])), **OWN

@@ -115,7 +115,7 @@ def test_it_starts_on_alpha_and_is_sampled_too():
     scenario = ij.presets.zhang_yan_2024(law="dynamic_surface")
     run = ij.simulate(scenario, duration=0.1, dt=1e-3)
     np.testing.assert_array_equal(run.alpha[0], run.controller_state[0])
-    tube = scenario.setting.tube(jnp.zeros(()))
+    tube = scenario.context.tube(jnp.zeros(()))
     np.testing.assert_allclose(
         run.alpha[0],
         scenario.controller.barrier.virtual_velocity(tube, scenario.initial.q, 2.0, 0.1),

@@ -126,12 +126,12 @@ class FullLoop(Loop):
 
 def random_states(scenario, count=64, seed=0):
     """Times and states of the loop inside both pairs of bounds, e1 and e2 up to 0.95 of theirs."""
-    rng, law, setting = np.random.default_rng(seed), scenario.controller, scenario.setting
+    rng, law, context = np.random.default_rng(seed), scenario.controller, scenario.context
 
     def state(t, xi, xi2, eta):
-        tube = setting.tube(t)
+        tube = context.tube(t)
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
-        inner = law.tubes(t, q, jnp.zeros(2), setting)[1]  # alpha and K do not depend on q'
+        inner = law.tubes(t, q, jnp.zeros(2), context)[1]  # alpha and K do not depend on q'
         dq = inner.q_d + xi2 * jnp.where(xi2 > 0, inner.k_u, inner.k_l)
         return initial_state(scenario)._replace(q=q, dq=dq, observer=eta), jnp.minimum(
             inner.q_d - inner.lower, inner.upper - inner.q_d
@@ -156,7 +156,7 @@ def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng
         def torque(t, state, scenario=scenario):
             f_hat = scenario.observer.estimate(t, state.q, state.dq, scenario.model, state.observer)
             command = scenario.controller.command(
-                t, state.q, state.dq, f_hat, scenario.setting, ()
+                t, state.q, state.dq, f_hat, scenario.context, ()
             )[0]
             return command.tau, command.V1
 
@@ -240,9 +240,9 @@ def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, 
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
     assert not np.any(proof.held)
     assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.terms))
-    V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.setting.tube(t), q))(t, states.q)
+    V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.context.tube(t), q))(t, states.q)
     phi = jax.vmap(
-        lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.setting)[1], dq)
+        lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.context)[1], dq)
     )(t, states.q, states.dq)
     expected = np.sum(V1 * np.array([0.2, 6.0]) + phi + 0.5 * proof.f_tilde**2, axis=1)
     np.testing.assert_allclose(proof.V, expected, rtol=1e-9)
@@ -263,11 +263,11 @@ def test_without_its_own_terms_the_inequality_breaks():
 
 @ij.component
 class _WithoutCrossTerm(controllers.FullState):
-    def command(self, t, q, dq, f_hat, setting, state):
-        command, rate = controllers.FullState.command(self, t, q, dq, f_hat, setting, state)
-        outer, inner = self.tubes(t, q, dq, setting)
+    def command(self, t, q, dq, f_hat, context, state):
+        command, rate = controllers.FullState.command(self, t, q, dq, f_hat, context, state)
+        outer, inner = self.tubes(t, q, dq, context)
         crossed = self.barrier.slope(outer, q) * self.velocity_barrier.error_over_slope(inner, dq)
-        return command._replace(tau=command.tau + setting.model.mass_matrix(q) @ crossed), rate
+        return command._replace(tau=command.tau + context.model.mass_matrix(q) @ crossed), rate
 
 
 def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
@@ -291,7 +291,7 @@ def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
         jnp.array([0.3, -0.6]),
         jnp.array([0.2, 0.1]),
     )
-    command = law.command(t, q, dq, f_hat, scenario.setting, ())[0]
+    command = law.command(t, q, dq, f_hat, scenario.context, ())[0]
     z2, kb, model = np.asarray(dq), 0.8, scenario.model
     np.testing.assert_allclose(
         command.alpha, 0.0, atol=1e-15
@@ -303,7 +303,7 @@ def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
     tau = model.mass_matrix(q) @ wanted + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
     np.testing.assert_allclose(command.tau, tau, rtol=1e-12)
     z1 = np.array([0.1, -0.2])
-    command = law.command(t, q + z1, dq, f_hat, scenario.setting, ())[0]
+    command = law.command(t, q + z1, dq, f_hat, scenario.context, ())[0]
     alpha = -gain * z1
     phi = 0.5 * np.log(1 / (1 - ((z2 - alpha) / np.where(z2 > alpha, kb - alpha, kb + alpha)) ** 2))
     np.testing.assert_allclose(command.V1, 0.5 * np.log(0.16 / (0.16 - z1**2)) + phi, rtol=1e-12)
@@ -379,10 +379,10 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
         study = ij.monte_carlo(
             scenario, perturbations, runs=28 * starts // 10, duration=2.0, dt=2.5e-4, progress=False
         )
-    law, setting, zero = scenario.controller, scenario.setting, jnp.zeros(())
+    law, context, zero = scenario.controller, scenario.context, jnp.zeros(())
 
     def start(q, dq):
-        inner = law.tubes(zero, q, dq, setting)[1]
+        inner = law.tubes(zero, q, dq, context)[1]
         return jnp.min(jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)), jnp.max(
             jnp.abs(inner.xi(dq))
         )
@@ -635,7 +635,7 @@ def test_a_barrier_states_whether_its_ratio_jumps(name):
     wrapped = controllers.Saturated(law=law, limit=50.0)
     for each in (law, wrapped):
         found = switching_functions(
-            each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.setting, ()
+            each, jnp.zeros(()), scenario.initial.q, scenario.initial.dq, scenario.context, ()
         )
         assert (found is not None) == ratio_jumps(FAMILY[name])
 

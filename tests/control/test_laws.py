@@ -58,7 +58,7 @@ def test_the_funnel_is_kept_by_its_own_law():
     # and it lies inside the paper's bounds
     paper = ij.presets.zhang_yan_2024()
     tubes = [
-        jax.vmap(scenario.setting.tube)(jnp.linspace(0.0, 20.0, 2001))
+        jax.vmap(scenario.context.tube)(jnp.linspace(0.0, 20.0, 2001))
         for scenario in (run.scenario, paper)
     ]
     assert bool(jnp.all(tubes[0].lower >= tubes[1].lower))
@@ -183,8 +183,8 @@ def test_adaptive_law_uses_neither_model_nor_estimate():
     law, t = scenario.controller, jnp.asarray(0.3)
     weights = jax.random.normal(jax.random.PRNGKey(0), (law.nodes, 2))
     heavy = ij.robots.TwoLink(mass=9.0, length=1.0, centre=0.5, inertia=1.0)
-    one = law.command(t, Q, DQ, jnp.zeros(2), scenario.setting, weights)
-    other = law.command(t, Q, DQ, jnp.ones(2), scenario.setting._replace(model=heavy), weights)
+    one = law.command(t, Q, DQ, jnp.zeros(2), scenario.context, weights)
+    other = law.command(t, Q, DQ, jnp.ones(2), scenario.context._replace(model=heavy), weights)
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
@@ -193,20 +193,20 @@ def test_adaptation_descends_the_lyapunov_function():
     scenario = ij.presets.zhang_yan_2024(law="adaptive_rbf")
     law, t = scenario.controller, jnp.asarray(0.3)
     weights, ideal = jax.random.normal(jax.random.PRNGKey(1), (2, law.nodes, 2))
-    command, dweights = law.command(t, Q, DQ, jnp.zeros(2), scenario.setting, weights)
+    command, dweights = law.command(t, Q, DQ, jnp.zeros(2), scenario.context, weights)
     e2 = DQ - command.alpha
     S = jnp.linalg.lstsq(
-        weights.T, command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q)
+        weights.T, command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q)
     )[0]
     np.testing.assert_allclose(
         weights.T @ S,
-        command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q),
+        command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q),
         atol=1e-9,
     )
     S = -(dweights / law.Gamma + law.sigma * weights)[:, 0] / e2[0]
     np.testing.assert_allclose(
         weights.T @ S,
-        command.tau + law.K2 * e2 + law.barrier.slope(scenario.setting.tube(t), Q),
+        command.tau + law.K2 * e2 + law.barrier.slope(scenario.context.tube(t), Q),
         atol=1e-9,
     )
     error = weights - ideal
@@ -304,7 +304,7 @@ def test_smooth_limit(dtype):
             Q.astype(dtype),
             DQ.astype(dtype),
             jnp.zeros(2, dtype),
-            scenario.setting,
+            scenario.context,
             (),
         )[0].tau
 
@@ -330,10 +330,10 @@ class _Fixed:
 
     tau: jax.Array = ij.leaf("N m", shape="any")
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
+    def command(self, t, q, dq, f_hat, context, state):
         never = jnp.zeros(q.shape, bool)
         return controllers.Command(self.tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), ()
 
@@ -560,9 +560,9 @@ def weighted(name, weight=None):
 
 def commanded(scenario):
     """What its law commands at one state."""
-    law, setting = scenario.controller, scenario.setting
+    law, context = scenario.controller, scenario.context
     return law.command(
-        jnp.asarray(0.3), Q, DQ, jnp.array([0.5, -0.2]), setting, law.init(Q, DQ, setting)
+        jnp.asarray(0.3), Q, DQ, jnp.array([0.5, -0.2]), context, law.init(Q, DQ, context)
     )[0]
 
 
@@ -571,13 +571,13 @@ def test_the_weight_multiplies_slope_and_value_of_the_barrier(name):
     plain, other = (commanded(weighted(name, weight)) for weight in (None, WEIGHT))
     scenario = weighted(name)
     tube, barrier, model = (
-        scenario.setting.tube(jnp.asarray(0.3)),
+        scenario.context.tube(jnp.asarray(0.3)),
         scenario.controller.barrier,
         scenario.model,
     )
     added, first = (WEIGHT - 1.0) * barrier.slope(tube, Q), 0.0
     if name == "full_state":
-        inner = scenario.controller.tubes(jnp.asarray(0.3), Q, DQ, scenario.setting)[1]
+        inner = scenario.controller.tubes(jnp.asarray(0.3), Q, DQ, scenario.context)[1]
         added = model.mass_matrix(Q) @ (
             added * scenario.controller.velocity_barrier.error_over_slope(inner, DQ)
         )

@@ -95,9 +95,9 @@ def test_it_keeps_what_the_law_alone_breaks_from_random_starts(name):
     scenario = scenario_of(governor)
 
     def inside(q, dq):  # V <= Gamma at the start
-        g = governor.init(q, dq, scenario.setting).g
-        return governor.energy(q, dq, g, scenario.setting) <= governor.level(
-            jnp.zeros(()), g, scenario.setting
+        g = governor.init(q, dq, scenario.context).g
+        return governor.energy(q, dq, g, scenario.context) <= governor.level(
+            jnp.zeros(()), g, scenario.context
         )
 
     fine = np.asarray(
@@ -113,11 +113,11 @@ def test_it_keeps_what_the_law_alone_breaks_from_random_starts(name):
 def test_V_stays_below_Gamma():
     governor = controllers.ReferenceGovernor(law=LAWS["pd"])
     run = ij.simulate(scenario_of(governor), duration=3.0, dt=1e-3)
-    setting = run.scenario.setting
-    V = jax.vmap(lambda q, dq, g: governor.energy(q, dq, g, setting))(
+    context = run.scenario.context
+    V = jax.vmap(lambda q, dq, g: governor.energy(q, dq, g, context))(
         run.q, run.dq, run.controller_state.g
     )
-    level = jax.vmap(lambda t, g: governor.level(t, g, setting))(run.t, run.controller_state.g)
+    level = jax.vmap(lambda t, g: governor.level(t, g, context))(run.t, run.controller_state.g)
     assert np.all(level * (1 + 1e-6) + 1e-12 >= V)
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 0.02  # and it gets there
 
@@ -168,7 +168,7 @@ def test_its_speed_is_tuned():
 
 def test_its_state_starts_inside_the_margin():
     governor = controllers.ReferenceGovernor(law=LAWS["pd"])
-    state = governor.init(jnp.array([0.205, 0.5]), jnp.zeros(2), scenario_of(governor).setting)
+    state = governor.init(jnp.array([0.205, 0.5]), jnp.zeros(2), scenario_of(governor).context)
     assert isinstance(state, GovernorState)
     np.testing.assert_allclose(state.g, [0.22, 0.5])
 

@@ -96,7 +96,7 @@ def test_it_keeps_what_the_law_breaks(alone, options):
 def commands(scenario, t, q, dq):
     """Torque of the filter and of the law in it, and the slack."""
     law, zero = scenario.controller, jnp.zeros(2)
-    found, bare = (x.command(t, q, dq, zero, scenario.setting, ())[0] for x in (law, law.law))
+    found, bare = (x.command(t, q, dq, zero, scenario.context, ())[0] for x in (law, law.law))
     return found.tau, bare.tau, found.slack
 
 
@@ -196,7 +196,7 @@ def test_an_empty_box_is_flagged_with_its_slack():
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     worst = np.unravel_index(np.argmax(run.slack), run.slack.shape)
     low, high = scenario.controller.box(
-        run.t[worst[0]], run.q[worst[0]], run.dq[worst[0]], scenario.setting
+        run.t[worst[0]], run.q[worst[0]], run.dq[worst[0]], scenario.context
     )
     assert float(run.slack[worst]) == pytest.approx(0.5 * float(low[worst[1]] - high[worst[1]]))
 
@@ -309,7 +309,7 @@ def test_the_box_of_shaped_conditions(shape1, shape2, rng):
     A = {"linear": lambda h: h, "atan": np.arctan}[shape1]
     B = {"linear": lambda z: z, "cubic": lambda z: z**3}[shape2]
     for t, q, dq in zip(*random_places(rng, 5), strict=True):
-        low, high = law.box(jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), scenario.setting)
+        low, high = law.box(jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), scenario.context)
         for ddq, sign, side in ((low, 1, 0), (high, -1, 1)):
             # h and z along a motion with this acceleration; z' by differences.
             def z_at(s, q=q, dq=dq, t=t, ddq=ddq, sign=sign, side=side):

@@ -35,7 +35,7 @@ def test_its_torque_is_the_published_one():
     base, t = scenario(), 0.7
     q, dq = np.array([0.9, 0.2]), np.array([0.3, -0.8])
     command, _ = base.controller.command(
-        jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), jnp.ones(2), base.setting, ()
+        jnp.asarray(t), jnp.asarray(q), jnp.asarray(dq), jnp.ones(2), base.context, ()
     )
     q_d, dq_d = (
         0.5 + 0.14 * np.array([np.sin(t), np.cos(t)]),

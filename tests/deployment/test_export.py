@@ -46,7 +46,7 @@ def walk(scenario, dtype, seed=0):
     """Positions and velocities that wander in the tube and touch its bounds."""
     rng = np.random.default_rng(seed)
     t = jnp.asarray(np.arange(SAMPLES) * 1e-3, dtype)
-    tube = jax.vmap(scenario.setting.tube)(t)
+    tube = jax.vmap(scenario.context.tube)(t)
     share = 0.5 + 0.6 * np.cumsum(rng.normal(size=(SAMPLES, scenario.n)), axis=0) / np.sqrt(SAMPLES)
     q = tube.lower + share.astype(dtype) * (tube.upper - tube.lower)
     return Told(t, q, jnp.asarray(0.3 * rng.normal(size=q.shape), dtype)), tube
@@ -163,10 +163,10 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
 
         gain: ij.Leaf = ij.leaf("1")
 
-        def init(self, q, dq, setting):
+        def init(self, q, dq, context):
             return ()
 
-        def command(self, t, q, dq, f_hat, setting, state):
+        def command(self, t, q, dq, f_hat, context, state):
             x = jax.lax.while_loop(lambda x: x[0] < 1.0, lambda x: x + self.gain, q)
             no = jnp.zeros(q.shape, bool)
             return ij.controllers.Command(x, dq, 0 * q, no, no), ()
@@ -177,10 +177,10 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
 
         gain: ij.Leaf = ij.leaf("1")
 
-        def init(self, q, dq, setting):
+        def init(self, q, dq, context):
             return ()
 
-        def command(self, t, q, dq, f_hat, setting, state):
+        def command(self, t, q, dq, f_hat, context, state):
             no = jnp.zeros(q.shape, bool)
             return (
                 ij.controllers.Command(
@@ -226,15 +226,15 @@ def test_a_users_law_goes_out_without_a_name_in_files(base, tmp_path):
 
         gain: ij.Leaf = ij.leaf("N m/rad")
 
-        def init(self, q, dq, setting):
+        def init(self, q, dq, context):
             return ()
 
-        def command(self, t, q, dq, f_hat, setting, state):
-            tube = setting.tube(t)
+        def command(self, t, q, dq, f_hat, context, state):
+            tube = context.tube(t)
             no = jnp.zeros(q.shape, bool)
             return (
                 ij.controllers.Command(
-                    setting.model.gravity(q) + self.gain * (tube.q_d - q) - dq, dq, 0 * q, no, no
+                    context.model.gravity(q) + self.gain * (tube.q_d - q) - dq, dq, 0 * q, no, no
                 ),
                 (),
             )

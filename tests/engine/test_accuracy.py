@@ -274,11 +274,11 @@ class PowerOfE2:
     c: jax.Array = ij.leaf("N m", sign="positive")
     a: jax.Array = ij.leaf("1", sign="positive", default=0.6)
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        tube, model = setting.tube(t), setting.model
+    def command(self, t, q, dq, f_hat, context, state):
+        tube, model = context.tube(t), context.model
         alpha = tube.dq_d - 2.0 * (q - tube.q_d)
         e2, wanted = dq - alpha, tube.ddq_d - 2.0 * (dq - tube.dq_d)
         tau = model.coriolis(q, dq, dq) + model.gravity(q) + model.mass_matrix(q) @ wanted
@@ -291,7 +291,7 @@ def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
     scenario = ij.with_parts(
         paper, controller=PowerOfE2(K2=5.0, c=2.0), observer=ij.observers.NoObserver()
     )
-    tube = scenario.setting.tube(jnp.zeros(()))
+    tube = scenario.context.tube(jnp.zeros(()))
     scenario = ij.with_parts(scenario, initial=ij.Initial(tube.q_d, tube.dq_d))  # e2 = 0
     run = ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=100)
     assert run.ok

@@ -133,10 +133,10 @@ def test_a_users_law_is_kept_by_its_parameters(short_run):
     class Mine:
         gain: jax.Array = ij.leaf("1")
 
-        def init(self, q, dq, setting):
+        def init(self, q, dq, context):
             return ()
 
-        def command(self, t, q, dq, f_hat, setting, state):
+        def command(self, t, q, dq, f_hat, context, state):
             raise NotImplementedError
 
     run = dataclasses.replace(

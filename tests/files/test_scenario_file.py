@@ -143,11 +143,11 @@ def test_users_classes_are_refused_until_they_have_a_name(paper, monkeypatch):
         factor: jax.Array = ij.leaf("1", shape="scalar", default=2.0)
         label: str = ij.static(default="twice")
 
-        def init(self, q, dq, setting):
-            return self.inner.init(q, dq, setting)
+        def init(self, q, dq, context):
+            return self.inner.init(q, dq, context)
 
-        def command(self, t, q, dq, f_hat, setting, state):
-            command, rate = self.inner.command(t, q, dq, f_hat, setting, state)
+        def command(self, t, q, dq, f_hat, context, state):
+            command, rate = self.inner.command(t, q, dq, f_hat, context, state)
             return command._replace(tau=self.factor * command.tau), rate
 
     mine = dataclasses.replace(paper, controller=Doubled(paper.controller))

@@ -38,7 +38,7 @@ ONLY_IN = {
     "matplotlib": ("plotting",),
     "optax": ("tuning",),
     "argparse": ("cli",),
-    "mujoco": ("robots", "deployment"),
+    "mujoco": ("world", "deployment"),
     "xarray": ("files", "studies", "identification", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""

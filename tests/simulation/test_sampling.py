@@ -51,12 +51,12 @@ class Independent:
 
     def __init__(self, scenario):
         self.scenario = scenario
-        plant, model, setting = scenario.plant, scenario.model, scenario.setting
+        plant, model, context = scenario.plant, scenario.model, scenario.context
 
         @jax.jit
         def law(t, q, dq, eta):
             f_hat = eta + scenario.observer.kf * (model.mass_matrix(q) @ dq)
-            command, _ = scenario.controller.command(t, q, dq, f_hat, setting, ())
+            command, _ = scenario.controller.command(t, q, dq, f_hat, context, ())
             # (3.11), corrected, whose rate is linear in eta
             rest = (
                 command.tau

@@ -183,13 +183,13 @@ class Bang:
 
     size: object = ij.leaf("N m", default=0.1)
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        tube = setting.tube(t)
+    def command(self, t, q, dq, f_hat, context, state):
+        tube = context.tube(t)
         never = jnp.zeros(q.shape, bool)
-        tau = setting.model.gravity(q) - self.size * jnp.sign(q - tube.q_d)
+        tau = context.model.gravity(q) - self.size * jnp.sign(q - tube.q_d)
         return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
 
 
@@ -311,15 +311,15 @@ class Wavy:
     high: object = ij.leaf("1", shape="scalar", default=1.23)
     damping: object = ij.leaf("N m s/rad", shape="scalar", default=4000.0)
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        tube, L = setting.tube(t), jnp.log(self.k)
+    def command(self, t, q, dq, f_hat, context, state):
+        tube, L = context.tube(t), jnp.log(self.k)
         Kp = 60.0 * jnp.maximum(1.0 + 2.0 * L + 0.7 * L**2, 0.05)
         in_band = (self.k > self.low) & (self.k < self.high) | (self.k > 1.4) & (self.k < 1.6)
         Kd = jnp.where(in_band, self.damping, 20.0)
-        tau = setting.model.gravity(q) - Kp * (q - tube.q_d) - Kd * (dq - tube.dq_d)
+        tau = context.model.gravity(q) - Kp * (q - tube.q_d) - Kd * (dq - tube.dq_d)
         never = jnp.zeros(q.shape, bool)
         return controllers.Command(tau, tube.dq_d, jnp.zeros_like(q), never, never), ()
 

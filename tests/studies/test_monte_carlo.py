@@ -180,12 +180,12 @@ def test_a_law_and_a_distribution_from_a_notebook():
 
         Kd: jax.Array = ij.leaf("N m s/rad", sign="positive")
 
-        def init(self, q, dq, setting):
+        def init(self, q, dq, context):
             return ()
 
-        def command(self, t, q, dq, f_hat, setting, state):
+        def command(self, t, q, dq, f_hat, context, state):
             never = jnp.zeros(q.shape, bool)
-            tau = setting.model.gravity(q) - self.Kd * dq - f_hat
+            tau = context.model.gravity(q) - self.Kd * dq - f_hat
             return (
                 ij.controllers.Command(tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never),
                 state,

@@ -28,13 +28,13 @@ class PlainLaw:
 
     gain: jax.Array
 
-    def init(self, q, dq, setting):
+    def init(self, q, dq, context):
         return ()
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        tube = setting.tube(t)
+    def command(self, t, q, dq, f_hat, context, state):
+        tube = context.tube(t)
         tau = (
-            setting.model.gravity(q)
+            context.model.gravity(q)
             - self.gain * (q - tube.q_d)
             - 0.2 * self.gain * (dq - tube.dq_d)
         )
@@ -93,8 +93,8 @@ def test_missing_methods_are_listed_with_their_meaning():
     rejects(
         ij.testing.check_law,
         Nothing(),
-        "command(t, q, dq, f_hat, setting, state) is missing",
-        "init(q, dq, setting) is missing",
+        "command(t, q, dq, f_hat, context, state) is missing",
+        "init(q, dq, context) is missing",
     )
     rejects(
         ij.testing.check_fold, Nothing(), "'units' is missing", "update(acc, sample) is missing"
@@ -276,9 +276,9 @@ def test_broken_law():
 def unguarded(reach):
     """A law with a root that has no real value for |xi| > reach."""
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        command, state = PlainLaw.command(self, t, q, dq, f_hat, setting, state)
-        xi = setting.tube(t).xi(q) / reach
+    def command(self, t, q, dq, f_hat, context, state):
+        command, state = PlainLaw.command(self, t, q, dq, f_hat, context, state)
+        xi = context.tube(t).xi(q) / reach
         return command._replace(tau=command.tau - xi / jnp.sqrt(1 - xi**2)), state
 
     return changed(PlainLaw, command=command)(3.0)
@@ -290,10 +290,10 @@ def published(power=1.0, delta=0.0):
     def slope(tube, x):
         return jnp.log(tube.k_u / tube.k_l * (tube.k_l + x) / (tube.k_u - x))
 
-    def command(self, t, q, dq, f_hat, setting, state):
-        tube, model = setting.tube(t), setting.model
+    def command(self, t, q, dq, f_hat, context, state):
+        tube, model = context.tube(t), context.model
         alpha = tube.dq_d - 2.0 * (q - tube.q_d)
-        slow, fast = setting.speed_limits(t)
+        slow, fast = context.speed_limits(t)
         e2 = dq - alpha
         inner = tube._replace(q_d=alpha, lower=slow, upper=fast)
         powered = (
@@ -332,13 +332,13 @@ def test_an_infinite_derivative_in_e2_is_named():
 class Stating(PlainLaw):
     """A law that states a claim: a damped spring's energy, and what its damper takes."""
 
-    def lyapunov(self, t, q, dq, f_tilde, setting, state):
-        tube = setting.tube(t)
+    def lyapunov(self, t, q, dq, f_tilde, context, state):
+        tube = context.tube(t)
         return (
-            0.5 * dq * (setting.model.mass_matrix(q) @ dq) + 0.5 * self.gain * (q - tube.q_d) ** 2
+            0.5 * dq * (context.model.mass_matrix(q) @ dq) + 0.5 * self.gain * (q - tube.q_d) ** 2
         )
 
-    def decay(self, t, q, dq, f_tilde, setting, state):
+    def decay(self, t, q, dq, f_tilde, context, state):
         return 0.2 * self.gain * dq**2
 
 
@@ -359,14 +359,14 @@ def test_broken_claims_of_a_law():
     with pytest.raises(
         ContractError,
         match=(
-            r"decay\(t, q, dq, f_tilde, setting, state\) gives .*must be an array of shape \(\) or"
+            r"decay\(t, q, dq, f_tilde, context, state\) gives .*must be an array of shape \(\) or"
             r" \(2,\)"
         ),
     ):
         claims_of(wide(3.0))
     terms = changed(
         Stating,
-        disturbance_terms=lambda self, t, q, dq, f_tilde, df, setting, state: df.astype("float64"),
+        disturbance_terms=lambda self, t, q, dq, f_tilde, df, context, state: df.astype("float64"),
     )
     with pytest.raises(ContractError, match=r"disturbance_terms.* gives float64 for float32"):
         claims_of(terms(3.0))
@@ -605,7 +605,7 @@ def test_the_number_of_joints_is_that_of_the_leaves(n):
     assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
     scenario = scenario_of(n)
     assert scenario.n == n
-    tube = scenario.setting.tube(jnp.asarray(0.0))
+    tube = scenario.context.tube(jnp.asarray(0.0))
     assert bool(
         jnp.all(
             (tube.lower < tube.q_d)

@@ -136,7 +136,7 @@ def test_the_torque_is_that_of_every_set_of_active_rows(rng):
     q, v = rng.uniform([0.8, 0.9], [1.2, 1.6], (60, 2)), rng.uniform(-1.5, 1.5, (60, 2))
     law, zero = scenario.controller, jnp.zeros(2)
     found = jax.jit(
-        jax.vmap(lambda q, v: law.command(zero[0], q, v, zero, scenario.setting, ())[0])
+        jax.vmap(lambda q, v: law.command(zero[0], q, v, zero, scenario.context, ())[0])
     )(q, v)
     np.testing.assert_array_equal(found.slack, 0.0)
     np.testing.assert_array_equal(found.region_slack, 0.0)
@@ -208,7 +208,7 @@ def test_too_little_torque_breaks_them_and_says_by_how_much():
     np.testing.assert_allclose(run.metrics.largest_region_slack, run.region_slack.max(axis=0))
     assert float(np.max(run.metrics.largest_region_slack)) > 0.1
     assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([3.0, 1.0]) * (1 + 1e-9))
-    at = scenario.setting.regions_along(run.q[1], run.dq[1])
+    at = scenario.context.regions_along(run.q[1], run.dq[1])
     model, law = scenario.model, scenario.controller
     ddq = np.linalg.solve(
         model.mass_matrix(run.q[1]),

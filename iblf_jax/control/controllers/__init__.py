@@ -4,8 +4,8 @@ by name.
 
 from iblf_jax.control.controllers._base import Command as Command
 from iblf_jax.control.controllers._base import Controller as Controller
+from iblf_jax.control.controllers._base import LawContext as LawContext
 from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
-from iblf_jax.control.controllers._base import Setting as Setting
 from iblf_jax.control.controllers._base import State as State
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping as Backstepping
@@ -21,6 +21,9 @@ from iblf_jax.control.controllers.surface_barrier import SurfaceBarrier as Surfa
 from iblf_jax.control.controllers.systems import KEEPERS as KEEPERS
 from iblf_jax.control.controllers.systems import LAWS as LAWS
 from iblf_jax.control.controllers.systems import law_by_name as law_by_name
+
+Setting = LawContext
+"""The name that earlier versions gave `LawContext`."""
 
 MEMBERS = {
     "backstepping": Backstepping,
@@ -47,6 +50,7 @@ __all__ = [
     "Controller",
     "DynamicSurface",
     "FullState",
+    "LawContext",
     "LyapunovLaw",
     "PDGravity",
     "ReferenceGovernor",

@@ -1,6 +1,6 @@
 """The contract of a tracking law.
 
-A law knows the model, the reference and the bounds (its `Setting`), measures q and q', is given the
+A law knows the model, the reference and the bounds (its `LawContext`), measures q and q', is given the
 observer's estimate, and commands a torque.  Everything else that it returns is there to be looked
 at: its virtual velocity alpha, its Lyapunov function V1, whether a guard or a limit was at work.
 """
@@ -21,7 +21,7 @@ State = Any
 """A pytree of arrays; `()` for a law without memory."""
 
 
-class Setting(NamedTuple):
+class LawContext(NamedTuple):
     """What a law knows of the world; of bounds on the velocities, and of regions, if there are
     any.
     """
@@ -84,16 +84,16 @@ class Controller(Protocol):
     A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it
       works ("k1", "K2" if it says nothing),
     which `compare` scales together; `uses_observer = False` if it has no use for f_hat;
-    `needs_velocity_bounds = True` if it cannot do without `Setting.velocity_bounds`; `includes_e2 =
+    `needs_velocity_bounds = True` if it cannot do without `LawContext.velocity_bounds`; `includes_e2 =
     True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2; `filters =
     True` if its commands have a `slack`; `wraps`, the name of the field that holds another law
     whose paths are then its own ("controller.K2" reaches through); `unit_factors`, the names of
     leaves that only multiply, of which it may be compiled in which numbers are 1
-    (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(setting)`,
+    (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(context)`,
       which raises ValueError for what does not fit together where the number of joints is known,
       and `leaf_units()`, the units of leaves that depend on other fields, by name.
 
-    A law whose command jumps declares where: `switching(t, q, dq, setting, state)` returns (m,)
+    A law whose command jumps declares where: `switching(t, q, dq, context, state)` returns (m,)
       functions of q or q', and the command
     jumps where one of them crosses 0 (as sliding-mode laws do, or `FullState` with some barriers).
     The derivatives of a run then contain what such a jump does to a perturbation
@@ -101,7 +101,7 @@ class Controller(Protocol):
     call on with `switching_functions`.
     """
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """State at the start of a run, given q [rad] and dq [rad/s] there; `()` for most laws."""
         ...
 
@@ -111,7 +111,7 @@ class Controller(Protocol):
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: State,
     ) -> tuple[Command, State]:
         """The command, and the rate of the law's own state (same structure as the state).
@@ -120,20 +120,20 @@ class Controller(Protocol):
           t: time, () [s].
           q, dq: position [rad] and velocity [rad/s], (n,).
           f_hat: the observer's estimate of the uncertain term, (n,) [N m].
-          setting: model, reference and bounds.
+          context: model, reference and bounds.
           state: the law's own state.
         """
         ...
 
 
 def switching_functions(
-    law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State
+    law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
 ) -> jax.Array | None:
     """The functions at whose zeros a law's command jumps, (m,), or None if it declares none;
     arguments as `Controller.command`.
     """
     declared = getattr(law, "switching", None)
-    return None if declared is None else declared(t, q, dq, setting, state)
+    return None if declared is None else declared(t, q, dq, context, state)
 
 
 class LyapunovLaw(Protocol):
@@ -154,7 +154,7 @@ class LyapunovLaw(Protocol):
         q: jax.Array,
         dq: jax.Array,
         f_tilde: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: State,
     ) -> jax.Array:
         """V >= 0, () or (n,).
@@ -164,7 +164,7 @@ class LyapunovLaw(Protocol):
           q, dq: position [rad] and velocity [rad/s], (n,).
           f_tilde: error of the observer's estimate, f - f_hat, (n,) [N m]; f itself for a law with
             `uses_observer = False`.
-          setting: model, reference and bounds.
+          context: model, reference and bounds.
           state: the law's own state.
         """
         ...
@@ -175,7 +175,7 @@ class LyapunovLaw(Protocol):
         q: jax.Array,
         dq: jax.Array,
         f_tilde: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: State,
     ) -> jax.Array:
         """W >= 0, () or (n,), in the unit of V a second: how fast V decreases where f_tilde = 0.
@@ -190,14 +190,14 @@ class LyapunovLaw(Protocol):
         dq: jax.Array,
         f_tilde: jax.Array,
         df: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: State,
     ) -> jax.Array:
         """T, () or (n,), in the unit of V a second: what f_tilde and f' may add to V'.  A law may
         leave this method out.
 
         Args:
-          t, q, dq, f_tilde, setting, state: as `lyapunov`.
+          t, q, dq, f_tilde, context, state: as `lyapunov`.
           df: rate of the uncertain term, f', (n,) [N m/s].
         """
         ...

@@ -29,7 +29,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Log
 from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_o, fit_weight, weight_unit
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -94,7 +94,7 @@ class AdaptiveRBF:
         """The unit of the weight, which depends on the barrier."""
         return {"weight": weight_unit(self.barrier)}
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> jax.Array:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> jax.Array:
         """W_hat(0) = 0, (nodes, n) [N m]."""
         return jnp.zeros((self.nodes, q.size), q.dtype)
 
@@ -117,12 +117,12 @@ class AdaptiveRBF:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: jax.Array,
     ) -> tuple[Command, jax.Array]:
         """The torque, what belongs to it, and W_hat'."""
-        alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
-        tube, e2 = setting.tube(t), dq - alpha
+        alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
+        tube, e2 = context.tube(t), dq - alpha
         S = self.basis(q, dq, alpha, dalpha)
         learned = jnp.sum(S[:, None] * state, axis=0)
         tau = learned - self.K2 * e2 - self.weight * self.barrier.slope(tube, q)

@@ -27,7 +27,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import CLAIMS, guard_is_active, value_unit
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -98,7 +98,7 @@ class Backstepping:
         )
         return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost: {rest}."]
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
         """No state."""
         return ()
 
@@ -108,12 +108,12 @@ class Backstepping:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque (3.14) and what belongs to it."""
-        alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
-        tube, model = setting.tube(t), setting.model
+        alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
+        tube, model = context.tube(t), context.model
         carried = alpha if self.reading == "corrected" else dq
         feedforward = (
             model.coriolis(q, dq, carried) + model.gravity(q) + matvec(model.mass_matrix(q), dalpha)
@@ -158,13 +158,13 @@ def weight_unit(barrier: Barrier) -> str:
 
 
 def alpha_and_rate(
-    law, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting
+    law, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
 ) -> tuple[jax.Array, jax.Array]:
     """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,),
     for a law with `barrier`, `k1`, `o`.
     """
 
     def alpha_at(t, q):
-        return law.barrier.virtual_velocity(setting.tube(t, acceleration=False), q, law.k1, law.o)
+        return law.barrier.virtual_velocity(context.tube(t, acceleration=False), q, law.k1, law.o)
 
     return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))

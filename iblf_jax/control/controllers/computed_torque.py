@@ -11,7 +11,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
 
@@ -33,7 +33,7 @@ class ComputedTorque:
     Kd: Leaf = leaf("1/s", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
         """No state."""
         return ()
 
@@ -43,11 +43,11 @@ class ComputedTorque:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
-        tube, model = setting.tube(t), setting.model
+        tube, model = context.tube(t), context.model
         e1, de1 = q - tube.q_d, dq - tube.dq_d
         accelerate = matvec(model.mass_matrix(q), tube.ddq_d - self.Kd * de1 - self.Kp * e1)
         tau = accelerate + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import fit_o, fit_weight, weight_unit
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -76,15 +76,15 @@ class DynamicSurface:
         """The unit of the weight, which depends on the barrier."""
         return {"weight": weight_unit(self.barrier)}
 
-    def _alpha(self, t: jax.Array, q: jax.Array, setting: Setting) -> jax.Array:
+    def _alpha(self, t: jax.Array, q: jax.Array, context: LawContext) -> jax.Array:
         """Alpha, (n,) [rad/s]."""
         return self.barrier.virtual_velocity(
-            setting.tube(t, acceleration=False), q, self.k1, self.o
+            context.tube(t, acceleration=False), q, self.k1, self.o
         )
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> jax.Array:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> jax.Array:
         """beta(0) = alpha(0), (n,) [rad/s]."""
-        return self._alpha(jnp.zeros((), q.dtype), q, setting)
+        return self._alpha(jnp.zeros((), q.dtype), q, context)
 
     def command(
         self,
@@ -92,12 +92,12 @@ class DynamicSurface:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: jax.Array,
     ) -> tuple[Command, jax.Array]:
         """The torque, what belongs to it, and beta'."""
-        tube, model, beta = setting.tube(t), setting.model, state
-        dbeta = (self._alpha(t, q, setting) - beta) / self.filter
+        tube, model, beta = context.tube(t), context.model, state
+        dbeta = (self._alpha(t, q, context) - beta) / self.filter
         feedforward = (
             model.coriolis(q, dq, beta) + model.gravity(q) + matvec(model.mass_matrix(q), dbeta)
         )

@@ -57,7 +57,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import CLAIMS, guard_is_active, ratio_jumps, value_unit
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_weight
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -161,22 +161,22 @@ class FullState:
         """The unit of the weight, by those of V1 and phi."""
         return {"weight": WEIGHT_UNITS[value_unit(self.barrier), value_unit(self.velocity_barrier)]}
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
         """No state."""
         return ()
 
     def tubes(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
     ) -> tuple[Tube, Tube]:
         """The tube of q around the reference, and that of q' around alpha; in the latter
         "positions" are velocities.
         """
-        alpha, dalpha = alpha_and_rate(self, t, q, dq, setting)
-        (lower, upper), (dlower, dupper) = jax.jvp(setting.speed_limits, (t,), (jnp.ones_like(t),))
-        return setting.tube(t), Tube(alpha, dalpha, lower, upper, dlower, dupper)
+        alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
+        (lower, upper), (dlower, dupper) = jax.jvp(context.speed_limits, (t,), (jnp.ones_like(t),))
+        return context.tube(t), Tube(alpha, dalpha, lower, upper, dlower, dupper)
 
     def switching(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: tuple[()]
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: tuple[()]
     ) -> jax.Array | None:
         """e2 = q' - alpha, (n,) [rad/s], where the torque jumps at e2 = 0; None for a velocity
         barrier without a jump.
@@ -184,7 +184,7 @@ class FullState:
         if not ratio_jumps(self.velocity_barrier):
             return None
         alpha = self.barrier.virtual_velocity(
-            setting.tube(t, acceleration=False), q, self.k1, self.o
+            context.tube(t, acceleration=False), q, self.k1, self.o
         )
         return dq - alpha
 
@@ -194,11 +194,11 @@ class FullState:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it; V1 is V1 + phi."""
-        (outer, inner), model = self.tubes(t, q, dq, setting), setting.model
+        (outer, inner), model = self.tubes(t, q, dq, context), context.model
         first, second = self.barrier, self.velocity_barrier
         a2 = second.virtual_velocity(inner, dq, self.K2, self.o)
         ratio: Any = second.error_over_slope(inner, dq)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -30,7 +30,7 @@ class PDGravity:
     Kd: Leaf = leaf("N m s/rad", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
         """No state."""
         return ()
 
@@ -40,12 +40,12 @@ class PDGravity:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
-        tube = setting.tube(t)
+        tube = context.tube(t)
         e1, de1 = q - tube.q_d, dq - tube.dq_d
-        tau = setting.model.gravity(q) - self.Kp * e1 - self.Kd * de1 - f_hat
+        tau = context.model.gravity(q) - self.Kp * e1 - self.Kd * de1 - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * self.Kp * e1**2, never, never), ()

@@ -27,7 +27,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, Controller, Setting, switching_functions
+from iblf_jax.control.controllers._base import Command, Controller, LawContext, switching_functions
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
@@ -99,33 +99,33 @@ class ReferenceGovernor:
                 remedy,
             )
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> GovernorState:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> GovernorState:
         """g(0) = q(0), moved inside the margin where it is not."""
-        low, high = self._walls(jnp.zeros((), q.dtype), setting)
-        return GovernorState(jnp.minimum(jnp.maximum(q, low), high), self.law.init(q, dq, setting))
+        low, high = self._walls(jnp.zeros((), q.dtype), context)
+        return GovernorState(jnp.minimum(jnp.maximum(q, low), high), self.law.init(q, dq, context))
 
-    def _walls(self, t: jax.Array, setting: Setting) -> tuple[jax.Array, jax.Array]:
+    def _walls(self, t: jax.Array, context: LawContext) -> tuple[jax.Array, jax.Array]:
         """The bounds less the margin, (n,) each [rad]."""
-        tube = setting.tube(t, acceleration=False)
+        tube = context.tube(t, acceleration=False)
         return tube.lower + self.margin, tube.upper - self.margin
 
-    def energy(self, q: jax.Array, dq: jax.Array, g: jax.Array, setting: Setting) -> jax.Array:
+    def energy(self, q: jax.Array, dq: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """V, () [N m for PD, rad^2/s^2 for computed torque]."""
         law: Any = self.law
-        moving = matvec(setting.model.mass_matrix(q), dq) if isinstance(law, PDGravity) else dq
+        moving = matvec(context.model.mass_matrix(q), dq) if isinstance(law, PDGravity) else dq
         return 0.5 * (inner(dq, moving) + jnp.sum(law.Kp * (q - g) ** 2))
 
-    def level(self, t: jax.Array, g: jax.Array, setting: Setting) -> jax.Array:
+    def level(self, t: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """Gamma, () in the unit of V; 0 for a g outside."""
         law: Any = self.law
-        low, high = self._walls(t, setting)
+        low, high = self._walls(t, context)
         return 0.5 * jnp.min(law.Kp * jnp.maximum(jnp.minimum(g - low, high - g), 0.0) ** 2)
 
     def switching(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: GovernorState
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: GovernorState
     ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
-        governed = setting._replace(reference=_AtRest(state.g))
+        governed = context._replace(reference=_AtRest(state.g))
         return switching_functions(self.law, t, q, dq, governed, state.law)
 
     def command(
@@ -134,20 +134,20 @@ class ReferenceGovernor:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: GovernorState,
     ) -> tuple[Command, GovernorState]:
         """The law's command for the reference g, and the rates of g and of the law's state."""
-        g, (low, high) = state.g, self._walls(t, setting)
+        g, (low, high) = state.g, self._walls(t, context)
         command, rate = self.law.command(
-            t, q, dq, f_hat, setting._replace(reference=_AtRest(g)), state.law
+            t, q, dq, f_hat, context._replace(reference=_AtRest(g)), state.law
         )
-        away = setting.reference.position(t) - g
+        away = context.reference.position(t) - g
         # The square root has no slope at 0, where the attraction is away/width.
         square, near = inner(away, away), jnp.min(self.width) ** 2
         attraction = away / jnp.sqrt(jnp.maximum(square, near))
         repulsion = jnp.maximum(1.0 - (g - low) / self.width, 0.0) - jnp.maximum(
             1.0 - (high - g) / self.width, 0.0
         )
-        free = jnp.maximum(self.level(t, g, setting) - self.energy(q, dq, g, setting), 0.0)
+        free = jnp.maximum(self.level(t, g, context) - self.energy(q, dq, g, context), 0.0)
         return command, GovernorState(self.eta * free * (attraction + repulsion), rate)

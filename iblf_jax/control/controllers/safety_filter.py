@@ -37,7 +37,7 @@ import jax.numpy as jnp
 from iblf_jax.control.controllers._base import (
     Command,
     Controller,
-    Setting,
+    LawContext,
     State,
     switching_functions,
 )
@@ -107,22 +107,22 @@ class SafetyFilter:
         """The wrapped law's."""
         return getattr(self.law, "advice", list)()
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""
-        return self.law.init(q, dq, setting)
+        return self.law.init(q, dq, context)
 
     def box(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
     ) -> tuple[jax.Array, jax.Array]:
         """The accelerations that the conditions allow, lowest and highest, (n,) each [rad/s^2]."""
         lowest, highest = (
             ddside + self._room(side - q, dside - dq)
-            for side, dside, ddside in _moving_bounds(t, setting)
+            for side, dside, ddside in _moving_bounds(t, context)
         )
         if self.margin is not None:
             lowest, highest = lowest + self.margin, highest - self.margin
-        if setting.velocity_bounds is not None:
-            (slow, fast), (dslow, dfast) = jax.jvp(setting.speed_limits, (t,), (jnp.ones_like(t),))
+        if context.velocity_bounds is not None:
+            (slow, fast), (dslow, dfast) = jax.jvp(context.speed_limits, (t,), (jnp.ones_like(t),))
             lowest = jnp.maximum(lowest, dslow + self.a3 * (slow - dq))
             highest = jnp.minimum(highest, dfast + self.a3 * (fast - dq))
         return lowest, highest
@@ -138,10 +138,10 @@ class SafetyFilter:
         return self.a1 * dA * dh + self.a2 * (z if self.shape2 == "linear" else z**3)
 
     def switching(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
-        return switching_functions(self.law, t, q, dq, setting, state)
+        return switching_functions(self.law, t, q, dq, context, state)
 
     def command(
         self,
@@ -149,21 +149,21 @@ class SafetyFilter:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: State,
     ) -> tuple[Command, State]:
         """The wrapped law's command with its torque filtered, and the slack."""
-        command, rate = self.law.command(t, q, dq, f_hat, setting, state)
-        model, asked = setting.model, command.tau
+        command, rate = self.law.command(t, q, dq, f_hat, context, state)
+        model, asked = context.model, command.tau
         M = model.mass_matrix(q)
         planned = solve_spd(M, asked + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
-        lowest, highest = self.box(t, q, dq, setting)
-        if self.nearest == "acceleration" and self.limit is None and not setting.regions:
+        lowest, highest = self.box(t, q, dq, context)
+        if self.nearest == "acceleration" and self.limit is None and not context.regions:
             # An empty box is broken on both sides alike.
             slack = jnp.maximum(0.5 * (lowest - highest), 0.0)
             wanted = jnp.clip(planned, lowest - slack, highest + slack)
             return command._replace(tau=asked + matvec(M, wanted - planned), slack=slack), rate
-        unit = jnp.eye(setting.model.n, dtype=asked.dtype)
+        unit = jnp.eye(context.model.n, dtype=asked.dtype)
         # What is looked for is the change of the torque or of the acceleration; the columns say
         # what it does to both.
         torque, acceleration = (
@@ -172,8 +172,8 @@ class SafetyFilter:
             else (M, unit)
         )
         rows = [(acceleration, highest - planned, 1.0), (-acceleration, planned - lowest, 1.0)]
-        if setting.regions:
-            at = setting.regions_along(q, dq)
+        if context.regions:
+            at = context.regions_along(q, dq)
             room = (
                 matvec(at.slope, planned)
                 + at.bend
@@ -187,7 +187,7 @@ class SafetyFilter:
             saturated = saturated | (jnp.abs(asked) > self.limit)
         found = _nearest(rows)
         region_slack = (
-            found.slack[2 * len(q) : 2 * len(q) + len(setting.regions)] if setting.regions else ()
+            found.slack[2 * len(q) : 2 * len(q) + len(context.regions)] if context.regions else ()
         )
         slack = jnp.maximum(found.slack[: len(q)], found.slack[len(q) : 2 * len(q)])
         tau = asked + matvec(torque, found.x)
@@ -209,14 +209,16 @@ def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:
     return Solution(*(jnp.where(free, 0.0, x) for x in found))
 
 
-def _moving_bounds(t: jax.Array, setting: Setting) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
+def _moving_bounds(
+    t: jax.Array, context: LawContext
+) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
     """Lower and upper bound of q, each with its first and second rate, (n,) [rad], [rad/s],
     [rad/s^2].
     """
 
     def sides(t):
-        q_d = setting.reference.position(t)
-        return setting.bounds.lower.at(t, q_d), setting.bounds.upper.at(t, q_d)
+        q_d = context.reference.position(t)
+        return context.bounds.lower.at(t, q_d), context.bounds.upper.at(t, q_d)
 
     def rates(t):
         return jax.jvp(sides, (t,), (jnp.ones_like(t),))[1]

@@ -15,7 +15,7 @@ import numpy as np
 from iblf_jax.control.controllers._base import (
     Command,
     Controller,
-    Setting,
+    LawContext,
     State,
     switching_functions,
 )
@@ -57,15 +57,15 @@ class Saturated:
         """The wrapped law's."""
         return getattr(self.law, "advice", list)()
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> State:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""
-        return self.law.init(q, dq, setting)
+        return self.law.init(q, dq, context)
 
     def switching(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, setting: Setting, state: State
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
     ) -> jax.Array | None:
         """Where the wrapped law's command jumps."""
-        return switching_functions(self.law, t, q, dq, setting, state)
+        return switching_functions(self.law, t, q, dq, context, state)
 
     def command(
         self,
@@ -73,13 +73,13 @@ class Saturated:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: State,
     ) -> tuple[Command, State]:
         """The wrapped law's command with its torque limited; `saturated` says where it asked for
         more than the limit.
         """
-        command, rate = self.law.command(t, q, dq, f_hat, setting, state)
+        command, rate = self.law.command(t, q, dq, f_hat, context, state)
         asked = command.tau
         tau = (
             jnp.clip(asked, -self.limit, self.limit)

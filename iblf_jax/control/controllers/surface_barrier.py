@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, PrescribedPerformance
 from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
-from iblf_jax.control.controllers._base import Command, Setting
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Bounds, Tube
@@ -74,9 +74,9 @@ class SurfaceBarrier:
                 "Such as Bounds(lower=..., upper=...).",
             )
 
-    def check_start(self, setting: Setting) -> None:
+    def check_start(self, context: LawContext) -> None:
         """Raises ValueError for bounds of the surface that do not have 0 between them at t = 0."""
-        zero = jnp.zeros(setting.model.n, self.a.dtype)
+        zero = jnp.zeros(context.model.n, self.a.dtype)
         lower, upper = (side.at(zero[0], zero) for side in (self.surface.lower, self.surface.upper))
         if not (jnp.all(lower < 0) and jnp.all(upper > 0)):
             raise checks.fail(
@@ -86,7 +86,7 @@ class SurfaceBarrier:
                 "Exchange or widen them.",
             )
 
-    def init(self, q: jax.Array, dq: jax.Array, setting: Setting) -> tuple[()]:
+    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
         """No state."""
         return ()
 
@@ -96,11 +96,11 @@ class SurfaceBarrier:
         q: jax.Array,
         dq: jax.Array,
         f_hat: jax.Array,
-        setting: Setting,
+        context: LawContext,
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
-        outer, zero = setting.tube(t), jnp.zeros_like(q)
+        outer, zero = context.tube(t), jnp.zeros_like(q)
         alpha = outer.dq_d - self.a * (q - outer.q_d)
         sigma = dq - alpha
         # A slope needs no rates of the bounds.
