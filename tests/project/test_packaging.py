@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
+import json
 import re
 import sys
 import tomllib
@@ -79,6 +80,16 @@ def test_workflows_use_a_python_of_the_classifiers():
     ]
     assert used
     assert {tuple(map(int, version.split("."))) for version in used} <= set(CLASSIFIED)
+
+
+def test_the_tests_run_on_every_python_with_and_without_extras():
+    workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text()
+    lists = re.findall(r"^ +(python|extras): (\[.*\])$", workflow, re.MULTILINE)
+    matrix = {name: json.loads(values) for name, values in lists}
+    assert [tuple(map(int, version.split("."))) for version in matrix["python"]] == CLASSIFIED
+    all_extras = {"test", "sweep", "robots", "export", "docs", "bench"}
+    assert [set(extras.split(",")) for extras in matrix["extras"]] == [{"test"}, all_extras]
+    assert all_extras <= set(PROJECT["optional-dependencies"])
 
 
 def test_every_import_is_declared():
