@@ -21,7 +21,7 @@ paper".
 **Published result**, according to the plots of the script: |x| and |w| over time; |w| falls below
 epsilon and remains there.
 
-**Not published:** how the load enters gravity and the Coriolis forces. In the script it changes the
+**Not printed:** how the load enters gravity and the Coriolis forces. In the script it changes the
 inertia only; in this example it increases the mass of the second link in all terms. The first part
 of the script has eta as above, and its time loop a tenth of it; this example uses the full value.
 

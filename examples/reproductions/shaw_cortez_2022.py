@@ -23,7 +23,7 @@ without it they violate all of them. The published figures show data files of th
 CSV file of this example has 28 instants of the run. The sources of this example are the program and
 its data, not the article.
 
-**Different from a planar arm:** M_11 of the program (two_dof_module.py, M_eval) contains a term
+**Not printed:** the inertia of a planar arm. M_11 of the program (two_dof_module.py, M_eval) contains a term
 2 m2 l1 (l2/2)^2 = 0.5 kg m^2 that a planar arm does not have. A constant in M_11 is equivalent to a
 moment of inertia of the first link, so the scenario has the value 1/12 + 0.5. With it, the torques
 of exp0 at the authors' states agree to 1e-14 N m.

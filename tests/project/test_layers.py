@@ -206,11 +206,11 @@ def test_no_leftovers():
 
 
 def test_these_tests_can_fail():
-    assert LAYER_OF["bounds"] == 1
+    assert LAYER_OF["world"] == 1
     assert LAYER_OF["engine"] == 4
-    assert upward("bounds", "from iblf_jax.engine.simulate import simulate") == {"engine"}
-    assert upward("bounds", "import iblf_jax.engine") == {"engine"}
-    assert upward("bounds", "from iblf_jax import engine") == {"engine"}
+    assert upward("world", "from iblf_jax.engine.simulate import simulate") == {"engine"}
+    assert upward("world", "import iblf_jax.engine") == {"engine"}
+    assert upward("world", "from iblf_jax import engine") == {"engine"}
     plot = "def plot(self):\n    from iblf_jax import plotting"
     assert upward("simulation", plot) == set()
     assert upward("simulation", plot, at_the_top=False) == {"plotting"}
@@ -222,7 +222,7 @@ def test_these_tests_can_fail():
         )
         == set()
     )
-    assert upward("engine", "from iblf_jax.bounds import Tube") == set()
+    assert upward("engine", "from iblf_jax.world.bounds import Tube") == set()
     assert imports("def f():\n    import optax.losses", at_the_top=False) == {"optax.losses"}
     assert calls(
         "import jax\nx = jax.lax.scan(f, 0, None)\njax.config.update('a', 1)", "jax.lax.scan"
