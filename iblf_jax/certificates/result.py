@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks, tables
+from iblf_jax.core.presentation import present
 
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
 OWN_INEQUALITY = "inequality, own V"
@@ -173,9 +174,7 @@ class Certificate:
         return "\n".join([*shown, *([self.omitted] if self.omitted else [])])
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
     def table_html(self) -> str:
         """The lines that apply as an HTML table, those that fail in bold, and below it why the
@@ -262,9 +261,7 @@ class Certificate:
         """V2 under its envelope, the inequality's left side, and the errors under their bounds.
         Options as `plotting.certificate`.
         """
-        from iblf_jax.plotting import certificates
-
-        return certificates.certificate(self, **options)
+        return present("certificate figure", self, **options)
 
 
 def _named(names: list[str]) -> str:
