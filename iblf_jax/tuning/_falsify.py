@@ -1,5 +1,5 @@
-"""`falsify`: searches for a run that violates its bounds, by derivatives over start, disturbance and
-plant within stated ranges.
+"""`falsify`: searches for a run that violates its bounds, by derivatives over start, disturbance
+and plant within stated ranges.
 
 Random runs seldom contain the worst case: in d dimensions its corner of the set is small.  Here the
 uniform number u in [0, 1]^d behind each perturbation is the unknown, and each of S attacks, which
@@ -45,7 +45,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import NUMBERS_A_RUN, Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import BACKENDS, Run, known_of, simulate, tangents_of_runs
+from iblf_jax.tuning.runs import RunRequest, check_backend, simulate, tangents_of_runs
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
@@ -155,7 +155,7 @@ def falsify(
     Source: head of this module.
     """
     tableau(method)
-    checks.one_of("backend", backend, BACKENDS)
+    check_backend(backend)
     steps = checks.whole_steps(duration, dt)
     scenario = canonical(scenario)
     check_step(scenario, dt)
@@ -170,8 +170,8 @@ def falsify(
     one: Any = 1.0
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
-    run = Run(steps, method, mechanism=known_of(scenario))
-    evaluate = MarginEvaluator(cube, peak, dt, run, backend, starts)
+    request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
+    evaluate = MarginEvaluator(cube, peak, dt, request, starts)
     unit = DEFICITS[peak.signal]
     with bar(progress, iterations + 1, unit="steps") as shown:
         _attack(cube, evaluate, seed, iterations, shown, unit)
@@ -233,16 +233,14 @@ class MarginEvaluator:
       cube: the set.
       peak: of the deficit that is minus the margin.
       dt: time step [s].
-      run, backend: steps and integrator, and on what they are executed.
+      request: what is run.
       starts: number S of attacks.
     """
 
-    def __init__(self, cube: Cube, peak: Peak, dt: float, run: Run, backend: str, starts: int):
+    def __init__(self, cube: Cube, peak: Peak, dt: float, request: RunRequest, starts: int):
         self.dtype = cube.cases.scenario.initial.q.dtype
         step = jnp.asarray(dt, self.dtype)
-        self.margins = partial(
-            _margins, cube, astype(peak, self.dtype), step, run=run, backend=backend
-        )
+        self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
         size = cube.size
         self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
         self.active = np.ones(starts, bool)
@@ -274,9 +272,9 @@ def _admissible(
     return accepted.copy()
 
 
-@partial(jax.jit, static_argnames=("run", "backend"))
+@partial(jax.jit, static_argnames="request")
 def _margins(
-    cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, run: Run, backend: str
+    cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, request: RunRequest
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Smallest margin (S,), minus the peak of a deficit, its gradient by u (S, d) and the status of
     each attack.
@@ -284,9 +282,7 @@ def _margins(
     varied = jax.vmap(cube.values)(u)
     jacobians = jax.vmap(jax.jacfwd(cube.values))(u)
     folds = (Quantities((peak,)),)
-    found = tangents_of_runs(
-        cube.cases.scenario, varied, jacobians, folds, dt, run, backend=backend
-    )
+    found = tangents_of_runs(cube.cases.scenario, varied, jacobians, folds, dt, request)
     deficits = found.outcome.metrics["tuning_pieces"]
     slopes = found.tangents["tuning_pieces"]
     worst = jnp.argmax(deficits, axis=1)

@@ -1,5 +1,5 @@
-"""`pareto`: the front of two objectives, for example tracking and effort: first its ends, then points
-in its largest gaps.
+"""`pareto`: the front of two objectives, for example tracking and effort: first its ends, then
+points in its largest gaps.
 
 With A = log risk_b[a_b], B = log risk_b[b_b], an end minimises one of them only,
 

@@ -280,7 +280,7 @@ def is_smoothed(objective: Objective) -> bool:
     )
 
 
-def has_price_on_torque(objective: Objective) -> bool:
+def depends_on_torque(objective: Objective) -> bool:
     """Whether a term or a requirement grows with the torque; a metric of the user's own is taken
     for one that does.
     """

@@ -144,7 +144,7 @@ def _solver(given: Any) -> Solver | None:
             return None
         checks.one_of("solver", given, ("auto", *SOLVERS))
         return SOLVERS[given]()
-    members = [x for x in (*vars(Solver), *Solver.__annotations__) if not x.startswith("_")]
+    members = [x for x in vars(Solver) if not x.startswith("_")]
     expected = f"a solver: one of {', '.join(map(repr, SOLVERS))}, or as ij.tuning.SQP()"
     checks.offers("solver", given, tuple(members), expected)
     return given

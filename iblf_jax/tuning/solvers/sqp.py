@@ -119,7 +119,7 @@ class Unknowns(NamedTuple):
     """Requirement -> column of t."""
     surplus: dict[int, np.ndarray]
     """Requirement -> columns of u, one a run with selected pieces."""
-    count: int
+    total: int
 
     @staticmethod
     def of(size: int, worst: tuple[int, ...], selected: list[Selected]) -> Unknowns:
@@ -176,16 +176,16 @@ def solve_subproblem(
     ]
     mean_rows = [_mean_row(unknowns, r, constraints.worst[r]) for r in unknowns.threshold]
     nonnegative = unknowns.nonnegative
-    signs = -np.eye(unknowns.count)[nonnegative]
-    bounds = np.eye(size, unknowns.count)
+    signs = -np.eye(unknowns.total)[nonnegative]
+    bounds = np.eye(size, unknowns.total)
     A = np.concatenate([*piece_rows, *mean_rows, signs, bounds, -bounds])
     limits = [-pieces[x.run, x.piece] - TARGET_EXCESS for x in selected]
     zeros = np.zeros(len(mean_rows) + len(nonnegative))
     b = np.concatenate([*limits, zeros, high, -low])
 
-    H = np.zeros((unknowns.count, unknowns.count))
+    H = np.zeros((unknowns.total, unknowns.total))
     H[unknowns.step, unknowns.step] = matrix
-    c = np.zeros(unknowns.count)
+    c = np.zeros(unknowns.total)
     c[unknowns.step] = gradient
     c[unknowns.violation] = penalty
     x, y = quadratic.solve(H, c, A, b)
@@ -213,7 +213,7 @@ def _piece_rows(
     unknowns: Unknowns, r: int, chosen: Selected, piece_gradients: np.ndarray
 ) -> np.ndarray:
     """Rows a_j.s - v_r, or a_j.s - t - u_b where the requirement is a mean of runs."""
-    rows = np.zeros((len(chosen.run), unknowns.count))
+    rows = np.zeros((len(chosen.run), unknowns.total))
     rows[:, unknowns.step] = piece_gradients[chosen.run, :, chosen.piece]
     if r not in unknowns.threshold:
         rows[:, unknowns.violation.start + r] = -1.0
@@ -226,7 +226,7 @@ def _piece_rows(
 
 def _mean_row(unknowns: Unknowns, r: int, k: int) -> np.ndarray:
     """The row t + sum_b u_b / k - v_r <= 0."""
-    row = np.zeros((1, unknowns.count))
+    row = np.zeros((1, unknowns.total))
     row[0, unknowns.threshold[r]] = 1.0
     row[0, unknowns.surplus[r]] = 1.0 / k
     row[0, unknowns.violation.start + r] = -1.0
