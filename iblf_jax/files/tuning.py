@@ -178,6 +178,7 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
         options["solver"] = _solver(table["solver"])
     if "report" in table:
         report = as_table(table["report"], "tune.report")
+        known_keys(report, "tune.report", [field.name for field in dataclasses.fields(Report)])
         options["report"] = components.construct(Report, dict(report), "tune.report")
     if "risk" in table:
         checks.one_of("tune.risk", table["risk"], KINDS)

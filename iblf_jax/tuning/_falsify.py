@@ -34,7 +34,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
-from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
@@ -45,7 +44,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import NUMBERS_A_RUN, Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import RunRequest, check_backend, simulate, tangents_of_runs
+from iblf_jax.tuning.runs import RunRequest, simulate, tangents_of_runs
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
@@ -94,7 +93,9 @@ class Attack:
         return simulate(self.scenario, record_every=record_every, **self.timing)
 
     def __repr__(self) -> str:
-        word = "FALSIFIED" if self.violated else "not falsified"
+        word = "not falsified"
+        if self.violated:
+            word = "FALSIFIED"
         lines = [
             f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g}"
             f" at random; {self.runs} runs)"
@@ -154,27 +155,36 @@ def falsify(
 
     Source: head of this module.
     """
-    tableau(method)
-    check_backend(backend)
     steps = checks.whole_steps(duration, dt)
     scenario = canonical(scenario)
+    request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
     check_step(scenario, dt)
-    starts = checks.positive_integer("starts", starts)
-    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
-    seed = checks.seed(seed)
-    checks.fits("iterations", iterations, 8 * starts)
+    starts, iterations, seed = _checked_sizes(starts, iterations, seed)
     cube = bounded(scenario, perturbations)
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     checks.one_of("margin", margin, MARGINS)
     one: Any = 1.0
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
-    request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
     evaluate = MarginEvaluator(cube, peak, dt, request, starts)
     unit = DEFICITS[peak.signal]
     with bar(progress, iterations + 1, unit="steps") as shown:
         _attack(cube, evaluate, seed, iterations, shown, unit)
+    timing = {"duration": duration, "dt": dt, "method": method}
+    return _result(cube, evaluate, timing, unit)
+
+
+def _checked_sizes(starts: Any, iterations: Any, seed: Any) -> tuple[int, int, int]:
+    """Number of attacks, of their steps, and the seed."""
+    starts = checks.positive_integer("starts", starts)
+    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    checks.fits("iterations", iterations, 8 * starts)
+    return starts, iterations, checks.seed(seed)
+
+
+def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any], unit: str) -> Attack:
+    """The worst run of all."""
     worst = evaluate.worst
     if worst is None:
         remedy = (
@@ -182,18 +192,18 @@ def falsify(
             " is too large: narrow the perturbations, widen the bounds, or take a smaller dt."
         )
         raise cube.nothing(remedy)
-    point = cube.values(jnp.asarray(worst.u, scenario.initial.q.dtype))
+    point = cube.values(jnp.asarray(worst.u, evaluate.dtype))
     values = {path: np.asarray(x) for path, x in point.items()}
     history = np.stack(evaluate.history)
     return Attack(
-        scenario=with_parameters(scenario, values),
+        scenario=with_parameters(cube.cases.scenario, values),
         values=values,
         margin=worst.margin,
         first_margin=next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row))),
         status=worst.status,
         history=history,
-        runs=starts * (iterations + 1),
-        timing={"duration": duration, "dt": dt, "method": method},
+        runs=history.size,
+        timing=timing,
         unit=unit,
     )
 

@@ -278,9 +278,10 @@ def _objective(problem: TuningProblem, candidate: Candidate, quantities: jax.Arr
 
 def _excesses(problem: TuningProblem, quantities: jax.Array) -> jax.Array:
     """G_r of each requirement, (n_requirements,)."""
+    if not problem.allowed:
+        return jnp.zeros((0,), quantities.dtype)
     each = jax.vmap(problem.objective.excesses)(quantities)
-    found = [worst_share(each[:, r], share) for r, share in enumerate(problem.allowed)]
-    return jnp.stack(found) if found else jnp.zeros((0,), quantities.dtype)
+    return jnp.stack([worst_share(each[:, r], share) for r, share in enumerate(problem.allowed)])
 
 
 def _augmentation(excess: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
@@ -311,7 +312,9 @@ def value_of_start(
     """
     fine = (status & int(UNTRUSTED) == 0) & jnp.all(jnp.isfinite(smooth), axis=-1)
     valid = jnp.all(fine)
-    risk = problem.risk if problem.on_front else Risk()
+    risk = Risk()  # the mean
+    if problem.on_front:
+        risk = problem.risk
     return Value(
         loss=jnp.where(valid, _loss(problem, candidate, smooth), jnp.inf),
         objective=_objective(problem, candidate, exact),

@@ -116,19 +116,17 @@ class TuningProblem:
         check_backend(backend)
         steps = checks.whole_steps(duration, dt)
         goal = checked(objective)
-        risk = as_risk(risk)
         seed = checks.seed(seed)
         runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
         scenario = canonical(scenario)
         check_step(scenario, float(dt))
-        perturbations = {} if perturbations is None else perturbations
+        if perturbations is None:
+            perturbations = {}
         targets, by_path = targets_of(scenario, perturbations)
         _check_runs(runs, bool(targets) or has_noise(scenario))
         blocks, box = layout(scenario, parameters, float(dt), method)
         checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
-        goal = for_scenario(goal, scenario)
-        check_signals(goal, scenario)
-        fit_joints(goal, scenario.n, "objective")
+        goal = _fitted(goal, scenario)
         # Terms without a scale are evaluated once with scale 1, for their values at the start.
         dtype = scenario.initial.q.dtype
         arrays = complete(goal, np.ones(len(goal.terms))), by_path, dt
@@ -144,7 +142,7 @@ class TuningProblem:
             targets=targets,
             runs=runs,
             request=RunRequest.of(scenario, steps=steps, method=method, backend=backend),
-            risk=risk,
+            risk=as_risk(risk),
             allowed=tuple(float(r.allowed) for r in goal.requirements),
             piece_counts=piece_counts(scaled, scenario, float(duration)),
             on_front=on_front,
@@ -244,7 +242,9 @@ class TuningProblem:
           trusted: share of the runs that can be integrated, at the best of these gains.
         """
         count = round(trusted * self.runs)
-        how_many = f"only {count} of {self.runs} runs" if count else "no run"
+        how_many = "no run"
+        if count:
+            how_many = f"only {count} of {self.runs} runs"
         remedy = (
             f"Take dt={self.suggested_dt():g}, not {float(self.dt):g} s (ij.recommended_dt), lower"
             " gains, or narrower perturbations."
@@ -261,6 +261,14 @@ class TuningProblem:
             perturbations=self.perturbations or None,
             seed=int(self.seed),
         )
+
+
+def _fitted(objective: Objective, scenario: Scenario) -> Objective:
+    """The objective for the joints and signals of a scenario."""
+    fitted = for_scenario(objective, scenario)
+    check_signals(fitted, scenario)
+    fit_joints(fitted, scenario.n, "objective")
+    return fitted
 
 
 def _check_runs(runs: int, differ: bool) -> None:

@@ -93,24 +93,22 @@ class Verdict:
     def __str__(self) -> str:
         text = self._verdict()
         if np.isfinite(self.value):
-            text += self._of_limits() if self.unit == OF_LIMIT else self._of_units()
+            text += self._value_in_words()
         if self.multiplier is not None and self.verdict != "fail" and self.multiplier > 0:
             text += self._sensitivity(self.multiplier)
         return text
 
-    def _of_units(self) -> str:
+    def _value_in_words(self) -> str:
+        """The value; where each joint has a limit of its own, that of the worst joint relative to
+        its limit.
+        """
+        if self.unit == OF_LIMIT:
+            return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
         text = f"; {self.value:.5g} {self.unit}"
         if self.verdict != "fail":
             return text
-        away = self.value - self.limit
-        side = "above" if away > 0 else "below"
-        return f"{text}, {abs(away):.3g} {self.unit} {side} the limit"
-
-    def _of_limits(self) -> str:
-        """Where each joint has a limit of its own, the value is that of the worst joint, relative
-        to its limit.
-        """
-        return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
+        side = "above" if self.value > self.limit else "below"
+        return f"{text}, {abs(self.value - self.limit):.3g} {self.unit} {side} the limit"
 
     def _sensitivity(self, multiplier: float) -> str:
         if self.unit == OF_LIMIT:
@@ -125,8 +123,8 @@ class Verdict:
 
     def _verdict(self) -> str:
         if self.after.runs == 1:
-            before, after = ("broken" if x.count else "kept" for x in (self.before, self.after))
-            return f"{self.name}: {before} -> {after}: {self.verdict}"
+            words = ["broken" if x.count else "kept" for x in (self.before, self.after)]
+            return f"{self.name}: {' -> '.join(words)}: {self.verdict}"
         text = (
             f"{self.name} (broken by at most {self.allowed:g} of the runs):"
             f" {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
@@ -398,19 +396,18 @@ def _changes(
     risk = case.risk
     both = samples[0].made & samples[1].made
     before, after = (_terms(case.objective, x.exact[both]) for x in samples)
-    several = len(before) > 1
     is_cvar = risk.kind == "cvar"
-    level = f" {risk.level:g}" if is_cvar else ""
+    risk_name = f"cvar {risk.level:g}" if is_cvar else risk.kind
 
     def name(what: str, combined_by: str) -> str:
-        return f"{what} ({combined_by})" if several else what
+        return f"{what} ({combined_by})" if len(before) > 1 else what
 
-    objective = name("objective", f"{risk.kind}{level}")
+    objective = name("objective", risk_name)
     found = [_objective_change(risk, objective, before, after, confidence)]
     for i, term in enumerate(case.objective.terms):
         found.append(_change(name(term.name, "mean"), before[:, i], after[:, i], confidence))
         if is_cvar and len(case.objective.terms) > 1:
-            tail = f"{term.name} (cvar{level})"
+            tail = f"{term.name} ({risk_name})"
             one = slice(i, i + 1)
             found.append(_objective_change(risk, tail, before[:, one], after[:, one], confidence))
     return tuple(found)
@@ -473,7 +470,9 @@ def _verdicts(
         allowed = float(requirement.allowed)
         # For a limited probability the constraint is on a margin: its multiplier is not the
         # sensitivity to the probability.
-        known = r < len(multipliers) and requirement.event == "value"
+        multiplier = None
+        if r < len(multipliers) and requirement.event == "value":
+            multiplier = multipliers[r]
         sign, unit = requirement.measure
         values = samples[1].exact[samples[1].made, len(objective.terms) + r]
         verdict = Verdict(
@@ -485,7 +484,7 @@ def _verdicts(
             value=sign * float(worst_share(jnp.asarray(values), allowed)),
             limit=sign * float(requirement.limit),
             unit=unit,
-            multiplier=multipliers[r] if known else None,
+            multiplier=multiplier,
         )
         found.append(verdict)
     return tuple(found)
@@ -501,7 +500,9 @@ def verdict_of(p: Probability, allowed: float) -> str:
         return "fail" if p.count else "pass"
     if p.high <= allowed:
         return "pass"
-    return "fail" if p.low > allowed else "undecided"
+    if p.low > allowed:
+        return "fail"
+    return "undecided"
 
 
 def _broken(objective: Objective, r: int, sample: _Sample) -> np.ndarray:

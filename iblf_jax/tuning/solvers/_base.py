@@ -110,7 +110,7 @@ class Solver(Protocol):
 
     @property
     def mode(self) -> str:
-        """ "forward" or "reverse" differentiation, or "auto": by the number of coordinates."""
+        """Differentiation: "forward", "reverse", or "auto", by the number of coordinates."""
         ...
 
     @property
@@ -130,14 +130,14 @@ class Solver(Protocol):
 
     @property
     def sharpenings(self) -> int:
-        """How often the smoothing of peaks in the objective is divided by 4, each time once the starts
-        have converged.
+        """How often the smoothing of peaks in the objective is divided by 4, each time once the
+        starts have converged.
         """
         ...
 
     @property
     def patience(self) -> int:
-        """Steps without a better result after which the search ends (or the smoothing is divided)."""
+        """Steps without a better result after which the search or its stage ends."""
         ...
 
     def init(self, space: SearchSpace, z: np.ndarray) -> Any:
