@@ -40,7 +40,11 @@ DRIVER = """
 #if defined(__x86_64__)
 static double now(void) { return (double)__builtin_ia32_rdtsc(); }
 #else
-static double now(void) { struct timespec t; clock_gettime(CLOCK_MONOTONIC, &t); return 1e9 * (double)t.tv_sec + (double)t.tv_nsec; }
+static double now(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return 1e9 * (double)t.tv_sec + (double)t.tv_nsec;
+}
 #endif
 static int by_size(const void *a, const void *b) {
   const double x = *(const double *)a, y = *(const double *)b;

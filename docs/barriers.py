@@ -1,6 +1,4 @@
-"""Pages of the barriers: each with V1, its slope and alpha across an asymmetric tube, drawn by the
-barrier itself.
-"""
+"""Pages of the barriers: each plots V1, its slope and alpha between asymmetric bounds."""
 
 from __future__ import annotations
 
@@ -15,11 +13,11 @@ from reference import body
 import iblf_jax as ij
 
 LOWER, UPPER = -0.2, 0.4
-"""Bounds of the tube of the plots, around 0 [rad]; the upper one falls by 0.1 rad/s."""
+"""Bounds of the plots [rad] for a reference at 0; the upper one decreases by 0.1 rad/s."""
 
 
 def tube() -> ij.bounds.Tube:
-    """It, at an instant."""
+    """The bounds at one instant."""
     one = jnp.ones(1)
     return ij.bounds.Tube(0 * one, 0 * one, LOWER * one, UPPER * one, 0 * one, -0.1 * one)
 
@@ -44,15 +42,15 @@ def draw(barrier, path: Path) -> None:
             inside = np.abs(y[(e1 > 0.93 * LOWER) & (e1 < 0.93 * UPPER)]).max()
             axes.plot(e1, y)
             axes.set_ylim(-1.5 * inside if y.min() < 0 else -0.05 * inside, 1.5 * inside)
-            for wall in (LOWER, UPPER):
-                axes.axvline(wall, color=bound(), linewidth=1.0)
+            for limit in (LOWER, UPPER):
+                axes.axvline(limit, color=bound(), linewidth=1.0)
             axes.set_xlabel(label("$e_1$", "rad"))
             axes.set_ylabel(label(f"${symbol}$", unit))
         figure.savefig(path, dpi=110)
 
 
 def write(folder: Path) -> None:
-    """Writes a page a barrier, and their list."""
+    """Write a page for each barrier, and the list of pages."""
     names = []
     for name, cls in ij.barriers.MEMBERS.items():
         draw(cls(), folder / f"barrier_{name}.png")
@@ -60,18 +58,19 @@ def write(folder: Path) -> None:
             f"# {cls.__name__}\n\n{body(inspect.getdoc(cls) or '')}\n\n![V1, slope and"
             f" alpha](barrier_{name}.png)\n\n"
         )
-        told = (
-            f"Drawn for bounds at {LOWER:g} and {UPPER:g} rad, the upper one falling by 0.1 rad/s;"
-            " k1 = 1 1/s, o = 0.1 1/s^2."
+        conditions = (
+            f"The plot has bounds at {LOWER:g} and {UPPER:g} rad; the upper one decreases by 0.1"
+            " rad/s; k1 = 1 1/s, o = 0.1 1/s^2."
         )
         (folder / f"barrier_{name}.md").write_text(
-            text + told + " Beyond the bounds the guard goes on along the tangent.\n"
+            text
+            + conditions
+            + " The guard extends the functions beyond the bounds along the tangent.\n"
         )
         names.append(f"barrier_{name}")
     listed = "\n".join(names)
     words = (
-        "What a barrier is, and what the guard does at the wall, is said in `iblf_jax.barriers`. A"
-        " page a member:"
+        "`iblf_jax.barriers` defines a barrier and its guard at the bound. Each member has a page:"
     )
     (folder / "barriers.md").write_text(
         f"# Barriers\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"

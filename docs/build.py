@@ -1,10 +1,9 @@
 """Builds the site: `python docs/build.py`; the result is out/site/html/index.html.
 
-Pages are put together in out/site/source: what stands in this folder, the notebooks and the gallery
-  as the tests have executed them (what
-is missing or older than its source is executed here), and pages that are made of docstrings, of the
-status flags, of the barriers, of CONTRIBUTING and of the benchmarks' results.  Any warning of
-Sphinx is an error, and any dead link (`links.py`).
+The script assembles the pages in out/site/source: the pages of this folder, the notebooks and the
+gallery as the tests executed them, and pages that are generated from docstrings, status flags,
+barriers, CONTRIBUTING and benchmark results. It executes notebooks and scripts whose output is
+missing or older than the source. Warnings of Sphinx and dead links (`links.py`) are errors.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ def assemble() -> None:
             execute(notebook, work)
         shutil.copy(EXECUTED / notebook.name, SOURCE / "tutorials")
     listed = "\n".join(notebook.stem for notebook in NOTEBOOKS)
-    words = "The notebooks of the repository, in order, as the tests have run them."
+    words = "The notebooks of the repository with their output."
     (SOURCE / "tutorials" / "index.md").write_text(
         f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
     )

@@ -1,7 +1,8 @@
-"""The page "Why did my run fail?": a run for every status flag, its picture, and what to do.
+"""The page "Why did my run fail?": an example run for every status flag, its figure, and the
+remedy.
 
-The tests make the sections with `section`, which keeps them in `out/site/flags`; `docs/build.py`
-takes them from there, and makes what is missing or older than this file.
+The tests write the sections by `section` to `out/site/flags`. `docs/build.py` reads them there, and
+writes the sections that are missing or older than this file.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ MADE = gallery.ROOT / "out" / "site" / "flags"
 
 
 class Case(NamedTuple):
-    """A run that raises a flag; a scenario where none can be made, None where there is nothing to
-    see.
+    """An example of a flag.
+
+    `run` returns a run that has the flag, a scenario where no run is possible, or None where there
+    is no figure.
     """
 
     run: Callable[[], Any]
-    says: str
-    mend: str
+    meaning: str
+    remedy: str
     draw: Callable = plotting.positions
 
 
@@ -47,7 +50,7 @@ def _weak(limit: list[float]) -> ij.Scenario:
 
 
 def _meeting() -> ij.Scenario:
-    """The upper bound comes down to the reference of the first joint."""
+    """A scenario whose upper bound decreases to the reference of the first joint."""
     upper = ij.bounds.Sinusoid(offset=0.66, amplitude=0.2, frequency=1.0, phase=1.5707963)
     return _paper(
         bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=upper),
@@ -55,7 +58,7 @@ def _meeting() -> ij.Scenario:
     )
 
 
-def _near_the_wall() -> ij.Scenario:
+def _near_the_bound() -> ij.Scenario:
     return ij.with_parameters(ij.presets.zhang_yan_2024(), {"initial.q": [1.0397, 0.8]})
 
 
@@ -94,15 +97,15 @@ class PowerOfE2:
         tube, model = context.tube(t), context.model
         alpha = tube.dq_d - 2.0 * (q - tube.q_d)
         e2 = dq - alpha
-        wanted = tube.ddq_d - 2.0 * (dq - tube.dq_d)
-        tau = model.coriolis(q, dq, dq) + model.gravity(q) + model.mass_matrix(q) @ wanted
+        acceleration = tube.ddq_d - 2.0 * (dq - tube.dq_d)
+        tau = model.coriolis(q, dq, dq) + model.gravity(q) + model.mass_matrix(q) @ acceleration
         tau = tau - f_hat - self.K2 * e2 - self.c * jnp.sign(e2) * jnp.abs(e2) ** 0.6
         none = jnp.zeros(q.shape, bool)
         return ij.controllers.Command(tau, alpha, (q - tube.q_d) ** 2, none, none), ()
 
 
 def _at_rest() -> ij.Scenario:
-    """It starts at e2 = 0."""
+    """A scenario that starts at e2 = 0."""
     scenario = _paper(controller=PowerOfE2(K2=5.0, c=2.0))
     tube = scenario.context.tube(jnp.zeros(()))
     return ij.with_parts(scenario, initial=ij.Initial(tube.q_d, tube.dq_d))
@@ -111,123 +114,128 @@ def _at_rest() -> ij.Scenario:
 CASES: dict[str, Case] = {
     "BOUND_VIOLATED": Case(
         lambda: _run(_weak([4.0, 1.0])),
-        "A joint touched or left its bound. Here the motors are too weak for the arm's own weight,"
-        " so that no law could have kept it.",
-        "Look at the first violation (`run.metrics.first_violation_time`), and whether the torque"
-        " was saturated or the start was outside. If neither, the law was not strong enough against"
-        " what it did not know: raise `K2`, or tune.",
+        "A joint touched or violated its bound. In this example the motors are too weak for the"
+        " weight of the arm, so that no law can satisfy the bounds.",
+        "Inspect the first violation (`run.metrics.first_violation_time`), and check whether the"
+        " torque was saturated or the start was outside the bounds. Otherwise the gains are too"
+        " small for the uncertain term: increase `K2`, or tune the gains.",
     ),
     "NOT_FINITE": Case(
         lambda: _run(_sampled(4e-3, 4e-3), dt=4e-3),
-        "The state ran away, and was frozen at its last good value: nothing after that is a motion."
-        " Here the law is sampled too slowly.",
-        "Other flags of the same run say why: a step that is too large, a period that is too long."
-        " Otherwise the gains are too high.",
+        "The state diverged and was frozen at its last finite value. The signals after this instant"
+        " have no meaning. In this example the law is sampled too slowly.",
+        "Other flags of the same run name the reason, such as a time step or a sampling period that"
+        " is too large. Otherwise reduce the gains.",
     ),
     "STEP_TOO_LARGE": Case(
         lambda: _run(_paper(), dt=0.04),
-        "dt times the loop's fastest mode is beyond what the integrator can do. What you see is the"
-        " integrator's, not the robot's.",
-        "Take the step that the warning names, or the one of `ij.recommended_dt(scenario,"
-        " duration=...)`.",
+        "The product of dt and the fastest eigenvalue of the closed loop is outside the stability"
+        " region of the integrator. The oscillation is numerical and not physical.",
+        "Use the step that the warning names, or the one that `ij.recommended_dt(scenario,"
+        " duration=...)` returns.",
     ),
     "INFEASIBLE_REFERENCE": Case(
         _meeting,
-        "The reference touches or leaves a bound: no law can follow it and stay inside (Assumption"
-        " 2). A single run raises an error that names joint and time; in a batch or a study it is"
-        " this flag. A safety filter keeps its bounds wherever the reference goes, so its runs do"
-        " not raise it.",
-        "Move the reference, or widen the bounds. `ij.plotting.tube(scenario)` shows both before"
-        " anything is run.",
+        "The reference touches or violates a bound, so that no law can follow it and satisfy the"
+        " bounds (Assumption 2). A single run raises an error that names joint and time; runs of a"
+        " batch or a study have this flag. A safety filter satisfies its bounds for every"
+        " reference, so its runs do not have the flag.",
+        "Change the reference, or widen the bounds. `ij.plotting.tube(scenario)` plots both without"
+        " a simulation.",
         lambda scenario: plotting.tube(scenario, duration=4.0),
     ),
     "TORQUE_SATURATED": Case(
         lambda: _run(_weak([9.0, 4.0])),
-        "The law asked for more torque than there is. It is a remark, not a failure: here the"
-        " bounds hold.",
-        "Nothing, if the bounds hold and nothing is to be certified. Else lower the gains, or tune"
-        " with `peak_torque_below`.",
+        "The commanded torque exceeded its limit. This flag is a remark and not a failure: in this"
+        " example the bounds are satisfied.",
+        "No action is needed if the bounds are satisfied and no certificate is required. Otherwise"
+        " reduce the gains, or tune them with `peak_torque_below`.",
         plotting.torques,
     ),
     "GUARD_ACTIVE": Case(
-        lambda: _run(_near_the_wall()),
-        "A joint was within a thousandth of its bound, where the barrier's slope is held at a large"
-        " finite value. Here it starts there.",
-        "Nothing, if it was at the start alone. A barrier takes `guard=` if the default of 1e-3 is"
-        " too wide for you.",
+        lambda: _run(_near_the_bound()),
+        "The distance of a joint from its bound was below a thousandth of its range, where a guard"
+        " limits the slope of the barrier. In this example the run starts there.",
+        "No action is needed if the guard was active at the start only. The argument `guard=` of a"
+        " barrier changes the default of 1e-3.",
     ),
     "GUARD_STAYED": Case(
         lambda: _run(_weak([4.0, 1.0])),
-        "The guard was at work beyond the first instant: there another law ran, softer than the one"
-        " that was asked for.",
-        "Do not judge the law by this run. See why it comes so near its bound: torque limits, a"
-        " payload, too large a step.",
+        "The guard was active beyond the first instant. Meanwhile the slope of the barrier was"
+        " smaller than that of the requested law.",
+        "The run does not represent the law. Find the reason for the small distance from the bound:"
+        " torque limits, a payload, or too large a time step.",
     ),
     "INACCURATE": Case(
         lambda: _run(_paper(), dt=5e-3),
-        "The estimated error of the positions is more than 0.5 % of the tube. Its numbers are not"
-        " to be used.",
-        "Take the step that the warning names.",
+        "The estimated error of the positions exceeds 0.5 % of the distance between the bounds. The"
+        " numbers of this run are not reliable.",
+        "Use the time step that the warning names.",
     ),
     "INFINITE_SLOPE": Case(
         lambda: _run(_at_rest(), dt=1e-2),
-        "The run is inaccurate, or its step too large, and at an isolated instant a derivative of"
-        " the loop is infinite: here that of |e2|^0.6 sign(e2) with respect to e2, at e2 = 0. It is"
-        " no fast mode, and the time step is judged without it.",
-        "Take the step that the warning names, or write such a power as e2 (e2^2 + delta^2)^((a -"
-        " 1)/2) with a small delta.",
+        "The run is inaccurate, or its time step is too large, and at an isolated instant a"
+        " derivative of the closed loop is infinite: in this example that of |e2|^0.6 sign(e2) with"
+        " respect to e2, at e2 = 0. It is not an eigenvalue of the loop, and the assessment of the"
+        " time step excludes it.",
+        "Use the time step that the warning names, or replace the power by e2 (e2^2 + delta^2)^((a"
+        " - 1)/2) with a small delta.",
     ),
     "SAMPLING_TOO_SLOW": Case(
         lambda: _run(_sampled(4e-3), dt=1e-3),
-        "From one period to the next the loop grows: `run.metrics.sampling_radius` is above 1.",
-        "Sample faster; `ij.recommended_period(scenario, duration=...)` says how fast. Or change"
-        " the term that limits the loop: the warning names it, be it the slope of the barrier"
+        "The one-period map of the sampled loop is unstable: its spectral radius,"
+        " `run.metrics.sampling_radius`, is above 1.",
+        "Use a shorter period; `ij.recommended_period(scenario, duration=...)` returns one. Or"
+        " change the term that limits the loop, which the warning names: the slope of the barrier"
         " (`weight`), `K2`, `kf`, a filter, a lag or the delay.",
     ),
     "VELOCITY_VIOLATED": Case(
         lambda: _run(_paper(velocity_bounds=_speeds(-0.4))),
-        "A joint was faster than its velocity bound, which this law does not know.",
-        "Take `controllers.FullState`, which keeps both, or lower `k1`, which asks for less speed.",
+        "A joint exceeded its velocity bound. The law of this example does not use velocity"
+        " bounds.",
+        "Use `controllers.FullState`, which bounds positions and velocities, or reduce `k1`.",
         plotting.velocities,
     ),
     "ALPHA_INFEASIBLE": Case(
         lambda: _run(_paper(velocity_bounds=_speeds(-0.4))),
-        "The velocity that the law wants, alpha, leaves the velocity bounds: no law that follows it"
-        " can keep them.",
-        "Lower `k1`, start nearer to the reference, or widen the velocity bounds.",
+        "The virtual velocity alpha violates the velocity bounds, so that no law that follows alpha"
+        " can satisfy them.",
+        "Reduce `k1`, start nearer to the reference, or widen the velocity bounds.",
         plotting.velocities,
     ),
     "FILTER_INFEASIBLE": Case(
         lambda: _run(_filtered()),
-        "A safety filter's conditions and its torque limits have nothing in common. The torque"
-        " broke the conditions by the least.",
-        "`run.slack` says by how much. More torque, slower conditions (`a1`, `a2`), or another"
-        " start.",
+        "No torque satisfies both the conditions of the safety filter and the torque limits. The"
+        " filter used the torque with the smallest violation of the conditions.",
+        "`run.slack` is the size of the violation. Increase the torque limits, reduce the rates of"
+        " the conditions (`a1`, `a2`), or change the start.",
     ),
     "REGION_VIOLATED": Case(
         lambda: _run(
             _paper(regions=(ij.regions.HalfSpace(normal=[0.0, 1.0], offset=0.45),)), duration=4.0
         ),
-        "The tip, or the origin of a joint, touched or crossed the wall of a region. Here the law"
-        " does not know the wall.",
-        "Put a `controllers.SafetyFilter` around the law, or move the reference."
-        " `run.metrics.region_margin` says by how much.",
+        "The tip, or the origin of a joint, touched or crossed the boundary of a region. The law of"
+        " this example does not use regions.",
+        "Wrap the law in a `controllers.SafetyFilter`, or change the reference."
+        " `run.metrics.region_margin` is the size of the violation.",
         plotting.workspace,
     ),
     "INADMISSIBLE_DRAW": Case(
         lambda: None,
-        "Of studies: a draw was no robot at all, such as one with a negative mass. The run was not"
-        " made; its metrics are NaN.",
-        "Narrow the distribution. `study.made` says which runs were made, and no statistic counts"
-        " the others.",
+        "A draw of a study was physically impossible, for example a negative mass. The run was not"
+        " simulated, and its metrics are NaN.",
+        "Narrow the distribution. `study.made` marks the runs that were simulated; statistics"
+        " contain no others.",
     ),
 }
-"""Flag -> a run that raises it."""
+"""Flag -> a run that has it."""
 
 
 def section(name: str) -> str:
-    """Runs the case of a flag and writes its section, the picture beside it; raises if the run does
-    not raise the flag.
+    """Run the example of a flag, and write its section and its figure.
+
+    Raises:
+      ValueError: the run does not have the flag.
     """
     MADE.mkdir(parents=True, exist_ok=True)
     case = CASES[name]
@@ -238,9 +246,9 @@ def section(name: str) -> str:
         f"<!-- {gallery.digest(Path(__file__))} -->",
         f"## {name}",
         "",
-        case.says,
+        case.meaning,
         "",
-        f"**What to do.** {case.mend}",
+        f"**Remedy.** {case.remedy}",
         "",
     ]
     if run is not None:
@@ -258,7 +266,11 @@ def _kept(name: str) -> Path:
 
 
 def write(folder: Path) -> None:
-    """Writes the page; raises if a run does not raise its flag, or a flag has no run."""
+    """Write the page.
+
+    Raises:
+      ValueError: a run does not have its flag, or a flag has no example.
+    """
     missing = {flag.name for flag in ij.Status if flag} - set(CASES)
     if missing:
         raise ValueError(f"flags without a section: {sorted(missing)}")
@@ -266,8 +278,8 @@ def write(folder: Path) -> None:
         "# Why did my run fail?",
         "",
         (
-            "A run, a batch and a study carry status flags, `ij.Status`. Each section has a run"
-            " that raises its flag."
+            "Runs, batches and studies have status flags, `ij.Status`. Each section shows a run"
+            " that has the flag."
         ),
     ]
     lines += ["", "```python", "run.ok, ij.Status(int(run.status))", "```", ""]

@@ -1,12 +1,13 @@
-"""The gallery: every script of examples/gallery and examples/reproductions is run once, and becomes
-a page with its text, its figures and what it printed.
+"""The gallery: runs every script of examples/gallery and examples/reproductions and writes its
+page.
 
-A script begins with its page's words, "Title: words"; a block of it begins with "# %%" and more
-words, which may go on in the comment below.  A reproduction has its scenario beside it, a file of
-the same name, and may have published numbers there.
+A page has the text, the figures and the printed output of its script. The docstring of a script is
+the introduction, "Title: text". A block begins with "# %%" and a text, which may continue in the
+comment lines below. A reproduction has a scenario file of the same name, and may have published
+numbers in a CSV file of the same name.
 
-The tests run the scripts with `page`, which keeps what they made in `out/site/gallery`;
-`docs/build.py` takes it from there, and runs what is missing or older than its script.
+The tests run the scripts by `page`, which writes to `out/site/gallery`. `docs/build.py` reads the
+pages there, and runs the scripts whose page is missing or older.
 """
 
 from __future__ import annotations
@@ -97,9 +98,9 @@ def page(script: Path) -> list[Path]:
 def _words(block: str) -> tuple[str, str]:
     """What a block says, its first line and the comment below it, and its code."""
     words, *rest = block.split("\n")
-    said = list(itertools.takewhile(lambda line: line.startswith("#"), rest))
-    return "\n".join([words.strip(), *(line[1:].strip() for line in said)]), "\n".join(
-        rest[len(said) :]
+    comment = list(itertools.takewhile(lambda line: line.startswith("#"), rest))
+    return "\n".join([words.strip(), *(line[1:].strip() for line in comment)]), "\n".join(
+        rest[len(comment) :]
     )
 
 
@@ -116,10 +117,11 @@ def _picture(value: Any, stem: str) -> Path | None:
 
 def index() -> str:
     """The page that shows all of them, by their first picture."""
-    words = "Each picture is a script of `examples/gallery`; the tests run them."
+    words = "Each figure has a script in `examples/gallery`, which the tests run."
     others = (
-        "Published examples of other authors, each a scenario file of `examples/reproductions`:"
-        " what is printed and what is not, what comes out here, and what could not be reproduced."
+        "Published examples of other authors, as scenario files in `examples/reproductions`. Each"
+        " page lists the printed and the missing parameters, the results of this package, and what"
+        " could not be reproduced."
     )
     toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(script.stem for script in PAGES) + "\n```"
     parts = [

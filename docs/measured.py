@@ -1,5 +1,6 @@
-"""The page of benchmarks: a table and a plot of each result that `benchmarks/*.py --json
-benchmarks/results/NAME.json` has written.
+"""The page of benchmarks: a table and a plot of each file `benchmarks/results/NAME.json`.
+
+`python benchmarks/NAME.py --json benchmarks/results/NAME.json` writes such a file.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Plot(NamedTuple):
 
 
 PLOTS = {
-    "latency": Plot(("row",), "ms", "One run alone, as a notebook calls it; less is better."),
+    "latency": Plot(("row",), "ms", "A single run, as in a notebook; less is better."),
     "throughput": Plot(
         ("row", "type"),
         "steps/s a core",
@@ -42,7 +43,7 @@ PLOTS = {
     "arm": Plot(
         ("row", "type"),
         "steps/s a core",
-        "Seven joints, beside what a user would take instead; more is better.",
+        "Seven joints, compared with other software; more is better.",
     ),
     "export": Plot(
         ("law", "type"),
@@ -52,7 +53,8 @@ PLOTS = {
     "constraints": Plot(
         ("law",),
         "us a step",
-        "What keeps which constraints, and the processor time of a step; less is better.",
+        "The constraints that each law satisfies, and the processor time of a step; less is"
+        " better.",
     ),
     "tuning": Plot(
         ("search",),
@@ -66,10 +68,10 @@ PLOTS = {
 def write(page: Path) -> None:
     """Writes the page, and its pictures beside it."""
     parts = [
-        "# Benchmarks\n\nA table is one run of a program in `benchmarks/`, made from what it wrote;"
-        " `python benchmarks/NAME.py` makes it again. Rows are compared within one run, on a"
-        " machine that others use too; where it says *a core*, processor time is counted. What was"
-        " tried, and what was learnt, is in the [lab notes](lab_notes.md).\n"
+        "# Benchmarks\n\nEach table is the output of one program in `benchmarks/`;"
+        " `python benchmarks/NAME.py` measures it again. Compare rows within a table only, because"
+        " the machines are shared. Columns *a core* count processor time. The"
+        " [lab notes](lab_notes.md) describe the experiments.\n"
     ]
     for name, plot in PLOTS.items():
         result = json.loads((RESULTS / f"{name}.json").read_text())
@@ -100,8 +102,8 @@ def draw(plot: Plot, rows: list[dict[str, Any]], path: Path) -> None:
     """Points on a logarithmic axis, in the order of the table."""
     from iblf_jax.plotting._style import new_figure, styled
 
-    asked = [row for row in rows if all(row[name] == value for name, value in plot.only.items())]
-    drawn = [row for row in asked if isinstance(row[plot.values], (int, float))]
+    selected = [row for row in rows if all(row[name] == value for name, value in plot.only.items())]
+    drawn = [row for row in selected if isinstance(row[plot.values], (int, float))]
     with styled():
         figure = new_figure(7.5, 0.8 + 0.26 * len(drawn))
         axes = figure.subplots()

@@ -1,7 +1,7 @@
 """Writes docs/members.md from the docstrings of the package's own members: `python
 docs/members.py`.
 
-A test compares the file with what this gives, so that it cannot go stale.
+A test compares the file with the output of this script.
 """
 
 from __future__ import annotations
@@ -91,9 +91,9 @@ def systems() -> list[str]:
         law = controllers.law_by_name(name)
         barrier = getattr(law, "barrier", None)
         usual = observers.Printed(kf=20.0)
-        around = f" around {type(law.law).__name__}" if hasattr(law, "law") else ""
+        inner = f" around {type(law.law).__name__}" if hasattr(law, "law") else ""
         parts = (
-            type(law).__name__ + around,
+            type(law).__name__ + inner,
             type(barrier).__name__ if barrier else "-",
             "none" if observer_of(name, usual) is not usual else "any",
         )

@@ -1,8 +1,7 @@
-"""Pages of the types that a class of a user's own returns or is given: protocols, records and type
-aliases.
+"""Pages of the protocols, records and type aliases that user-written classes need.
 
-A protocol is shown with its methods, a record with its fields; the text of a field is the string
-that follows it in the source, which `inspect` does not know.
+The page of a protocol lists its methods, and that of a record its fields. The text of a field is
+the string that follows it in the source, which `inspect` does not return.
 """
 
 from __future__ import annotations

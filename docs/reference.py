@@ -1,4 +1,4 @@
-"""The reference: a page a family, from the docstrings of what is public."""
+"""The reference: one page for each family, from the docstrings of the public names."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ PAGES: dict[str, tuple[str, str]] = {
             " load_tuning objectives.Quantity objectives.Outer"
         ),
     ),
-    "identification": ("Parameters from logs", "identify Identification excitation"),
+    "identification": ("Identification", "identify Identification excitation"),
     "out": (
-        "Out of Python, files and reports",
+        "Export, files and reports",
         (
             "export Exported explore cosimulate report load_scenario save_scenario load_rollouts"
             " save_rollouts"
         ),
     ),
     "testing": (
-        "Checkers for your own classes",
+        "Checkers for user-written classes",
         (
             "testing.check_law testing.check_barrier testing.check_observer testing.check_sensor"
             " testing.check_actuator testing.check_robot testing.check_reference testing.check_side"
@@ -70,8 +70,8 @@ FAMILIES = (
     "actuators",
     "metrics",
 )
-OWN_TYPES = "What a class of your own has, returns and is given"
-"""Heading of a family's protocols and records."""
+OWN_TYPES = "Protocols and types for user-written classes"
+"""Heading of the protocols and records of a family."""
 
 
 def page_of(thing: Any, name: str, level: int = 2) -> str:
@@ -165,6 +165,6 @@ def write(folder: Path) -> None:
         names.append(family)
     listed = "\n".join(names)
     (folder / "index.md").write_text(
-        "# Reference\n\nEvery public name, from its docstring. [All members in one"
+        "# Reference\n\nThe reference documents every public name. [All members in one"
         f" table](../members.md).\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
     )

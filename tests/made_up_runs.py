@@ -63,15 +63,34 @@ def made_up(plant, *, duration=4.0, dt=0.01, shift=0.0, status=0):
     )
     f = 0.1 * np.cos(2 * t[:, None] + joints)
     arrays = {
-        "t": t, "q": q_d + e1, "dq": np.gradient(q_d + e1, dt, axis=0), "tau": 3.0 - 8 * np.exp(-9 * t[:, None]) + joints, "e1": e1,
-        "e2": -3 * e1, "xi": e1 / 0.45, "q_d": q_d, "dq_d": np.gradient(q_d, dt, axis=0), "lower": lower, "upper": upper, "alpha": 0 * q_d,
-        "disturbance": f, "disturbance_estimate": f * (1 - np.exp(-5 * t[:, None])), "V": np.exp(-2 * t),
-    }  # fmt: skip
+        "t": t,
+        "q": q_d + e1,
+        "dq": np.gradient(q_d + e1, dt, axis=0),
+        "tau": 3.0 - 8 * np.exp(-9 * t[:, None]) + joints,
+        "e1": e1,
+        "e2": -3 * e1,
+        "xi": e1 / 0.45,
+        "q_d": q_d,
+        "dq_d": np.gradient(q_d, dt, axis=0),
+        "lower": lower,
+        "upper": upper,
+        "alpha": 0 * q_d,
+        "disturbance": f,
+        "disturbance_estimate": f * (1 - np.exp(-5 * t[:, None])),
+        "V": np.exp(-2 * t),
+    }
     arrays = {name: jnp.asarray(x) for name, x in arrays.items()}
     return ij.Rollout(
-        scenario=Holder(plant), controller_state=(), observer_state=(), metrics=ij.Metrics({}, ()), status=jnp.int32(status),
-        fastest_mode=jnp.asarray(10.0), dt=jnp.asarray(dt), method="rk4", **arrays,
-    )  # fmt: skip
+        scenario=Holder(plant),
+        controller_state=(),
+        observer_state=(),
+        metrics=ij.Metrics({}, ()),
+        status=jnp.int32(status),
+        fastest_mode=jnp.asarray(10.0),
+        dt=jnp.asarray(dt),
+        method="rk4",
+        **arrays,
+    )
 
 
 def runaway(plant, at=150):

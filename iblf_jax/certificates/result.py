@@ -20,6 +20,7 @@ from iblf_jax.certificates.lines import (
     Line,
 )
 from iblf_jax.core import checks, tables
+from iblf_jax.core.presentation import present
 
 FEW = 3
 """Lines that do not apply are listed by name up to this number."""
@@ -124,9 +125,7 @@ class Certificate:
         return "\n".join(shown)
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
     def table_html(self) -> str:
         """The lines that apply as an HTML table, those that fail in bold, and below it why the
@@ -209,9 +208,7 @@ class Certificate:
         """V2 under its envelope, the inequality's left side, and the errors under their bounds.
         Options as `plotting.certificate`.
         """
-        from iblf_jax.plotting import certificates
-
-        return certificates.certificate(self, **options)
+        return present("certificate figure", self, **options)
 
 
 def _listed(names: list[str]) -> str:

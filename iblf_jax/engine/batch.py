@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.plan import Shape
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import (
     Carry,
     Inputs,
     Outcome,
     Probe,
     Probed,
-    Run,
     TimeStep,
     probe_steps,
     probed,
@@ -214,7 +214,9 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
     return jax.eval_shape(lambda: batch.each(one))
 
 
-def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Probed) -> Outcome:
+def end(
+    executor: Executor, batch: Batch, run: RunRequest, carry: Carry, at_start: Probed
+) -> Outcome:
     """The outcome after the last step, without records; `at_start` is what a `Probe` has found
     there.
     """
@@ -248,13 +250,15 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
     return batch.each(judged, carry, at_start, later)
 
 
-def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:
+def run_all(executor: Executor, batch: Batch, run: RunRequest) -> Outcome:
     """All runs, from the start to the outcome."""
     outcome, records = run_step(executor, batch, TimeStep.of(run), run)
     return outcome if run.record_every is None else outcome._replace(records=records)
 
 
-def run_step(executor: Executor, batch: Batch, step: TimeStep, run: Run) -> tuple[Outcome, Any]:
+def run_step(
+    executor: Executor, batch: Batch, step: TimeStep, run: RunRequest
+) -> tuple[Outcome, Any]:
     """All runs by a step that may record something else; the outcome, and the records apart."""
     carry, at_start = begin(executor, batch, run.method)
     carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)

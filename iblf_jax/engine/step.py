@@ -30,6 +30,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.mechanism import Mechanism
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 from iblf_jax.simulation import accuracy, integrators, jumps, sampling, stability
 from iblf_jax.simulation.closed_loop import (
@@ -47,15 +48,14 @@ from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
 from iblf_jax.world.bounds import NARROWEST
 
 
-class Run(NamedTuple):
-    """What to run, whatever the scenario: static."""
-
-    steps: int
-    method: str = "rk4"
-    record_every: int | None = None
-    """Every so-many-th instant is recorded, from t = 0; None: metrics only."""
-    mechanism: Mechanism | None = None
-    """What of the robots is compiled in."""
+def Run(
+    steps: int,
+    method: str = "rk4",
+    record_every: int | None = None,
+    mechanism: Mechanism | None = None,
+) -> RunRequest:
+    """The former name of `RunRequest`."""
+    return RunRequest(steps, method, record_every, mechanism)
 
 
 class Inputs(NamedTuple):
@@ -605,7 +605,7 @@ class TimeStep:
     """Function (folds, what `advance` found) of an instant."""
 
     @staticmethod
-    def of(run: Run) -> TimeStep:
+    def of(run: RunRequest) -> TimeStep:
         """The step of a run."""
         return TimeStep(run.method, None if run.record_every is None else recorded)
 

@@ -22,6 +22,7 @@ from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, notices
 from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
@@ -238,9 +239,7 @@ class Scenario:
         return self.context
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
 
 def with_parts(scenario: Scenario, **parts: Any) -> Scenario:

@@ -35,6 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import bar
 from iblf_jax.engine.plan import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
@@ -99,9 +100,7 @@ class Front:
 
     def plot(self, **options):
         """Figure of the front.  Options as `plotting.pareto`."""
-        from iblf_jax import plotting
-
-        return plotting.pareto(self, **options)
+        return present("front figure", self, **options)
 
     def __repr__(self) -> str:
         ends = ", ".join(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.presentation import present
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import known_of
@@ -363,9 +364,7 @@ class TuneResult:
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as
         `plotting.tuning`.
         """
-        from iblf_jax import plotting
-
-        return plotting.tuning(self, **options)
+        return present("tuning figure", self, **options)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes everything to one file, from which `load_tuning` gives the result back with the
@@ -376,9 +375,7 @@ class TuneResult:
             name.
           OSError: the file cannot be written.
         """
-        from iblf_jax.files.tuning import save_tuning
-
-        save_tuning(self, path)
+        present("tuning file", self, path)
 
     def __repr__(self) -> str:
         probes = f", {self.probes} probes" if self.probes else ""
@@ -396,6 +393,4 @@ class TuneResult:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)

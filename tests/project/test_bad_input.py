@@ -442,7 +442,7 @@ def test_every_parameter_can_be_written_back_by_its_path(paper):
     )
 
 
-# --------------------------------------------------------------------------------------- every function, before it does anything
+# ------------------------------------------------------- every function, before it does anything
 
 WEAK = ij.presets.zhang_yan_2024()
 DRAWN = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
@@ -711,7 +711,7 @@ def test_a_component_with_a_constructor_of_its_own_keeps_its_errors():
         Own()
 
 
-# ------------------------------------------------------------------------------------------------------------------ warnings
+# -------------------------------------------------------------------------------------- warnings
 
 
 def test_a_warning_points_at_the_callers_line(paper):
@@ -826,7 +826,7 @@ def test_every_warning_of_the_package_looks_for_the_users_line():
         assert not uses or path.name == "notices.py", path
 
 
-# ----------------------------------------------------------------------------------------------------------------- grammar
+# --------------------------------------------------------------------------------------- grammar
 
 
 @pytest.mark.parametrize(

@@ -292,7 +292,7 @@ def test_no_silent_nan_in_a_run(paper, values):
         assert status & Status.NOT_FINITE, values
 
 
-# ----------------------------------------------------------------------------------------- whatever a user may put in the place of it
+# ---------------------------------------------------- whatever a user may put in the place of it
 
 DEEP: list = [1.0]
 for _ in range(5000):
@@ -753,7 +753,7 @@ def test_toml_of_any_depth(text, tmp_path, capsys):
     assert depth_left(500)
 
 
-# ------------------------------------------------------------------------------------------------------ what results and commands take
+# ---------------------------------------------------------------- what results and commands take
 
 
 @pytest.fixture

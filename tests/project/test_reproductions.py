@@ -55,7 +55,7 @@ def test_the_command_of_a_file_runs(capsys):
     assert "status: ok" in capsys.readouterr().out
 
 
-# ---------------------------------------------------------------------------------------------------------- what the pages say
+# ---------------------------------------------------------------------------- what the pages say
 
 
 def dimanidis(run):
@@ -133,7 +133,7 @@ def test_a_file_does_what_its_page_says(name):
     SAID[name](run_of(name))
 
 
-# ---------------------------------------------------------------------------------------- programs from the printed numbers alone
+# ------------------------------------------------------- programs from the printed numbers alone
 
 
 def two_links(mass, length, centre, inertia, g):
@@ -229,11 +229,15 @@ def zhang_alone(t, x):
     M = np.array([[m11, m12, m13], [m12, m22, m23], [m13, m23, 0.1788]])
     a, b, c = v
     inner, middle, outer = 0.1742 * s2, 0.04047 * s23, 0.02809 * s3
-    N = np.array([
-        -inner * b * (2 * a + b) - middle * (b + c) * (2 * a + b + c) - outer * c * (2 * a + 2 * b + c),
-        (inner + middle) * a**2 - outer * c * (2 * a + 2 * b + c),
-        middle * a**2 + outer * (a + b) ** 2,
-    ])  # fmt: skip
+    N = np.array(
+        [
+            -inner * b * (2 * a + b)
+            - middle * (b + c) * (2 * a + b + c)
+            - outer * c * (2 * a + 2 * b + c),
+            (inner + middle) * a**2 - outer * c * (2 * a + 2 * b + c),
+            middle * a**2 + outer * (a + b) ** 2,
+        ]
+    )
     r, dr, ddr = (
         gain * (np.cos(w * t + 1) + 1),
         -gain * w * np.sin(w * t + 1),
