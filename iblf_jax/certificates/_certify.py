@@ -23,13 +23,15 @@ from iblf_jax.certificates.run_summary import RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.engine.plan import CERTIFY_RECORDED
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 from iblf_jax.world.robots import joint_names
 
+RECORDED = 20_000
+"""Largest number of recorded samples of a run that `certify` makes; the other steps are
+reconstructed."""
 WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
@@ -88,7 +90,7 @@ def certify(
         )
     own_claim(scenario)  # raises for half of a claim, before anything is simulated
     if run is None:
-        every = 1 + checks.whole_steps(duration, dt) // CERTIFY_RECORDED
+        every = 1 + checks.whole_steps(duration, dt) // RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
     if worst is not None:
         worst = checks.positive_integer("worst", worst)
@@ -160,9 +162,9 @@ def _replayed(study: Any, index: int) -> Rollout:
     if duration is None or dt is None:
         return study.replay(index)
     steps = round(duration / dt)
-    if steps <= CERTIFY_RECORDED:
+    if steps <= RECORDED:
         return study.replay(index)
-    return study.replay(index, record_every=1 + steps // CERTIFY_RECORDED)
+    return study.replay(index, record_every=1 + steps // RECORDED)
 
 
 # --- one run -------------------------------------------------------------------------------------

@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.plan import CERTIFY_TOGETHER
 from iblf_jax.world.robots import Robot
 
+BATCH_SIZE = 512
+"""Positions whose eigenvalues are computed together; bounds the memory."""
 POINTS_PER_AXIS = {1: 257, 2: 65, 3: 21}
 """Points of the grid per axis, by number of joints."""
 SOBOL_POINTS = 4096
@@ -49,7 +50,7 @@ def _with_gradient(robot: Robot, q: jax.Array, sign: int) -> jax.Array:
 def _eigenvalues(robot: Robot, points: jax.Array) -> jax.Array:
     """Eigenvalues of M0 at each point, ascending, (m, n)."""
     return jax.lax.map(
-        lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=CERTIFY_TOGETHER
+        lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=BATCH_SIZE
     )
 
 

@@ -10,7 +10,7 @@ A run whose status makes its numbers meaningless is not reconstructed: its recor
 as they are.
 
 This is the only module of the package that runs the engine step by step. It works in blocks of
-`CERTIFY_STRETCH` steps, so that one compiled program serves runs of every length.
+`BLOCK_STEPS` steps, so that one compiled program serves runs of every length.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ import numpy as np
 from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.status import UNTRUSTED, Status, describe
-from iblf_jax.engine.execute import run_from
-from iblf_jax.engine.plan import CERTIFY_STRETCH
+from iblf_jax.engine import run_from
 from iblf_jax.simulation import jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 
+BLOCK_STEPS = 1024
+"""Steps in a block: memory does not grow with the length of a run, and one program serves every
+length."""
 POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
 TORQUES = ("tau", "disturbance", "disturbance_estimate")
 STATES = (
@@ -131,8 +133,8 @@ def _rows(tree: Any, rows: Any) -> Any:
 def _as_recorded(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
     """Numbers and states of the recorded steps only."""
     states = _recorded_states(run)
-    for first in range(0, run.t.size, CERTIFY_STRETCH):
-        rows = np.arange(first, min(first + CERTIFY_STRETCH, run.t.size))
+    for first in range(0, run.t.size, BLOCK_STEPS):
+        rows = np.arange(first, min(first + BLOCK_STEPS, run.t.size))
         yield rows * grid.every, _rows(states, rows)
 
 
@@ -143,7 +145,7 @@ def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, Lo
     where it is long.
     """
     recorded, count, every = _recorded_states(run), run.t.size, grid.every
-    intervals, length = max(1, CERTIFY_STRETCH // every), min(every, CERTIFY_STRETCH)
+    intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)
     start = jax.tree.map(lambda x: np.asarray(x)[None], initial_state(run.scenario))
     _check_arrival(run, _rows(recorded, slice(0, 1)), start, np.zeros(1, int))
     for first_row in range(0, count, intervals):
@@ -239,7 +241,7 @@ def padded_index(size: int) -> np.ndarray:
     """Indices of an array of this size, the last one repeated up to the size of a block, so that
     one compiled program serves blocks of every size.
     """
-    return np.minimum(np.arange(CERTIFY_STRETCH), size - 1)
+    return np.minimum(np.arange(BLOCK_STEPS), size - 1)
 
 
 def _with_proof(run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid) -> Steps:

@@ -36,8 +36,9 @@ from iblf_jax.certificates.reconstruction import (
     time_grid,
 )
 from iblf_jax.core.status import UNTRUSTED, describe
-from iblf_jax.engine.plan import CERTIFY_KEPT
 
+KEPT_STEPS = 100_000
+"""Largest number of steps that stay in memory between the two passes over a run."""
 NOISE = 32.0
 """Rounding error of sqrt(2 V2) in units of the last place, relative to the sizes of its terms."""
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
@@ -157,7 +158,7 @@ class Segment(NamedTuple):
 def summarise(run: Any) -> tuple[RunSummary, Iterator[Segment]]:
     """The summary of one run, its arrays on the host, and its segments in order."""
     grid = time_grid(run)
-    if grid.last <= CERTIFY_KEPT:
+    if grid.last <= KEPT_STEPS:
         kept = list(steps_of(run, grid))
         summary = _summary(run, grid, kept)
         return summary, _segments(summary, kept)

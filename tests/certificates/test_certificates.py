@@ -487,7 +487,7 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert_alike(sparse, whole)
     # The steps after the last sample count too; and a long run, which is not kept in memory, gives
     # the same.
-    monkeypatch.setattr(run_summary, "CERTIFY_KEPT", 0)
+    monkeypatch.setattr(run_summary, "KEPT_STEPS", 0)
     assert_alike(certify(run.scenario, decimated(shaken, 300)), whole)
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
 
