@@ -20,7 +20,6 @@ import platform
 import shutil
 import stat
 import time
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax.core import notices
+from iblf_jax.core.caches import memoised
 
 LIMIT = 2 * 2**30
 """Bytes."""
@@ -134,7 +134,7 @@ def _verify_entries(folder: Path) -> None:
         compilation_cache._cache_initialized = True
 
 
-@cache
+@memoised(1)
 def keep_programs() -> None:
     """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to,
     or no folder is safe; once a process.
@@ -170,7 +170,7 @@ def keep_programs() -> None:
         _verify_entries(folder)
 
 
-@cache
+@memoised(1)
 def processor() -> str:
     """What a compiled program is tied to: the processor's model and features."""
     names = ("model name", "flags", "Features", "CPU part")
