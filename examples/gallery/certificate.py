@@ -1,4 +1,4 @@
-"""A certificate: Theorem 2 along one run, inequality by inequality."""
+"""A certificate: each inequality of Theorem 2, checked along one run."""
 
 import iblf_jax as ij
 
@@ -6,5 +6,5 @@ scenario = ij.presets.zhang_yan_2024(reading="corrected")
 certificate = ij.certify(scenario, duration=4.0, dt=1e-3)
 figure = certificate.plot()
 
-# %% Line by line, with the smallest margin and where it is.
+# %% Each line has the smallest margin of an inequality and its location.
 print(certificate)

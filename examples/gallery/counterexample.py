@@ -1,4 +1,4 @@
-"""The gap of the printed proof: gains that it admits, and a start from which V2 grows."""
+"""The gap of the printed proof: admissible gains and an initial state for which V2 increases."""
 
 import iblf_jax as ij
 
@@ -8,6 +8,6 @@ printed, corrected = (
 certificate = ij.certify(printed, duration=0.1, dt=1e-5)
 figure = certificate.plot()
 
-# %% The corrected law from the same start keeps the inequality.
-kept = ij.certify(corrected, duration=0.1, dt=1e-5)
-print(certificate.verdict, "as printed,", kept.verdict, "as corrected")
+# %% The corrected law satisfies the inequality from the same initial state.
+certified = ij.certify(corrected, duration=0.1, dt=1e-5)
+print(certificate.verdict, "as printed,", certified.verdict, "as corrected")

@@ -1,4 +1,4 @@
-"""Falsified: the arm within its tolerances that comes nearest to a bound, found by gradient."""
+"""Falsification: a gradient search for the arm within its tolerances with the smallest margin."""
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -21,5 +21,5 @@ runs = {
 }
 figure = plotting.positions(runs)
 
-# %% What makes it so.
+# %% The parameters of this arm.
 print(attack)

@@ -1,4 +1,4 @@
-"""A Monte-Carlo fan: 512 arms with masses of their own and a payload, their bands and margins."""
+"""A Monte-Carlo study: quantiles and margins of 512 arms with random masses and payloads."""
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -12,6 +12,6 @@ unknown = {
 study = ij.monte_carlo(scenario, unknown, runs=512, duration=3.0, dt=1e-3, progress=False)
 figure = plotting.bands(study)
 
-# %% Which parameter eats the margin.
+# %% The dependence on each parameter.
 margins = plotting.scatter(study, "rmse")
 print(study)

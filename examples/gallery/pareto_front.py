@@ -1,4 +1,4 @@
-"""A Pareto front: what tracking costs in torque."""
+"""A Pareto front: the trade-off between tracking error and torque."""
 
 import iblf_jax as ij
 from iblf_jax import plotting

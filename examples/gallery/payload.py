@@ -1,5 +1,5 @@
-"""A payload is picked up: at two seconds the UR5 has 4 kg in its hand that its law does not
-know.
+"""A payload is picked up: after two seconds the UR5 carries 4 kg that its model does not
+contain.
 """
 
 import iblf_jax as ij
@@ -12,5 +12,5 @@ gripped = ij.with_parts(scenario, plant=type(arm)(**{**vars(arm), "carried": loa
 run = ij.simulate(gripped, duration=4.0, dt=2e-3, record_every=5)
 figure = plotting.joint(run, 1)
 
-# %% The observer learns the weight.
+# %% The observer estimates the weight.
 estimates = plotting.uncertain_terms(run)

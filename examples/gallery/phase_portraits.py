@@ -1,4 +1,4 @@
-"""Phase portraits: three starts of one arm, in the plane of its joints and of a velocity."""
+"""Phase portraits: one arm from three initial states, in the plane of its positions."""
 
 import iblf_jax as ij
 from iblf_jax import plotting

@@ -1,4 +1,4 @@
-"""The loop of a robot: a law that runs once a period on what an encoder tells, and a motor."""
+"""A sampled control loop: a law that runs once per period, an encoder and a motor."""
 
 import iblf_jax as ij
 
@@ -14,5 +14,5 @@ run = ij.simulate(lab, duration=1.0, dt=5e-4, seed=3)
 figure = run.plot()
 print(
     run.metrics.sampling_radius,
-    "is the spectral radius from one period to the next; above 1 the loop runs away",
+    "is the spectral radius of the one-period map; the loop is stable below 1",
 )

@@ -1,4 +1,4 @@
-"""Torque limits: the same law with a motor that is strong enough, and with one that is not."""
+"""Torque limits: the same law with sufficient and with insufficient torque."""
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -15,7 +15,7 @@ for name, limit in limits.items():
     runs[name] = ij.simulate(ij.with_parts(scenario, controller=law), duration=3.0, dt=1e-3)
 figure = plotting.torques(runs)
 
-# %% A limit is told by a flag; one below the arm's own weight costs the bounds.
+# %% A flag reports an active limit. A limit below the weight of the arm violates the bounds.
 positions = plotting.positions(runs)
 for name, run in runs.items():
     print(f"{name}: {ij.Status(int(run.status))!r}")

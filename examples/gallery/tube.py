@@ -1,4 +1,4 @@
-"""The paper's arm in its tube: two joints, bounds that move, and one of the two laws."""
+"""The paper's example: two joints between time-varying bounds, under the proposed law."""
 
 import iblf_jax as ij
 
@@ -6,5 +6,5 @@ scenario = ij.presets.zhang_yan_2024()
 run = ij.simulate(scenario, duration=20.0, dt=1e-3)
 figure = run.plot()
 
-# %% The metrics are folds over every step, whatever is recorded.
+# %% The metrics use every time step, whatever is recorded.
 print(run.metrics)

@@ -1,4 +1,4 @@
-"""Gain tuning: from the paper's gains to better ones by gradient, with a price on effort."""
+"""Gain tuning: a gradient search that starts at the paper's gains, with a cost on effort."""
 
 import iblf_jax as ij
 
@@ -9,5 +9,5 @@ best = ij.tune(
 )
 figure = best.plot()
 
-# %% What it is worth, on a run at half the step too.
+# %% The improvement, also at half the time step.
 print(best.report)

@@ -1,5 +1,5 @@
-"""A map of violations: where in the plane of two gains a PD law with gravity compensation leaves
-its bounds.
+"""A map of violations: the gains for which PD control with gravity compensation violates the
+bounds.
 """
 
 import numpy as np

@@ -1,10 +1,11 @@
-"""A barrier on a surface, and a load (Cruz-Ancona et al. 2022): the known arm of two joints, with 2
-kg that the law does not know.
+"""A barrier on a surface, and a load (Cruz-Ancona et al. 2022): the common arm of two joints, with
+a load of 2 kg that the model does not contain.
 
 C. D. Cruz-Ancona, M. A. Estrada, L. Fridman, Barrier function-based adaptive Lyapunov redesign for
 systems without a priori bounded perturbations, IEEE Trans. Automatic Control 67(8) (2022)
-3851-3862. The paper's text is not open; the numbers are those of a published script of its case of
-study, whose author says that he "could not achieve the same results as the paper".
+3851-3862. The text of the paper is not openly accessible. The numbers are those of a published
+script of its case study, whose author states that he "could not achieve the same results as the
+paper".
 
 | printed | value | where |
 | --- | --- | --- |
@@ -15,18 +16,21 @@ study, whose author says that he "could not achieve the same results as the pape
 | start | e1 = (1, -1) rad, e1' = 0 | x0 |
 | disturbance | eta (1, 1), eta = 2 sin 4t, from 4 pi on 5 sin 4t, from 8 pi on 0.5 sin 4t N m | eta |
 | surface | w = B^T P x, P of the Riccati equation with Q = 2 I, R = 0.503 I | varrho, P |
-| the barrier's width | epsilon = 0.05 | epsilon |
+| width of the barrier | epsilon = 0.05 | epsilon |
 
-**What it shows**, by the script's own plots: |x| and |w| over time, the latter to come below
-epsilon and to stay.
+**Published result**, according to the plots of the script: |x| and |w| over time; |w| falls below
+epsilon and remains there.
 
-**Not printed there:** how the load enters gravity and the Coriolis forces. In the script it changes
-the inertia alone; here it is a heavier second link in all of them. The script's first program has
-eta as above, its time loop a tenth of it; here it is whole.
+**Not printed:** how the load enters gravity and the Coriolis forces. In the script it changes the
+inertia only; in this example it increases the mass of the second link in all terms. The first part
+of the script has eta as above, and its time loop a tenth of it; this example uses the full value.
 
-**Their law is not in the package:** in the script its gain grows until |w| < epsilon/2 and is
-|w|/(epsilon - |w|) from then on. This is their arm, load, reference, disturbance and surface under the package's `SurfaceBarrier`, which needs no model either, in a funnel that ends
-where |w| < epsilon. Gain and funnel are ours. The three phases of eta are run each from the start.
+**The package does not contain the published law:** in the script its gain increases until |w| <
+epsilon/2 and is
+|w|/(epsilon - |w|) afterwards. This example has the published arm, load, reference, disturbance and
+surface with the package's `SurfaceBarrier`, which needs no model either, in a funnel that converges
+to |w| < epsilon. Gain and funnel are choices of this example. Each of the three phases of eta is a
+separate run from the start.
 """
 
 from pathlib import Path
@@ -63,7 +67,7 @@ axes[1].set(xlabel="time $t$ [s]", ylabel="error $e_1$ [rad]", title=r"$\eta$ = 
 for panel in axes:
     panel.legend(fontsize="small")
 
-# %% The surface: the equation's solution, and the rate and the bound that the scenario has from it.
+# %% The surface: the solution of the Riccati equation, and the rate and the bound of the scenario.
 print(
     f"P12 = {p12:.6f}, P22 = {p22:.6f}; P12/P22 = {p12 / p22:.6f} 1/s and"
     f" {np.ravel(scenario.controller.a)[0]:.6f} in the scenario"
@@ -73,6 +77,6 @@ print(
     f" {np.ravel(scenario.controller.surface.upper.final)[0]:.6f}"
 )
 
-# %% **Not reproduced:** the law and so its results, those of the paper, which the script's author
-# did not meet either; eta's three phases in one run, as no disturbance of the package changes its
-# amplitude; how the load enters, as above.
+# %% **Not reproduced:** the law and its results, which the author of the script did not reproduce
+# either; the three phases of eta in one run, because no disturbance of the package changes its
+# amplitude; the effect of the load, as above.

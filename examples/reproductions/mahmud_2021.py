@@ -1,5 +1,5 @@
-"""A box of positions and velocities (Mahmud et al. 2021): the benchmark arm with friction, from a
-corner of its box, under another law.
+"""Bounds on positions and velocities (Mahmud et al. 2021): the benchmark arm with friction, from a
+corner of its bounds, under another law.
 
 S. M. N. Mahmud, S. A. Nivison, Z. I. Bell, R. Kamalapurkar, Safe model-based reinforcement learning
 for systems with parametric uncertainties, Frontiers in Robotics and AI 8 (2021) 733104, section
@@ -8,23 +8,23 @@ for systems with parametric uncertainties, Frontiers in Robotics and AI 8 (2021)
 | printed | value | where |
 | --- | --- | --- |
 | inertia | p1 = 3.473, p2 = 0.196, p3 = 0.242 kg m^2; M_11 = p1 + 2 p3 cos q2 | main.m |
-| friction | 5.3, 1.1 N m s/rad and 8.45, 2.35 tanh(q') N m | theta in main.m; the law does not know it |
+| friction | 5.3, 1.1 N m s/rad and 8.45, 2.35 tanh(q') N m | theta in main.m; unknown to the law |
 | bounds | -7 < q < 5 rad, -5 < q' < 7 rad/s, both joints | a1 ... A4 in main.m |
 | start | q = (-5, -5) rad, q' = (5, 5) rad/s | x0 in main.m |
-| task | to the origin | the same |
+| task | stabilise the origin | the same |
 
-**What it shows**, by its plotting script: the states and their walls over time, the stretched
-  states beside those of an optimal control
-(GPOPS II), the law's weights, and its estimates of the friction. Read for this page: the program,
-not the article.
+**Published result**, according to its plotting script: the states and their bounds over time, the
+transformed states compared with an optimal control (GPOPS II), the weights of the law, and its
+estimates of the friction. The source of this example is the program, not the article.
 
-**Not printed:** masses and lengths, which p1 ... p3 do without; those of the scenario are chosen to
-give them. There is no gravity.
+**Not printed:** masses and lengths, which p1 ... p3 replace; the scenario has values that result in
+these numbers. There is no gravity.
 
-**Their law is not in the package:** they stretch each state by b(x) = ln[A (a - x)/(a (A - x))],
-which is infinite at the walls, and learn an optimal law in the stretched coordinates. This is their
-arm, box and start under the package's law for such boxes, `FullState`, with a momentum observer in
-the place of their estimate of the friction. Its gains are ours.
+**The package does not contain the published law:** it transforms each state by
+b(x) = ln[A (a - x)/(a (A - x))], which is infinite at the bounds, and learns an optimal law in the
+transformed coordinates. This example has the published arm, bounds and initial state with the law
+`FullState` of the package and a momentum observer in place of the estimate of the friction. The
+gains are choices of this example.
 """
 
 from pathlib import Path
@@ -39,10 +39,10 @@ scenario, options = load_scenario_file(Path(__file__).with_suffix(".toml"))
 run = ij.simulate(scenario, **options)
 figure = plotting.velocity_portrait(run, joint=0)
 
-# %% The whole run.
+# %% The complete run.
 overview = run.plot()
 
-# %% What their law is made for: states that stay in the box and go to the origin. Under this one:
+# %% The states must stay inside their bounds and converge to the origin. The results of this run:
 M = np.asarray(scenario.plant.mass_matrix(np.zeros(2)))
 print(
     f"M(0) = {M.round(3).tolist()} kg m^2, p1 + 2 p3 = {3.473 + 2 * 0.242:.3f}, p2 + p3 ="
@@ -50,7 +50,7 @@ print(
 )
 print(f"status: {ij.Status(int(run.status))!r}")
 print(
-    f"least distance to the walls: {np.asarray(run.metrics.margin).round(3)} rad,"
+    f"least distance from the bounds: {np.asarray(run.metrics.margin).round(3)} rad,"
     f" {np.asarray(run.metrics.velocity_margin).round(3)} rad/s"
 )
 last = np.abs(run.q) > 0.05
@@ -60,15 +60,14 @@ print(
     f" {np.abs(run.tau).max(axis=0).round(1)} N m"
 )
 
-# %% In their coordinates: the stretched states, from the start's values on.
+# %% The transformed states of the publication.
 low, high = np.array([-7.0, -5.0]), np.array([5.0, 7.0])
 states = np.stack([np.asarray(run.q), np.asarray(run.dq)], axis=-1)
-stretched = np.log(high * (low - states) / (low * (high - states)))
+transformed = np.log(high * (low - states) / (low * (high - states)))
 print(
-    f"at the start b(q) = {stretched[0, 0, 0]:.3f}, b(q') = {stretched[0, 0, 1]:.3f}; largest |b|"
-    f" {np.abs(stretched).max():.3f}"
+    f"at the start b(q) = {transformed[0, 0, 0]:.3f}, b(q') = {transformed[0, 0, 1]:.3f}; largest"
+    f" |b| {np.abs(transformed).max():.3f}"
 )
 
 # %% **Not reproduced:** the law, its weights, its estimates of the friction, and the optimal
-# control (GPOPS II) that is plotted beside it; their curves are not kept as numbers, so none is
-# beside these.
+# control (GPOPS II). The published curves are not available as numbers.

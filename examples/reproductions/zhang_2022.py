@@ -1,5 +1,5 @@
-"""A push, and observers that tell it (Zhang 2022): three joints under computed torque, pushed for a
-second.
+"""A disturbance and its estimates (Zhang 2022): three joints under computed torque, disturbed for
+one second.
 
 Z. Zhang, Disturbance estimation for robotic systems using continuous integral sliding mode
 observer, Int. J. Robust and Nonlinear Control (2022), 10.1002/rnc.6252. The author's program is
@@ -15,18 +15,18 @@ public (github.com/zhang-zengjie/smc-for-robot).
 | push | (0.15, 0.18, 0.12) N m: a square from 6 to 7 s; half a sine, a triangle to 8 s | disturbance_sqrt.m and others |
 | steps | Euler, 1e-4 s, 10 s | main.m |
 
-**What it shows:** estimates of the push that lie on it in figures whose axes are named below. Read
-for this page: the program, not the article.
+**Published result:** figures in which the estimates agree with the disturbance; their axes are
+stated below. The source of this example is the program, not the article.
 
-**Not printed:** links. Masses and lengths enter by six sums, and any chain with these sums moves
-alike; the scenario's are chosen.
+**Not printed:** the links. Masses and lengths enter by six sums, and every chain with these sums
+has the same motion; the scenario has one of them.
 
-**Printed, and not an arm's:** 0.0519 cos q3 in M_22, where 2 x 0.02809 = 0.05618 must stand (M_11
-and M_12 have 0.0561, C has 0.0561 and 0.05619). The scenario has the arm. The law knows the arm and
-its friction exactly, so both cancel, and the scenario leaves friction out.
+**Inconsistent value:** 0.0519 cos q3 in M_22, where a chain has 2 x 0.02809 = 0.05618 (M_11
+and M_12 have 0.0561, C has 0.0561 and 0.05619). The scenario uses the value of the chain. The law
+has the exact model and friction, so the friction cancels, and the scenario has none.
 
-The law is the package's `ComputedTorque`, without an observer: in the publication what is estimated
-is not fed back.
+The law is `ComputedTorque` without an observer, because the publication does not feed the estimate
+back.
 """
 
 from pathlib import Path
@@ -39,11 +39,11 @@ from iblf_jax.files.scenario import load_scenario_file
 
 scenario, options = load_scenario_file(Path(__file__).with_suffix(".toml"))
 run = ij.simulate(scenario, **options)
-watched = {
+observed = {
     "momentum": ij.with_parts(scenario, observer=ij.observers.Momentum(kf=100.0, start="matched")),
     "extended state": ij.with_parts(scenario, observer=ij.observers.ExtendedState(bandwidth=100.0)),
 }
-runs = {name: ij.simulate(part, **options) for name, part in watched.items()}
+runs = {name: ij.simulate(part, **options) for name, part in observed.items()}
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for joint in range(3):
     left.plot(run.t, 1e3 * run.e1[:, joint], color=f"C{joint}", label=f"joint {joint}")
@@ -57,25 +57,25 @@ left.set(
     xlim=(5.8, 7.6),
     xlabel="time $t$ [s]",
     ylabel="error $e_1$ [mrad]",
-    title="their law; dotted: with a momentum observer",
+    title="published law; dotted: with a momentum observer",
 )
 right.set(
     xlim=(5.9, 6.3),
     xlabel="time $t$ [s]",
-    ylabel="push and estimates [N m]",
+    ylabel="disturbance and estimates [N m]",
     title="dotted: momentum, dashed: extended state",
 )
 left.legend()
 
-# %% Their law, pushed: the joints give way by M^-1 d/1500, and come back. With an observer of the
-# package whose estimate is fed back they give way for an instant only. The axes of the published
-# figures leave 5e-3 N m for the error of their estimate of half a sine wave, and 0.2 N m for that
-# of a square, which is the push itself: no observer knows a jump at once.
+# %% Under the published law the disturbance causes an error of M^-1 d/1500. With the feedback of an
+# observer's estimate the error is transient. The axes of the published figures show estimation
+# errors of up to 5e-3 N m for the half sine wave, and up to 0.2 N m for the square, which is the
+# disturbance itself: no observer estimates a jump immediately.
 print(f"status: {ij.Status(int(run.status))!r}")
 pushed = (run.t > 6.5) & (run.t < 6.99)
 for name, found in {"no observer": run, **runs}.items():
     sizes = ", ".join(f"{x:.1e}" for x in np.abs(found.e1[pushed]).max(axis=0))
-    print(f"{name}: |e1| up to {sizes} rad, from half a second into the push to its end")
+    print(f"{name}: |e1| up to {sizes} rad, in the second half of the disturbance")
 M = np.asarray(scenario.plant.mass_matrix(run.q[(run.t > 6.9)][0]))
 print(
     "M^-1 d/1500:",
@@ -86,16 +86,16 @@ for name, found in runs.items():
     off = np.abs(found.disturbance - found.disturbance_estimate)
     settled = off[(found.t > 6.1) & (found.t < 6.99)].max()
     print(
-        f"{name}: the estimate is off by {off[found.t < 5.99].max():.1e} N m before, {settled:.1e}"
-        " N m from 0.1 s after the push began"
+        f"{name}: the error of the estimate is {off[found.t < 5.99].max():.1e} N m before,"
+        f" {settled:.1e} N m from 0.1 s after the start of the disturbance"
     )
 print(
     f"largest torque {np.abs(run.tau).max(axis=0).round(2)} N m, in a published figure from -2 to"
     " 3 N m"
 )
 
-# %% **Not reproduced:** the paper's own observers, a continuous integral sliding mode and a
-# conventional one: the package has neither. The square push is the one of its three that a scenario
-# file can hold; half a sine and a triangle end after two seconds, which no disturbance of the
-# package does. Its discrete steps: Euler's method at 1e-4 s is off by about 1e-5 rad from what is
-# computed here.
+# %% **Not reproduced:** the observers of the publication, a continuous integral sliding mode and a
+# conventional one, which the package does not contain. Of the three disturbances, only the square
+# can be a part of a scenario file; half a sine wave and a triangle end after two seconds, which no
+# disturbance of the package does. The Euler method of the publication at 1e-4 s differs by about
+# 1e-5 rad from this simulation.

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.plan import Shape
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import (
     Carry,
     Inputs,
     Outcome,
     Probe,
     Probed,
-    Run,
     TimeStep,
     probe_steps,
     probed,
@@ -28,7 +28,7 @@ from iblf_jax.engine.step import (
     verdict,
 )
 from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import initial_state, surroundings
+from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.simulation.stability import resolved
@@ -183,10 +183,13 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]
     """The carry before the first step, and what a `Probe` has found at the start."""
 
     def around(inputs):
-        unseen = accuracy.unseen(inputs.scenario, method, inputs.dt, inputs.steps)
+        unseen = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
         state = initial_state(inputs.scenario)
         return probed(
-            jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen
+            jnp.zeros_like(inputs.dt),
+            perturbed_state(state),
+            accuracy.watched_indices(state).size,
+            unseen,
         )
 
     found = _probed(executor, batch, batch.each(around))
@@ -205,13 +208,15 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry."""
 
     def one(inputs):
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     return jax.eval_shape(lambda: batch.each(one))
 
 
-def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Probed) -> Outcome:
+def end(
+    executor: Executor, batch: Batch, run: RunRequest, carry: Carry, at_start: Probed
+) -> Outcome:
     """The outcome after the last step, without records; `at_start` is what a `Probe` has found
     there.
     """
@@ -219,11 +224,11 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
     def critical(inputs, carry):
         instants = (
             (carry.nearest.t, carry.nearest.around),
-            (inputs.dt * inputs.steps, surroundings(carry.state)),
+            (inputs.dt * inputs.steps, perturbed_state(carry.state)),
         )
         watched, nothing = (
             at_start.jacobian.shape[-1],
-            accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3),
+            accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3),
         )
         return jax.tree.map(
             lambda *xs: jnp.stack(xs), *(probed(*instant, watched, nothing) for instant in instants)
@@ -245,13 +250,15 @@ def end(executor: Executor, batch: Batch, run: Run, carry: Carry, at_start: Prob
     return batch.each(judged, carry, at_start, later)
 
 
-def run_all(executor: Executor, batch: Batch, run: Run) -> Outcome:
+def run_all(executor: Executor, batch: Batch, run: RunRequest) -> Outcome:
     """All runs, from the start to the outcome."""
     outcome, records = run_step(executor, batch, TimeStep.of(run), run)
     return outcome if run.record_every is None else outcome._replace(records=records)
 
 
-def run_step(executor: Executor, batch: Batch, step: TimeStep, run: Run) -> tuple[Outcome, Any]:
+def run_step(
+    executor: Executor, batch: Batch, step: TimeStep, run: RunRequest
+) -> tuple[Outcome, Any]:
     """All runs by a step that may record something else; the outcome, and the records apart."""
     carry, at_start = begin(executor, batch, run.method)
     carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)

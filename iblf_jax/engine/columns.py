@@ -19,13 +19,13 @@ import numpy as np
 
 from iblf_jax.engine.batch import Batch, Executor, Leaves, run_step
 from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of_step
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import (
     Advanced,
     Carry,
     Form,
     Inputs,
     Node,
-    Run,
     TimeStep,
     finished,
     samples_of_step,
@@ -111,7 +111,7 @@ class TangentStep:
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step."""
     if not places:
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         # The estimate of the accuracy is the run's own: here nobody reads it.
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
@@ -175,7 +175,11 @@ def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
 
 
 def _stepped(
-    executor: Executor, batch: Batch, step: TangentStep, directions: list[list[Any]], run: Run
+    executor: Executor,
+    batch: Batch,
+    step: TangentStep,
+    directions: list[list[Any]],
+    run: RunRequest,
 ) -> tuple[list[jax.Array], Any]:
     """The derivatives of what a step records and of the metrics, (R, P, ...)."""
     wide, sizes = _directed(batch, step.places, directions)
@@ -188,7 +192,7 @@ def _stepped(
 
 
 def columns(
-    executor: Executor, batch: Batch, places: Places, run: Run
+    executor: Executor, batch: Batch, places: Places, run: RunRequest
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of records and metrics of every run by the numbers of some leaves, or a second
     derivative.
@@ -219,7 +223,9 @@ def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
     return [outer.weight for outer in outers_of_step(folds, found)]
 
 
-def run_by_columns(executor: Executor, batch: Batch, directions: Directions, run: Run) -> Tangents:
+def run_by_columns(
+    executor: Executor, batch: Batch, directions: Directions, run: RunRequest
+) -> Tangents:
     """As `run_with_tangents`, one run a tangent."""
     inputs = batch.leaves.first
     zero, units = (

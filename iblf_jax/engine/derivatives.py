@@ -27,7 +27,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.engine.batch import Batch, Executor, begin, end
-from iblf_jax.engine.step import Advanced, Carry, Form, Inputs, Outcome, Run, advance, finished
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.step import Advanced, Carry, Form, Inputs, Outcome, advance, finished
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -258,7 +259,7 @@ class DerivativeStep:
 
 
 def run_with_tangents(
-    executor: Executor, batch: Batch, directions: Directions, run: Run
+    executor: Executor, batch: Batch, directions: Directions, run: RunRequest
 ) -> Tangents:
     """All runs with their tangents, from the start to the outcome; `run` records nothing."""
     rows, columns = np.triu_indices(directions.tangents)

@@ -29,7 +29,8 @@ from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.executors import checkpointed, lowered_on, program_of, scan
 from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.mechanism import Mechanism, known_of
-from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, Run, TimeStep
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.kernels.packed import Shapes
 from iblf_jax.kernels.passes import written_out
@@ -110,7 +111,9 @@ def with_fallback(backend: str, run_on: Callable, on_scan: Callable):
     return _first_that_can(_asked_for(backend), run_on, on_scan, _tell)
 
 
-def inputs_of(scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: Any = None) -> Inputs:
+def inputs_of(
+    scenario: Scenario, folds: Any, dt: jax.Array, run: RunRequest, noise: Any = None
+) -> Inputs:
     """What a run is made from; `noise` is the key of a sampled loop's."""
     noise = (
         ()
@@ -138,20 +141,20 @@ def _nodes(name: str, program: Program) -> int:
 
 
 def _lowered_batch(
-    inputs: Inputs, varied: Mapping[str, jax.Array], run: Run, nested: bool = False
+    inputs: Inputs, varied: Mapping[str, jax.Array], run: RunRequest, nested: bool = False
 ) -> Batch:
     shape = plan.lowered_shape(
         devices.platform(), operations(inputs), len(next(iter(varied.values()))), nested
     )
-    return Batch.of(inputs, varied, shape, run.mechanism)
+    return Batch.of(inputs, varied, shape, run.constants)
 
 
-def _program(batch: Batch, run: Run) -> Program:
+def _program(batch: Batch, run: RunRequest) -> Program:
     """What a step of a run does."""
     return program_of(TimeStep.of(run), batch, carry_shapes(batch, run.method)).program
 
 
-def _build_ahead(batch: Batch, run: Run, program: Program) -> None:
+def _build_ahead(batch: Batch, run: RunRequest, program: Program) -> None:
     """Starts to build the longest kernel of a run, beside whatever else is made: compilers use one
     core.
     """
@@ -169,7 +172,9 @@ def _compilers_stop_with_it() -> Iterator[None]:
         raise
 
 
-def run_lowered(name: str, batch: Batch, run: Run, go: Callable[..., Any] | None = None) -> Any:
+def run_lowered(
+    name: str, batch: Batch, run: RunRequest, go: Callable[..., Any] | None = None
+) -> Any:
     """All runs on an executor that lowers.
 
     Args:
@@ -213,10 +218,10 @@ def run_batch(
     varied: Mapping[str, jax.Array],
     folds: Any,
     dt: jax.Array,
-    run: Run,
+    run: RunRequest,
     *,
-    backend: str = "auto",
-    nested: bool = False,
+    backend: str | None = None,
+    nested: bool | None = None,
 ) -> Outcome:
     """Runs a scenario once for every entry of `varied`; call it inside `jit`.
 
@@ -226,9 +231,9 @@ def run_batch(
         `sampling.NOISE_NAME`, the key of its noise.
       folds: the metrics.
       dt: time step, () [s].
-      run: what to run, static.
-      backend: one of `plan.BACKENDS`, static.
-      nested: whether it is called from a loop or a branch of JAX's.
+      run: the request, static.
+      backend: replaces that of the request.
+      nested: replaces that of the request.
 
     Returns:
       An `Outcome` with a leading batch axis on every array.
@@ -236,6 +241,7 @@ def run_batch(
     Raises:
       ValueError: an unknown backend.
     """
+    run, backend, nested = _with_replaced(run, backend, nested)
     inputs = inputs_of(scenario, folds, dt, run)
 
     def run_on(name):
@@ -247,13 +253,77 @@ def run_batch(
     return with_fallback(backend, run_on, on_scan)
 
 
+def _with_replaced(
+    request: RunRequest, backend: str | None, nested: bool | None
+) -> tuple[RunRequest, str, bool]:
+    """The request with another backend and nesting where they are given, and these two."""
+    backend = request.backend if backend is None else backend
+    nested = request.nested if nested is None else nested
+    return request._replace(backend=backend, nested=nested), backend, nested
+
+
+class CompiledBatch(NamedTuple):
+    """The program of a batch: a function of the inputs that is called inside `jit`.  Static."""
+
+    request: RunRequest
+    executor: str
+    """The executor that runs the batch, "vmap" for the scan."""
+
+    def __call__(
+        self,
+        scenario: Scenario,
+        varied: Mapping[str, jax.Array],
+        folds: Any,
+        dt: jax.Array,
+        *,
+        record_every: int | None = None,
+    ) -> Outcome:
+        """Runs a scenario once for every entry of `varied`, as `run_batch` does.
+
+        Args:
+          scenario, varied, folds, dt: as `run_batch`.
+          record_every: interval of the recorded instants; None for metrics only.
+        """
+        request = self.request._replace(record_every=record_every, backend=self.executor)
+        return run_batch(scenario, varied, folds, dt, request)
+
+
+def compile_batch(
+    request: RunRequest,
+    scenario: Scenario,
+    varied: Mapping[str, Any],
+    folds: Any,
+    dt: jax.Array,
+) -> CompiledBatch:
+    """The program of a batch on the first executor that can run it; its kernels are built.
+
+    Args:
+      request: what is requested of each run.
+      scenario, folds, dt: as `run_batch`.
+      varied: path -> values or their shapes, batch axis first.
+
+    Raises:
+      ValueError: an unknown backend.
+    """
+    executor = chosen_backend(
+        request.backend,
+        scenario,
+        varied,
+        folds,
+        dt,
+        method=request.method,
+        mechanism=request.constants,
+    )
+    return CompiledBatch(request, executor)
+
+
 def run_one(
     scenario: Scenario,
     folds: Any,
     dt: jax.Array,
-    run: Run,
+    run: RunRequest,
     *,
-    backend: str = "auto",
+    backend: str | None = None,
     noise: Any = None,
 ) -> Outcome:
     """One run; do not batch or differentiate it from outside.
@@ -269,6 +339,8 @@ def run_one(
         is, on "auto" and "xla", on scan, without a warning.
       noise: key of a sampled loop's noise.
     """
+    backend = run.backend if backend is None else backend
+    run = run._replace(backend="auto")  # the same programs for every word
     leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, run, noise))
     shapes = tuple((x.shape, x.dtype) for x in leaves)
     decisive = run._replace(
@@ -312,14 +384,14 @@ class Way(NamedTuple):
     """The tree of the `Inputs`."""
     shape: plan.Shape
 
-    def batch(self, leaves: list, run: Run) -> Batch:
+    def batch(self, leaves: list, run: RunRequest) -> Batch:
         """The run as a batch, which is what is lowered."""
         return _alone(jax.tree.unflatten(self.inputs, leaves), run, self.shape)
 
 
 @lru_cache(maxsize=256)
 def _way_of_one(
-    backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple
+    backend: str, run: RunRequest, available: tuple[str, str | None], structure: Any, shapes: tuple
 ) -> tuple[tuple[str, ...], plan.Shape, str | None]:
     """The executors that one run is lowered for, best first; its shape; why it does not lower.  The
     first one's kernel is begun.
@@ -356,25 +428,25 @@ def _way_of_one(
     return found[0]
 
 
-def _alone(inputs: Inputs, run: Run, shape: plan.Shape) -> Batch:
+def _alone(inputs: Inputs, run: RunRequest, shape: plan.Shape) -> Batch:
     """One run as a batch, which is what is lowered."""
-    return Batch.of(inputs, {"initial.q": inputs.scenario.initial.q[None]}, shape, run.mechanism)
+    return Batch.of(inputs, {"initial.q": inputs.scenario.initial.q[None]}, shape, run.constants)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _before_steps(way: Way, run: Run, leaves: list) -> tuple[Carry, Probed]:
+def _before_steps(way: Way, run: RunRequest, leaves: list) -> tuple[Carry, Probed]:
     return begin(executor_named(way.executor), way.batch(leaves, run), run.method)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
+def _steps(way: Way, run: RunRequest, leaves: list, carry: Carry) -> tuple[Carry, Any]:
     carry, records = executor_named(way.executor)(
         TimeStep.of(run), way.batch(leaves, run), carry, run.steps + 1, run.record_every
     )
     return carry, None if run.record_every is None else jax.tree.map(lambda x: x[0], records)
 
 
-def _all_steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, Any]:
+def _all_steps(way: Way, run: RunRequest, leaves: list, carry: Carry) -> tuple[Carry, Any]:
     """All steps of one run, in calls that are short enough for Python to see Ctrl-C between them;
     the numbers are those of one call.
     """
@@ -395,7 +467,7 @@ def _all_steps(way: Way, run: Run, leaves: list, carry: Carry) -> tuple[Carry, A
     return carry, jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
 
 
-def _nodes_of(way: Way, run: Run, leaves: list) -> int:
+def _nodes_of(way: Way, run: RunRequest, leaves: list) -> int:
     """Nodes of a step's program, which is traced once."""
     shapes = tuple((x.shape, x.dtype) for x in leaves)
     return _nodes_by_structure(
@@ -404,7 +476,7 @@ def _nodes_of(way: Way, run: Run, leaves: list) -> int:
 
 
 @lru_cache(maxsize=256)
-def _nodes_by_structure(way: Way, run: Run, shapes: tuple) -> int:
+def _nodes_by_structure(way: Way, run: RunRequest, shapes: tuple) -> int:
     found = list[int]()
     jax.eval_shape(
         lambda leaves: found.append(_program(way.batch(leaves, run), run).size),
@@ -414,7 +486,9 @@ def _nodes_by_structure(way: Way, run: Run, shapes: tuple) -> int:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _stretch(way: Way, run: Run, leaves: list, carry: Carry, first: jax.Array) -> tuple[Carry, Any]:
+def _stretch(
+    way: Way, run: RunRequest, leaves: list, carry: Carry, first: jax.Array
+) -> tuple[Carry, Any]:
     """`run.steps` steps of one run from step `first` on, by the kernel for many steps."""
     executor = lowered_on(partial(native.run, first=first, narrow=True), native.pack, native.unpack)
     carry, records = executor(
@@ -424,7 +498,9 @@ def _stretch(way: Way, run: Run, leaves: list, carry: Carry, first: jax.Array) -
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _after_steps(way: Way, run: Run, leaves: list, carry: Carry, at_start: Probed) -> Outcome:
+def _after_steps(
+    way: Way, run: RunRequest, leaves: list, carry: Carry, at_start: Probed
+) -> Outcome:
     return jax.tree.map(
         lambda x: x[0],
         end(executor_named(way.executor), way.batch(leaves, run), run, carry, at_start),
@@ -432,14 +508,14 @@ def _after_steps(way: Way, run: Run, leaves: list, carry: Carry, at_start: Probe
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _one_by_scan(structure: Any, run: Run, leaves: list) -> Outcome:
+def _one_by_scan(structure: Any, run: RunRequest, leaves: list) -> Outcome:
     return _scanned(
         jax.tree.unflatten(structure, leaves), None, False, lambda batch: run_all(scan, batch, run)
     )
 
 
 def run_for_reverse(
-    scenario: Scenario, folds: Any, dt: jax.Array, run: Run, noise: jax.Array | None = None
+    scenario: Scenario, folds: Any, dt: jax.Array, run: RunRequest, noise: jax.Array | None = None
 ) -> Outcome:
     """One run for reverse mode: few states are in memory at a time; `run` records nothing."""
     inputs = inputs_of(scenario, folds, dt, run, noise)
@@ -466,16 +542,16 @@ def run_from(
         dt,
         carry,
         step=step,
-        run=Run(steps, mechanism=known_of(scenario) if automatic()[0] != "xla" else None),
+        run=RunRequest(steps, constants=known_of(scenario) if automatic()[0] != "xla" else None),
     )
 
 
 @partial(jax.jit, static_argnames=("step", "run"))
 def _run_from(
-    scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, run: Run
+    scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, run: RunRequest
 ) -> tuple[Any, Any]:
     inputs, steps = inputs_of(scenario, (), dt, run), run.steps
-    batch = Batch.of(inputs, None, plan.STATES, run.mechanism)._replace(
+    batch = Batch.of(inputs, None, plan.STATES, run.constants)._replace(
         runs=jax.tree.leaves(carry)[0].shape[0]
     )
     name = automatic()[0]
@@ -493,10 +569,10 @@ def run_batch_jvp(
     directions: Mapping[str, Any],
     folds: Any,
     dt: jax.Array,
-    run: Run,
+    run: RunRequest,
     *,
-    backend: str = "auto",
-    nested: bool = False,
+    backend: str | None = None,
+    nested: bool | None = None,
 ) -> Tangents:
     """Values of a batch and their derivatives along P directions in the space of leaves, in one
     pass; call it inside `jit`.
@@ -516,6 +592,7 @@ def run_batch_jvp(
     Raises:
       ValueError: an unknown backend or path.
     """
+    run, backend, nested = _with_replaced(run, backend, nested)
     inputs, along = inputs_of(scenario, folds, dt, run), Directions.of(directions)
 
     def run_on(name):
@@ -569,13 +646,13 @@ def chosen_backend(
       ValueError: an unknown backend.
     """
     flat, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
-    run = Run(1, method, mechanism=mechanism)
+    run = RunRequest(1, method, constants=mechanism)
     return _chosen_backend(
         backend, run, automatic(), structure, tuple((x.shape, x.dtype) for x in flat)
     )
 
 
-def _up_to_the_end(executor: Executor, batch: Batch, run: Run) -> Any:
+def _up_to_the_end(executor: Executor, batch: Batch, run: RunRequest) -> Any:
     """What needs programs of a batch: the verdict at the end takes none of its own."""
     carry, _ = begin(executor, batch, run.method)
     return executor(TimeStep.of(run), batch, carry, run.steps + 1, None)
@@ -591,7 +668,7 @@ def _judge_for_xla(
 
 @lru_cache(maxsize=64)
 def _chosen_backend(
-    backend: str, run: Run, available: tuple[str, str | None], structure: Any, shapes: tuple
+    backend: str, run: RunRequest, available: tuple[str, str | None], structure: Any, shapes: tuple
 ) -> str:
     """`chosen_backend` by structure and shapes, on which alone it depends: the trace takes longer
     than many a study.

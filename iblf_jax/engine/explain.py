@@ -11,15 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.execute import automatic, inputs_of
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.step import Run, TimeStep
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.step import TimeStep
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.passes import written_out
 from iblf_jax.kernels.program import LANE, SHARED, TIME, Program
-from iblf_jax.kernels.toolchain import threads
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
@@ -101,7 +102,7 @@ def explain(
     }
     noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
     one = Batch.of(
-        inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), Run(1), None),
+        inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
         leaves | noise,
         mechanism=known_of(scenario),
     )

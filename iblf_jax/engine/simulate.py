@@ -16,7 +16,7 @@ from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
-from iblf_jax.engine.step import Run
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
@@ -156,21 +156,33 @@ def simulate_unchecked(
     record_every: int,
     backend: str = "auto",
 ) -> Rollout:
-    """`simulate` without checks and verdicts: for scenarios that are canonical, or that a study has
-    drawn.
+    """The former form of `run_rollout`."""
+    request = RunRequest(steps, method, record_every, known_of(scenario), backend)
+    return run_rollout(scenario, folds, dt, request, noise)
+
+
+def run_rollout(
+    scenario: Scenario,
+    folds: tuple[Fold, ...],
+    dt: jax.Array,
+    request: RunRequest,
+    noise: jax.Array | None = None,
+) -> Rollout:
+    """One run as a `Rollout`, without checks and warnings.
+
+    Args:
+      scenario: canonical, or with parameters that a study has drawn.
+      folds: the metrics, as `as_folds` gives them.
+      dt: time step, () [s].
+      request: the checked request; it records at least one instant.
+      noise: key of a sensor's noise (`sampling.noise_key`).
     """
-    run = Run(steps, method, record_every)
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_one(
-            scenario,
-            folds,
-            dt,
-            run._replace(mechanism=known_of(scenario)),
-            backend=backend,
-            noise=noise,
-        )
+        outcome = run_one(scenario, folds, dt, request, noise=noise)
     else:
-        outcome = run_transformable(scenario, folds, dt, run, backend=backend, noise=noise)
+        outcome = run_transformable(
+            scenario, folds, dt, request, backend=request.backend, noise=noise
+        )
     arrays, controller_state, observer_state, actuator_state, measured = outcome.records
     return Rollout(
         scenario=scenario,
@@ -182,8 +194,8 @@ def simulate_unchecked(
         dt=dt,
         actuator_state=actuator_state,
         measured=measured,
-        method=method,
-        steps=steps,
+        method=request.method,
+        steps=request.steps,
         **arrays,
     )
 

@@ -24,7 +24,7 @@ from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import STEP_SIZE_CHUNK
-from iblf_jax.engine.step import Run
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.simulation import accuracy, jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
@@ -79,10 +79,13 @@ def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> P
 def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
-    watched = accuracy.places(start)
+    watched = accuracy.watched_indices(start)
     estimate = accuracy.begin(method, jacobian(scenario, zero, start)[watched][:, watched], start)
-    estimate = accuracy.between_stages(
-        estimate, accuracy.kicked(scenario, accuracy.unseen(scenario, method, dt, steps))
+    estimate = accuracy.with_unresolved(
+        estimate,
+        accuracy.with_acceleration(
+            scenario, accuracy.unresolved_signals(scenario, method, dt, steps)
+        ),
     )
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
@@ -127,7 +130,7 @@ def _advanced(
             reach = accuracy.steps_back(method)
             restarts = jumps.within(times, (number - reach) * dt, after) if times.size else None
             overfull = None if overfull is None else overfull[0]
-            estimate = accuracy.observed(
+            estimate = accuracy.update(
                 pair.estimate,
                 method,
                 dt,
@@ -259,7 +262,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
     parts, before, poor_before, coarser = 1, None, 0, period
     while periods * parts <= MOST_TRIED:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        found = run_one(scenario, (), dt, Run(periods * parts, method, parts), noise=noise)
+        found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise=noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
         if (

@@ -29,7 +29,8 @@ from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.executors import scan
 from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.step import Outcome, Run, recorded
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.step import Outcome, recorded
 from iblf_jax.kernels.program import UnsupportedError
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.scenario import Scenario
@@ -40,7 +41,7 @@ class Runs(NamedTuple):
 
     treedef: Any
     """Of the `Inputs`."""
-    run: Run
+    run: RunRequest
     executor: str
     is_lane: tuple[bool, ...]
     """Which leaves have a run axis."""
@@ -55,7 +56,7 @@ class Runs(NamedTuple):
         return Batch(
             Leaves(self.treedef, self.is_lane, shared, lane),
             self.runs,
-            mechanism=self.run.mechanism,
+            mechanism=self.run.constants,
         )
 
 
@@ -63,7 +64,7 @@ def run_transformable(
     scenario: Scenario,
     folds: Any,
     dt: jax.Array,
-    run: Run,
+    run: RunRequest,
     *,
     backend: str = "auto",
     noise: Any = None,
@@ -77,7 +78,8 @@ def run_transformable(
     """
     leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run, noise))
     name, reason = execute.automatic()
-    runs = Runs(treedef, run._replace(mechanism=known_of(scenario)), name, (False,) * len(leaves))
+    request = run._replace(constants=known_of(scenario), backend="auto")
+    runs = Runs(treedef, request, name, (False,) * len(leaves))
     return (
         _differentiable(runs)(*leaves)
         if backend != "xla" and reason is None
@@ -141,7 +143,7 @@ def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
-        run = runs.run._replace(mechanism=known_of(inputs.scenario))
+        run = runs.run._replace(constants=known_of(inputs.scenario))
         return execute.run_one(inputs.scenario, inputs.folds, inputs.dt, run, noise=inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
-from iblf_jax.engine.replay import Place, slopes
 from iblf_jax.identification.coordinates import coordinates, scales
+from iblf_jax.identification.replay import Place, slopes
 from iblf_jax.simulation.closed_loop import torque_needed
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.world.references import WaypointSpline

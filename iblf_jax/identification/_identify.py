@@ -14,7 +14,6 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
-from iblf_jax.engine.replay import slopes, slopes_under
 from iblf_jax.identification.coordinates import (
     DELAY,
     OFFSET,
@@ -26,6 +25,7 @@ from iblf_jax.identification.coordinates import (
 )
 from iblf_jax.identification.log import Log, Said, read
 from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
+from iblf_jax.identification.replay import slopes, slopes_under
 from iblf_jax.identification.result import FINEST, LACKS, Identification, judged
 from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
 from iblf_jax.identification.smoothing import Smoothed, smoothed

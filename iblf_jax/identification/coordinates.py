@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.replay import Place
+from iblf_jax.identification.replay import Place
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, same_place

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.replay import slopes
 from iblf_jax.identification.coordinates import Coordinates, scales, to_x, to_z
 from iblf_jax.identification.log import Said
+from iblf_jax.identification.replay import slopes
 from iblf_jax.identification.search import WEAK, Around, search
 from iblf_jax.identification.smoothing import Smoothed
 from iblf_jax.world.robots import joint_names

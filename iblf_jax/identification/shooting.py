@@ -32,9 +32,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.replay import Slopes, Stretches, replayed, slopes_under, tangents
 from iblf_jax.identification.coordinates import Coordinates, to_x
 from iblf_jax.identification.log import Log, Said
+from iblf_jax.identification.replay import Slopes, Stretches, replayed, slopes_under, tangents
 from iblf_jax.identification.search import WEAK, Around, search
 from iblf_jax.identification.smoothing import around
 from iblf_jax.identification.standstill import NONE, Free

@@ -23,12 +23,12 @@ from scipy.signal import savgol_filter
 import iblf_jax as ij
 from iblf_jax import cli
 from iblf_jax.core.pytree import astype
-from iblf_jax.engine.replay import slopes
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
 from iblf_jax.identification._identify import _lacking_terms
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
+from iblf_jax.identification.replay import slopes
 from iblf_jax.identification.shooting import Replay, Torque, windows
 from iblf_jax.identification.smoothing import smoothed
 from iblf_jax.identification.standstill import _joints, by_the_law, free_about_standstill

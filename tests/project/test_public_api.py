@@ -157,7 +157,9 @@ PROTOCOLS = protocols()
 
 def family_of(module: str):
     """The public module of a family that has a Protocol in `module`."""
-    return importlib.import_module(PUBLIC_MODULE.get(module, ".".join(module.split(".")[:2])))
+    parts = module.split(".")
+    depth = 3 if parts[1] in ("world", "control") else 2
+    return importlib.import_module(PUBLIC_MODULE.get(module, ".".join(parts[:depth])))
 
 
 def types_named(annotations: list[ast.expr]) -> set[str]:
