@@ -28,7 +28,7 @@ from iblf_jax.engine.step import (
     verdict,
 )
 from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import initial_state, surroundings
+from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.simulation.stability import resolved
@@ -183,10 +183,13 @@ def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]
     """The carry before the first step, and what a `Probe` has found at the start."""
 
     def around(inputs):
-        unseen = accuracy.unseen(inputs.scenario, method, inputs.dt, inputs.steps)
+        unseen = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
         state = initial_state(inputs.scenario)
         return probed(
-            jnp.zeros_like(inputs.dt), surroundings(state), accuracy.places(state).size, unseen
+            jnp.zeros_like(inputs.dt),
+            perturbed_state(state),
+            accuracy.watched_indices(state).size,
+            unseen,
         )
 
     found = _probed(executor, batch, batch.each(around))
@@ -205,7 +208,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry."""
 
     def one(inputs):
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     return jax.eval_shape(lambda: batch.each(one))
@@ -221,11 +224,11 @@ def end(
     def critical(inputs, carry):
         instants = (
             (carry.nearest.t, carry.nearest.around),
-            (inputs.dt * inputs.steps, surroundings(carry.state)),
+            (inputs.dt * inputs.steps, perturbed_state(carry.state)),
         )
         watched, nothing = (
             at_start.jacobian.shape[-1],
-            accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3),
+            accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3),
         )
         return jax.tree.map(
             lambda *xs: jnp.stack(xs), *(probed(*instant, watched, nothing) for instant in instants)

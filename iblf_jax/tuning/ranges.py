@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.simulation.closed_loop import LoopState, sampled
+from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -188,7 +188,7 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     count = jnp.broadcast_to(resolution, (scenario.n,))
 
     def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:
-        return sampled(smooth, t, state._replace(q=q), normal).held.commands[0]
+        return run_sampled_law(smooth, t, state._replace(q=q), normal).sampled.commands[0]
 
     def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
         normal = jnp.zeros((sensor.draws, scenario.n), times.dtype)

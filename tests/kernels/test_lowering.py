@@ -114,7 +114,7 @@ def carry_of(inputs, varied, method):
     programs of their own."""
 
     def one(inputs):
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         jacobian = 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + size * size, dtype=inputs.dt.dtype)).reshape(
             size, size
         )

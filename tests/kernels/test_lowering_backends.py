@@ -18,11 +18,10 @@ from made_up_runs import ALWAYS
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
-from iblf_jax.core.cache import directory
 from iblf_jax.engine import execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
-from iblf_jax.kernels import packed, toolchain
+from iblf_jax.kernels import directory, packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
