@@ -456,10 +456,9 @@ def no_runs(monkeypatch):
         "engine.simulate.run_one",
         "studies.blocks._execute",
         "studies.setup._execute",
-        "tuning.problem.rollouts",
-        "tuning.problem.slope",
-        "tuning.problem.gradient",
-        "tuning._falsify._push",
+        "tuning.evaluation.rollouts",
+        "tuning.search.Evaluator.__call__",
+        "tuning._falsify._margins",
         "engine.explain.instructions",
         "certificates._certify._certificate_of",
     ):
