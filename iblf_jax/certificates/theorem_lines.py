@@ -206,8 +206,8 @@ def _gains(summary: RunSummary) -> list[Line]:
         (kf_2, constants.kf - claims.LOWEST_KF[2], not case_1),
     )
     lines = []
-    for statement, margins, counts in conditions:
-        margins = np.asarray(margins)
+    for statement, above_lowest, counts in conditions:
+        margins = np.asarray(above_lowest)
         line = check_positive(
             statement,
             float(margins.min()),
