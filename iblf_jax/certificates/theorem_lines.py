@@ -229,8 +229,7 @@ def _full_gains(summary: RunSummary) -> list[Line]:
         if not isinstance(constants, FullClaim):
             lines.append(not_applicable(statement, summary.claims.no_theorem))
             continue
-        terms = claims.rho_terms(constants, summary.lambda_max, case, lambda_min)
-        margin = 0.5 * float(terms[2])
+        margin = 0.5 * float(summary.rho_terms[case, "run"][2])
         needed = np.asarray(constants.kf).min() - claims.LOWEST_FULL[case]
         note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
         if margin <= 0 < needed:
@@ -246,7 +245,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     """The rate rho of one case, with the eigenvalues of M0 along the run or over the admissible
     box.
     """
-    full, constants = summary.claims.bounds_velocities, summary.claims.constants
+    full = summary.claims.bounds_velocities
     name = f"rho, case {case}" + {"run": "", "box": ", over the box"}[domain]
     equation = RHO[case]
     text = (
@@ -263,12 +262,9 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     reason = summary.claims.no_theorem
     if case == 1 and summary.case == 2:
         reason = summary.why_not_theorem(1)
-    if reason or constants is None:
+    if reason:
         return not_applicable(statement, reason)
     source: Any = {"run": summary, "box": summary.over_box}[domain]
-    terms = claims.rho_terms(
-        constants, jnp.asarray(source.lambda_max), case, jnp.asarray(source.lambda_min)
-    )
     least = ["the decay rate of V1", "K2 over lambda_max(M0)", "kf"]
     eigenvalue = f"lambda_max(M0) = {source.lambda_max:.4g} kg m^2"
     if full:
@@ -279,7 +275,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
         statement,
         summary.rho[case, domain],
         value=summary.rho[case, domain],
-        note=f"{eigenvalue}{searched}; set by {least[int(np.argmin(np.asarray(terms)))]}",
+        note=f"{eigenvalue}{searched}; set by {least[np.argmin(summary.rho_terms[case, domain])]}",
         counts=not (case == 2 and summary.case == 1),
     )
     return _unless_replaced(summary, line)
