@@ -43,7 +43,7 @@ NOISE = 32.0
 """Rounding error of sqrt(2 V2) in units of the last place, relative to the sizes of its terms."""
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 """Gain condition of each case."""
-ALWAYS_EXCLUDED = "the guard or a torque limit was at work all the time"
+ALWAYS_EXCLUDED = "the guard or a torque limit was active all the time"
 
 
 @dataclasses.dataclass(frozen=True)

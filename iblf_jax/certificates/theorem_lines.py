@@ -54,7 +54,7 @@ NOT_NEEDED = (
     "the paper's own envelope of V2 is lost, stability is not: the claim with weights (W.1) does"
     " not need it"
 )
-CASE_1_COUNTS = "f' = 0 on this run, so case 1 is what counts"
+CASE_1_COUNTS = "f' = 0 on this run, so case 1 decides"
 
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")
 RATE_BOUNDED = Statement("f' bounded", "Assumption 1", "|f'| <= F_d between jumps", "N m/s")
@@ -106,14 +106,14 @@ def exclusion_note(summary: RunSummary) -> str:
     """Which samples the claims exclude, and where they start again, in words."""
     excluded = ""
     if summary.excluded:
-        why = "the guard or a torque limit was at work"
+        why = "the guard or a torque limit was active"
         if summary.claims.bounds_velocities:
-            why = "alpha was outside, or the guard or a torque limit at work"
-        excluded = f"{summary.excluded} of {summary.samples} samples are left out: {why}"
+            why = "alpha was outside, or the guard or a torque limit active"
+        excluded = f"{summary.excluded} of {summary.samples} samples are excluded: {why}"
     restarts = ""
     if summary.jumps.size:
         times = ", ".join(f"{x:.4g}" for x in summary.jumps)
-        restarts = f"f jumps at t = {times} s, and the claim starts anew there"
+        restarts = f"f jumps at t = {times} s, and the claim starts again there"
     return join_notes(excluded, restarts)
 
 
@@ -485,13 +485,13 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
     by_law = Statement(
         "dropped term of the law",
         "(3.13)",
-        "e2^T M0' e2/2 alone <= the margin that the proof leaves",
+        "e2^T M0' e2/2 <= the margin that the proof leaves",
         "1/s",
     )
     by_observer = Statement(
         "dropped term of the observer",
         "(3.11)",
-        "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves",
+        "-f_tilde^T kf M0' q' <= the margin that the proof leaves",
         "1/s",
     )
     unclaimed = summary.claims.no_theorem or summary.invalid

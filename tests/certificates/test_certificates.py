@@ -903,7 +903,7 @@ def test_saturated_samples_are_left_out(corrected_run):
     left_out = certificate.numbers["samples_left_out"]
     assert 0 < left_out < 1000
     assert certificate["inequality, case 2"].verdict == "holds"
-    assert f"{left_out} of 2001 samples are left out" in certificate["inequality, case 2"].note
+    assert f"{left_out} of 2001 samples are excluded" in certificate["inequality, case 2"].note
     assert np.all(np.isnan(certificate.traces.envelope[certificate.traces.excluded]))
 
 
