@@ -22,6 +22,7 @@ from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
+from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -993,7 +994,7 @@ def test_a_tuning_file_has_the_options_as_tables(tmp_path, table, expected):
         f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
         '[[objective]]\nkind = "tracking"\n'
     )
-    arguments = ij.files.tuning.load_tuning_file(file)
+    arguments = load_tuning_file(file)
     assert {name: arguments[name] for name in expected} == expected
 
 
@@ -1013,7 +1014,7 @@ def test_wrong_options_in_a_tuning_file_are_named(tmp_path, table, words):
         '[[objective]]\nkind = "tracking"\n'
     )
     with pytest.raises(ValueError, match=words):
-        ij.files.tuning.load_tuning_file(file)
+        load_tuning_file(file)
 
 
 # ------------------------------------------------------------------------------------------- resume
