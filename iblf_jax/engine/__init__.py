@@ -10,9 +10,9 @@ Modules outside this folder import from here; `simulate`, `explain`, `recommende
 step sizes have modules of their own.
 """
 
+from iblf_jax.engine.compile import BackendWarning as BackendWarning
 from iblf_jax.engine.derivatives import Outer as Outer
 from iblf_jax.engine.derivatives import Tangents as Tangents
-from iblf_jax.engine.execute import BackendWarning as BackendWarning
 from iblf_jax.engine.execute import CompiledBatch as CompiledBatch
 from iblf_jax.engine.execute import compile_batch as compile_batch
 from iblf_jax.engine.execute import run_batch as run_batch

@@ -12,9 +12,10 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.execute import automatic, inputs_of
+from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import TimeStep
 from iblf_jax.kernels.operations import OPERATIONS
@@ -104,7 +105,7 @@ def explain(
     one = Batch.of(
         inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
         leaves | noise,
-        mechanism=known_of(scenario),
+        constants=known_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize

@@ -147,3 +147,8 @@ def run(
         every,
         plan.gpu_threads(carry.floats.shape[1], processors),
     )
+
+
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Compiles the kernel of `run`, which serves any number of runs and steps; see `kernel`."""
+    kernel(program, shared, per_run, architecture())

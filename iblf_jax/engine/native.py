@@ -142,3 +142,8 @@ def run(
         shared.reshape(1, -1), lane, *carry, settings
     )
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]
+
+
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Compiles the kernel with which `run` makes so many steps of so many runs; see `kernel`."""
+    kernel(program, shared, per_run, _is_narrow(program, runs, steps))

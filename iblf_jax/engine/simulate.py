@@ -12,11 +12,11 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
-from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.plan import SINGLE_RUN_BACKENDS
+from iblf_jax.engine.registry import single_run_backends
 from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
@@ -108,7 +108,7 @@ def simulate(
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
     tableau(method)
-    checks.one_of("backend", backend, SINGLE_RUN_BACKENDS)
+    checks.one_of("backend", backend, single_run_backends())
     steps = checks.whole_steps(duration, dt)
     record_every, throw = checks.recorded_every(record_every, steps), checks.flag("throw", throw)
     if steps // record_every > MOST_SAMPLES:
@@ -178,11 +178,9 @@ def run_rollout(
       noise: key of a sensor's noise (`sampling.noise_key`).
     """
     if checks.is_concrete((scenario, folds, dt)):
-        outcome = run_one(scenario, folds, dt, request, noise=noise)
+        outcome = run_one(scenario, folds, dt, request, noise)
     else:
-        outcome = run_transformable(
-            scenario, folds, dt, request, backend=request.backend, noise=noise
-        )
+        outcome = run_transformable(scenario, folds, dt, request, noise)
     arrays, controller_state, observer_state, actuator_state, measured = outcome.records
     return Rollout(
         scenario=scenario,

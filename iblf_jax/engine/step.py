@@ -48,14 +48,17 @@ from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
 from iblf_jax.world.bounds import NARROWEST
 
 
-def Run(
-    steps: int,
-    method: str = "rk4",
-    record_every: int | None = None,
-    mechanism: Mechanism | None = None,
-) -> RunRequest:
-    """The former name of `RunRequest`."""
-    return RunRequest(steps, method, record_every, mechanism)
+class Run(RunRequest):
+    """The former name of `RunRequest`, whose `constants` were `mechanism`."""
+
+    def __new__(
+        cls,
+        steps: int,
+        method: str = "rk4",
+        record_every: int | None = None,
+        mechanism: Mechanism | None = None,
+    ):
+        return RunRequest(steps, method, record_every, mechanism)
 
 
 class Inputs(NamedTuple):
@@ -79,7 +82,7 @@ class Nearest(NamedTuple):
 
     xi: jax.Array
     t: jax.Array
-    around: Any
+    state: Any
     """What `closed_loop.surroundings` gives there."""
 
 
@@ -229,15 +232,20 @@ def _as_it_is(function: Callable) -> Callable:
     return function
 
 
-class Form(NamedTuple):
-    """How an executor wants a step to be written."""
+class StepOptions(NamedTuple):
+    """How the code of a step is generated for an executor; the numbers do not depend on it."""
 
     rolled: bool = False
-    """The stages of the integrator as a loop."""
+    """Whether the stages of the integrator are a loop."""
     piece: Callable = _as_it_is
-    """What is made of a function that is compiled on its own."""
+    """Applied to every part of the step that is compiled as a function of its own."""
     scalar: bool = False
-    """Whether it is taken apart into numbers, where equal ones are one."""
+    """Whether the step becomes a scalar program, in which equal numbers are computed once."""
+
+
+def is_derivative(step: Any) -> bool:
+    """Whether a step computes derivatives; steps without such an attribute do not."""
+    return getattr(step, "is_derivative", False)
 
 
 class _Moment(NamedTuple):
@@ -320,7 +328,7 @@ def advance(
     carry: Carry,
     index: jax.Array,
     method: str,
-    form: Form,
+    options: StepOptions,
     loop: Callable = evaluate,
 ) -> Advanced:
     """One step: observe, integrate piece by piece, freeze what runs away.
@@ -329,11 +337,11 @@ def advance(
       inputs, carry: of the run.
       index: number of the instant, () int.
       method: the integrator.
-      form: how it is written.
+      options: how its code is generated.
       loop: stands for `closed_loop.evaluate`.
     """
     scenario, dt = inputs.scenario, inputs.dt
-    at, state = form.piece(loop), carry.state
+    at, state = options.piece(loop), carry.state
     if scenario.sampling is None:
         moment = _moment(inputs, index, method, None)
         along = _Loop(at, inputs, state, ())
@@ -353,7 +361,7 @@ def advance(
         moment = moment._replace(behind=jnp.where(due, jnp.zeros_like(dt), moment.behind))
 
     first = moment.division.pieces[0]
-    stepped = _integrated(along, first, moving(state), method, form)
+    stepped = _integrated(along, first, moving(state), method, options)
     ahead = jnp.where(moment.span.counts, first.length, jnp.zeros_like(dt))
     step = jnp.where(index > 0, dt, jnp.zeros_like(dt))
     sample = _weighed(stepped.first, moment.span.start, 0.5 * (moment.behind + ahead), step)
@@ -362,12 +370,12 @@ def advance(
         begun = _begun_at(index, inputs.folds, sample, accumulators)
         return begun, _updated(inputs.folds, begun, sample)
 
-    begun, accumulators = form.piece(at_the_instant)(inputs, index, accumulators, sample)
+    begun, accumulators = options.piece(at_the_instant)(inputs, index, accumulators, sample)
     if scenario.sampling is None:
         stepped, accumulators = _across_jumps(
             along, first, state, method, stepped, begun, accumulators
         )
-    later = _later_pieces(along, moment.division.pieces, stepped, accumulators, method, form)
+    later = _later_pieces(along, moment.division.pieces, stepped, accumulators, method, options)
     parts = [(first.length, stepped.slopes), *later.parts]
 
     def at_the_end(inputs, carry, index, sample, parts, later, before, goes_on, restarts, overfull):
@@ -387,7 +395,7 @@ def advance(
         return keep_if(sound & goes_on, moved, before), status, nearest, estimate
 
     moved, division = still(state, later.moved), moment.division
-    after, status, nearest, estimate = form.piece(at_the_end)(
+    after, status, nearest, estimate = options.piece(at_the_end)(
         inputs,
         carry,
         index,
@@ -462,7 +470,7 @@ def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
 
 
 def _integrated(
-    along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, form: Form
+    along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, options: StepOptions
 ) -> integrators.Stepped:
     """One step of the integrator over a piece."""
     return integrators.step(
@@ -471,7 +479,7 @@ def _integrated(
         piece.begin,
         moved,
         piece.length,
-        rolled=form.rolled,
+        rolled=options.rolled,
     )
 
 
@@ -534,7 +542,7 @@ def _later_pieces(
     stepped: integrators.Stepped,
     accumulators: tuple,
     method: str,
-    form: Form,
+    options: StepOptions,
 ) -> _Later:
     """The pieces after the first, each with the samples before and after the jump at which it
     begins.
@@ -553,7 +561,9 @@ def _later_pieces(
                 left = along.at(last, last.begin + last.length, moved)[1]
                 left = _weighed(left, piece.begin, 0.5 * last.length, none)
                 between = accumulators = _updated(folds, accumulators, left)
-            made = _integrated(along, piece, moved, method, form._replace(rolled=not form.scalar))
+            made = _integrated(
+                along, piece, moved, method, options._replace(rolled=not options.scalar)
+            )
             right = _weighed(made.first, piece.begin, 0.5 * piece.length, none)
             accumulators = _updated(folds, between, right) if folds else ()
             if along.inputs.scenario.sampling is None:
@@ -609,9 +619,9 @@ class TimeStep:
         """The step of a run."""
         return TimeStep(run.method, None if run.record_every is None else recorded)
 
-    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, form: Form):
+    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, options: StepOptions):
         """The carry after the step, and what is recorded."""
-        found = advance(inputs, carry, index, self.method, form)
+        found = advance(inputs, carry, index, self.method, options)
         return found.carry, self.record(inputs.folds, found) if self.record else ()
 
 
@@ -642,7 +652,7 @@ class Probe:
     iteration.
     """
 
-    def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
+    def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, options: StepOptions):
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
         watched, whole, x = (
@@ -661,7 +671,7 @@ class Probe:
 
         def rate_at(y):
             return ravel_pytree(
-                change(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece)
+                change(inputs.scenario, carry.time, whole(y), inputs.dt, options.piece)
             )[0]
 
         around = whole(x)

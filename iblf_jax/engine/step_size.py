@@ -21,10 +21,10 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
-from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import STEP_SIZE_CHUNK
 from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.single_run import run_one
 from iblf_jax.simulation import accuracy, jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
@@ -259,7 +259,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
     parts, before, poor_before, coarser = 1, None, 0, period
     while periods * parts <= MOST_TRIED:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise=noise)
+        found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
         if (

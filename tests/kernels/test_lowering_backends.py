@@ -19,8 +19,9 @@ from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
 from iblf_jax.core.cache import directory
-from iblf_jax.engine import execute, executors, native, plan
+from iblf_jax.engine import compile, execute, executors, native, plan, registry
 from iblf_jax.engine.batch import Batch
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
 from iblf_jax.kernels import packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
@@ -368,18 +369,25 @@ def test_forward_sensitivities(monkeypatch, written_out):
         assert [x.shape for x in products] == [(3, 3, 3)] * 2
 
 
+def with_fallback(backend, run_on, by_scan):
+    """`run_on(name)` with the first executor of the plan of a batch that works."""
+    request, sizes = RunRequest(1, backend=backend), plan.Sizes(700, 3)
+    execution = plan.choose_plan(request, sizes, registry.machine())
+    return compile.first_that_works(execution, lambda executor: run_on(executor.name), by_scan)
+
+
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(execute, "_told", set())
+    monkeypatch.setattr(compile, "_warned", set())
     native.kernel.cache_clear()
     called = []
-    with pytest.warns(execute.BackendWarning, match="no-such-compiler.*xla"):
-        execute.with_fallback(
+    with pytest.warns(compile.BackendWarning, match="no-such-compiler.*xla"):
+        with_fallback(
             "auto", lambda name: called.append(name) or fail_if_native(name), lambda: None
         )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        execute.with_fallback("auto", fail_if_native, lambda: None)
+        with_fallback("auto", fail_if_native, lambda: None)
     assert called == ["native", "xla"]
 
 

@@ -21,11 +21,12 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
+from test_lowering_backends import with_fallback
 
 from iblf_jax import cli
 from iblf_jax.core import drafts
 from iblf_jax.core.cache import _reloads_badly, directory, keep_programs, processor
-from iblf_jax.engine import execute, native
+from iblf_jax.engine import compile, native
 from iblf_jax.kernels import nvrtc, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 
@@ -567,8 +568,8 @@ def falls_back(work):
 
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        patch.setattr(execute, "_told", set())
-        assert execute.with_fallback("native", run_on, lambda: None) == "xla"
+        patch.setattr(compile, "_warned", set())
+        assert with_fallback("native", run_on, lambda: None) == "xla"
     (line,) = [str(x.message) for x in said]
     assert line.endswith("running on xla.")
     assert "\n" not in line
