@@ -56,7 +56,7 @@ def machine() -> dict[str, str]:
     """What the numbers were measured with (no host names)."""
     import os
 
-    from iblf_jax.core.cache import processor
+    from iblf_jax.kernels import processor
 
     models = {
         line.partition(":")[2].strip()

@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 from throughput import measured, method_for
 
 import iblf_jax as ij
+from iblf_jax.core import devices
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Run
@@ -160,7 +161,7 @@ def with_pinocchio(runs: int, steps: int) -> tuple[float, float, float, float]:
             *arrays[2:],
             *counts,
             ctypes.c_double(DT),
-            ctypes.c_long(toolchain.threads()),
+            ctypes.c_long(devices.threads()),
         )
         return states
 
@@ -203,7 +204,7 @@ def with_mujoco(runs: int, steps: int) -> tuple[float, float, float]:
     size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     state = np.zeros((runs, size))
     state[:, 1 : 1 + scenario.n] = starts(scenario, runs)
-    data = [mujoco.MjData(model) for _ in range(toolchain.threads())]
+    data = [mujoco.MjData(model) for _ in range(devices.threads())]
     return math.nan, *measured(lambda: rollout.rollout(model, data, state, nstep=steps)[0], 3)
 
 

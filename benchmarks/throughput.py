@@ -37,6 +37,7 @@ from _timing import compile_seconds, in_turn, report
 
 import iblf_jax as ij
 from iblf_jax import kernels
+from iblf_jax.core import devices
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Run
@@ -209,7 +210,7 @@ def limit(dtype):
             *pointers,
             *map(ctypes.c_long, (runs, steps)),
             ctypes.c_double(1e-3),
-            ctypes.c_long(toolchain.threads()),
+            ctypes.c_long(devices.threads()),
         )
         return x[:, : len(q)]
 

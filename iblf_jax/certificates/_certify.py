@@ -1,34 +1,41 @@
-"""`certify`: one run, a batch of runs or a study held against Theorem 2."""
+"""`certify`: checks one run, a batch of runs or a study against Theorem 2.
+
+The stages are: `certify` checks the request; `_certificate_of` takes one run through its summary
+and its segments (`run_summary`), the lines about them (`theorem_lines`, `further_lines`) and the
+traces; `_over_runs` combines the certificates of many runs.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 import numpy as np
 
-from iblf_jax.certificates import claims, own_law, weighted_lines
-from iblf_jax.certificates.lines import (
-    applicable_case,
-    bounds_along,
-    left_side,
-    of_stretch,
-    over_run,
-)
-from iblf_jax.certificates.result import FAILS, HOLDS, NOT_APPLICABLE, Certificate, Line, Traces
-from iblf_jax.certificates.retrace import believed, grid
-from iblf_jax.certificates.trajectory import Trajectory, Whole, look, same_structure, same_tree
+from iblf_jax.certificates import further_lines, lines, theorem_lines
+from iblf_jax.certificates.claims import own_claim
+from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement
+from iblf_jax.certificates.reconstruction import is_valid, time_grid
+from iblf_jax.certificates.result import Certificate, Traces
+from iblf_jax.certificates.run_summary import RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
-from iblf_jax.engine.plan import CERTIFY_RECORDED
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
+from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 from iblf_jax.world.robots import joint_names
 
+RECORDED = 20_000
+"""Largest number of recorded samples of a run that `certify` makes; the other steps are
+reconstructed."""
 WORST = 16
+"""Runs of a study that are checked if the caller does not say how many."""
+SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
+MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
 
 
 @notices.each_warning_once
@@ -41,37 +48,35 @@ def certify(
     method: str = "rk4",
     worst: int | None = WORST,
 ) -> Certificate:
-    """Theorem 2, inequality by inequality, with margins.
+    """Checks every inequality of Theorem 2 on a run, with margins.
 
-        V2' + rho V2 - 1/2 |f'|^2 <= 0  at every step, and what follows from it
-        (3.17)-(3.31)
+        V2' + rho V2 - 1/2 |f'|^2 <= 0  at every step, and what follows from it       (3.17)-(3.31)
 
     A law that states a Lyapunov function V of its own and its decay W (`controllers.LyapunovLaw`)
-    is held against
+    is checked against
 
         V' <= -W + T
 
-    V', V2' and f' are exact (by jvp along the vector field of the whole loop).  A law, an observer
-    or a situation without a claim is "not applicable", never "fails"; a sampled loop is held
-    against its continuous run instead.  Steps that a run did not record are made again, from each
-    recorded sample to the next.
+    V', V2' and f' are exact: they are derivatives along the vector field of the whole loop, by
+    forward-mode differentiation.  A law, an observer or a situation without a claim is "not
+    applicable", never "fails"; a sampled loop is compared with its continuous run instead.  Steps
+    that a run did not record are integrated again, from each recorded sample to the next.
 
     Args:
-      scenario: what runs.
+      scenario: the scenario.
       run: a `Rollout` of it (one run or a batch), or a study (with `replay(i)`, `metrics`, `len`),
-        whose runs that were not made are left out; simulated here if not given.
+        whose runs that were not made are ignored; simulated here if not given.
       duration, dt, method: of the simulation, if `run` is not given [s].
-      worst: of a study, judge that many runs, those nearest to their bounds; None for all.
+      worst: of a study, check this many runs, those nearest to their bounds; None for all.
 
     Returns:
       A `Certificate`; over many runs each line is that of the run with the smallest margin.  It
-      prints the lines that apply, and why the others do not in one sentence; its `lines` are all of
-      them.
+      prints the lines that apply, and why the others do not in one sentence; its `lines` has all.
 
     Raises:
       ValueError: a law that states half of a claim; a run of another scenario, one that its own
-        scenario, dt and method do not reproduce (or whose samples do not say how many steps it
-        had), or arguments of the wrong kind.
+        scenario, dt and method do not reproduce (or whose samples do not determine its number of
+        steps), or arguments of the wrong kind.
 
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
     """
@@ -83,23 +88,21 @@ def certify(
             "numbers",
             "certify works on the host: call it outside jit, vmap and grad.",
         )
-    own_law.stating_law(scenario)
+    own_claim(scenario)  # raises for half of a claim, before anything is simulated
     if run is None:
-        every = 1 + checks.whole_steps(duration, dt) // CERTIFY_RECORDED
+        every = 1 + checks.whole_steps(duration, dt) // RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
-    worst = None if worst is None else checks.positive_integer("worst", worst)
+    if worst is not None:
+        worst = checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
+        _check_scenario(scenario, run)
+        run = _on_host(run)
         if run.is_batch:
-            _check_same_kind(scenario, run)
-            on_host = jax.tree.map(np.asarray, run)
-            return _many(((i, on_host[i]) for i in range(len(run))), len(run))
-        _check_same(scenario, run)
-        return _one(jax.tree.map(np.asarray, run))
-    if hasattr(run, "replay") and hasattr(run, "metrics") and hasattr(run, "__len__"):
-        indices = _worst_of(run, worst)
-        return _many(
-            ((i, jax.tree.map(np.asarray, _replayed(run, i))) for i in indices), len(indices)
-        )
+            return _over_runs((i, run[i]) for i in range(len(run)))
+        return _certificate_of(run)
+    if all(hasattr(run, name) for name in ("replay", "metrics", "__len__")):
+        worst_runs = _nearest_to_bounds(run, worst)
+        return _over_runs((i, _on_host(_replayed(run, i))) for i in worst_runs)
     raise checks.fail(
         "run",
         run,
@@ -108,33 +111,35 @@ def certify(
     )
 
 
-def _check_same_kind(scenario: Scenario, run: Rollout) -> None:
-    if not same_structure(scenario, run.scenario):
-        raise checks.fail(
-            "run",
-            "a run of another kind of scenario",
-            "a run of `scenario`",
-            "Pass run.scenario as the scenario.",
-        )
+# --- the request ---------------------------------------------------------------------------------
 
 
-def _check_same(scenario: Scenario, run: Rollout) -> None:
-    _check_same_kind(scenario, run)
-    if not same_tree(scenario, run.scenario):
-        raise checks.fail(
-            "run",
-            "a run of a scenario with other numbers",
-            "a run of `scenario`",
-            "Pass run.scenario as the scenario.",
-        )
+def _on_host(run: Rollout) -> Rollout:
+    """A run with NumPy arrays."""
+    return jax.tree.map(np.asarray, run)
 
 
-def _worst_of(study: Any, worst: int | None) -> list[int]:
-    """The runs of a study that came nearest to their bounds, the nearest first, of those that were
-    made.
+def _check_scenario(scenario: Scenario, run: Rollout) -> None:
+    """Raises ValueError for a run of another scenario; the leaves of a batch may differ."""
+    structure: Any = jax.tree.structure(scenario)
+    got = ""
+    if structure != jax.tree.structure(run.scenario):
+        got = "a run of another kind of scenario"
+    elif not run.is_batch:
+        pairs = zip(jax.tree.leaves(scenario), jax.tree.leaves(run.scenario), strict=True)
+        if not all(np.array_equal(a, b) for a, b in pairs):
+            got = "a run of a scenario with other numbers"
+    if got:
+        remedy = "Pass run.scenario as the scenario."
+        raise checks.fail("run", got, "a run of `scenario`", remedy)
+
+
+def _nearest_to_bounds(study: Any, worst: int | None) -> list[int]:
+    """The runs of a study that came nearest to their bounds, the nearest first, among those that
+    were made.
     """
     count = len(study)
-    made = np.broadcast_to(getattr(study, "made", True), (count,))
+    made = np.broadcast_to(optional_member(study, "made"), (count,))
     if worst is None or worst >= np.sum(made):
         return np.flatnonzero(made).tolist()
     try:
@@ -152,106 +157,198 @@ def _worst_of(study: Any, worst: int | None) -> list[int]:
 
 
 def _replayed(study: Any, index: int) -> Rollout:
-    """One run of a study, with no more samples than memory should hold."""
-    steps = (
-        round(study.duration / study.dt)
-        if hasattr(study, "duration") and hasattr(study, "dt")
-        else 0
-    )
-    return (
-        study.replay(index, record_every=1 + steps // CERTIFY_RECORDED)
-        if steps > CERTIFY_RECORDED
-        else study.replay(index)
-    )
+    """One run of a study, with a bounded number of recorded samples."""
+    duration, dt = optional_member(study, "duration"), optional_member(study, "dt")
+    if duration is None or dt is None:
+        return study.replay(index)
+    steps = round(duration / dt)
+    if steps <= RECORDED:
+        return study.replay(index)
+    return study.replay(index, record_every=1 + steps // RECORDED)
 
 
-def _heading(scenario: Scenario) -> str:
-    law = claims.law_of(scenario)
-    parts = [type(law).__name__]
-    if hasattr(law, "barrier"):
-        parts.append(f"barrier {type(law.barrier).__name__}")
-    if hasattr(law, "reading"):
-        parts.append(f"reading {law.reading}")
-    return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
+# --- one run -------------------------------------------------------------------------------------
 
 
-def _one(run: Rollout) -> Certificate:
+def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
     if run.scenario.sampling is not None:
-        return _sampled(run)
-    whole, stretches = look(run)
-    parts, traces = [], []
-    for trajectory in stretches:
-        lines_there, shares = of_stretch(trajectory)
-        parts.append(([*lines_there, *weighted_lines.of_stretch(trajectory)], shares))
-        traces.append(_traces(trajectory))
-    lines = with_rates(over_run(whole, parts), weighted_lines.rates(whole))
-    joined = Traces(*map(np.concatenate, zip(*traces, strict=True)))
+        return _certificate_of_sampled(run)
+    summary, segments = summarise(run)
+    checked: list[Line] = []
+    weighted: list[Line] = []
+    shares: dict[str, float] = {}
+    traces = []
+    for segment in segments:
+        of_theorem, found = theorem_lines.segment_lines(segment)
+        checked += [*further_lines.own_segment_lines(segment), *of_theorem]
+        weighted += further_lines.weighted_segment_lines(segment)
+        for name, share in found.items():
+            shares[name] = max(share, shares.get(name, 0.0))
+        traces.append(_traces(segment))
+    by_name = _merged(checked)
+    for name, share in shares.items():
+        note = f"at most {100 * share:.3g} % of that margin at one instant"
+        by_name[name] = dataclasses.replace(by_name[name], note=note)
+    assumptions = [by_name.pop(name) for name in theorem_lines.ASSUMPTIONS if name in by_name]
+    all_lines = (
+        *assumptions,
+        *theorem_lines.run_lines(summary),
+        *by_name.values(),
+        *further_lines.weighted_run_lines(summary),
+        *_merged(weighted).values(),
+    )
     return Certificate(
         _heading(run.scenario),
-        lines,
-        _numbers(whole),
-        joined,
+        all_lines,
+        _numbers(summary),
+        Traces(*map(np.concatenate, zip(*traces, strict=True))),
         joints=joint_names(run.scenario.plant, run.n),
     )
 
 
-def with_rates(lines: list[Line], rates: list[Line]) -> tuple[Line, ...]:
-    """The lines of a run, with the rates of the claim with weights before what follows from
-    them.
+def _merged(checked: list[Line]) -> dict[str, Line]:
+    """One line per name from those of all segments."""
+    by_name: dict[str, list[Line]] = {}
+    for line in checked:
+        by_name.setdefault(line.name, []).append(line)
+    return {name: lines.over_segments(same) for name, same in by_name.items()}
+
+
+def _heading(scenario: Scenario) -> str:
+    """Law, barrier, reading and observer, in words."""
+    law = unwrapped(scenario.controller)
+    barrier, reading = optional_member(law, "barrier"), optional_member(law, "reading")
+    parts = [type(law).__name__]
+    if barrier is not None:
+        parts.append(f"barrier {type(barrier).__name__}")
+    if reading:
+        parts.append(f"reading {reading}")
+    return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
+
+
+def _numbers(summary: RunSummary) -> dict[str, Any]:
+    """The constants of the claims."""
+    rho = {f"rho_{domain}_case_{case}": value for (case, domain), value in summary.rho.items()}
+    weights = {
+        f"{name}_weighted_case_{case}": value
+        for case, chosen in summary.weights.items()
+        for name, value in chosen._asdict().items()
+    }
+    return {
+        **rho,
+        "case": summary.case,
+        "F_m": summary.F_m,
+        "F_d": summary.F_d,
+        "rho2": summary.F_d**2 / 2,
+        "V2_start": summary.V_ends[0],
+        "V2_end": summary.V_ends[1],
+        "lambda_min_run": summary.lambda_min,
+        "lambda_max_run": summary.lambda_max,
+        "lambda_min_box": summary.over_box.lambda_min,
+        "lambda_max_box": summary.over_box.lambda_max,
+        "lambda_searched": summary.over_box.searched,
+        "q_of_lambda_max_box": summary.over_box.q_max,
+        "jump_times": summary.jumps,
+        "lambda_min_K2_over_M0_run": summary.slowest,
+        **weights,
+        "samples": summary.samples,
+        "samples_left_out": summary.excluded,
+    }
+
+
+def _traces(segment: Segment) -> Traces:
+    """The curves of the figure along a segment, at its recorded samples; NaN where there is no
+    claim.
+
+    For a law that has only a claim about itself, V and the left side are those of that claim.
     """
-    first = next(
-        (i for i, line in enumerate(lines) if line.name.startswith("weighted")), len(lines)
+    sample, proof, case = segment.sample, segment.proof, segment.summary.theorem_case
+    V, dropped = proof.V, proof.dropped_e2 + proof.dropped_f
+    envelope = left = e2_bound = f_tilde_bound = np.full(segment.t.shape, np.nan)
+    xi_bound = np.full(sample.q.shape, np.nan)
+    if case is not None:
+        envelope, left = segment.envelope[case].bound, theorem_lines.left_side(segment, case)
+        bounds = theorem_lines.bounds_along(segment, envelope)
+        xi_bound, e2_bound = bounds["xi, by V1"], bounds["e2"]
+        f_tilde_bound = bounds["f_tilde"]
+    elif segment.summary.claims.own is not None and not further_lines.why_not_own(segment.summary):
+        V, left = proof.own.V, further_lines.own_left_side(proof)
+        dropped = np.zeros_like(left)
+    traces = Traces(
+        t=segment.t,
+        V=V,
+        envelope=envelope,
+        left=np.where(proof.excluded, np.nan, left),
+        dropped=dropped,
+        xi=sample.xi,
+        xi_bound=xi_bound,
+        e2=np.linalg.norm(proof.e2, axis=1),
+        e2_bound=e2_bound,
+        f_tilde=np.linalg.norm(proof.f_tilde, axis=1),
+        f_tilde_bound=f_tilde_bound,
+        excluded=proof.excluded,
     )
-    return (*lines[:first], *rates, *lines[first:])
+    return Traces(*(x[segment.recorded] for x in traces))
 
 
-def _sampled(run: Rollout) -> Certificate:
-    """That of a run whose law is sampled: nothing is claimed of it, and it is held against the
-    continuous run instead.
+# --- one run of a sampled loop -------------------------------------------------------------------
+
+
+def _certificate_of_sampled(run: Rollout) -> Certificate:
+    """The certificate of a run with a sampled law: nothing is claimed about it, and it is compared
+    with the continuous run instead.
     """
-    scenario, (every, steps) = run.scenario, grid(run)
+    scenario, grid = run.scenario, time_grid(run)
     ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
     with notices.muted(SimulationWarning):
-        continuous = simulate(
+        simulated = simulate(
             ideal,
-            duration=steps * float(run.dt),
+            duration=grid.duration,
             dt=float(run.dt),
             method=run.method,
-            record_every=every,
+            record_every=grid.every,
         )
-    beside = jax.tree.map(np.asarray, continuous)
-    certificate = _one(beside)
-    nothing: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
-    lines = tuple(
-        dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **nothing)
+    continuous = _on_host(simulated)
+    certificate = _certificate_of(continuous)
+    cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
+    unclaimed = tuple(
+        dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **cleared)
         for line in certificate.lines
     )
-    excess, margins = run.V - beside.V, [_margins(x) for x in (run, beside)]
-    k, joint = int(np.argmax(excess)), int(np.argmin(margins[0] - margins[1]))
-    measured = (
-        Line("V2, sampled less continuous", "(3.12)", "max over t of V2 of this run less V2 of the continuous one", NOT_APPLICABLE,
-             value=float(excess[k]), time=float(run.t[k]), note=MEASURED, counts=False),
-        Line("margin, sampled less continuous", "(2.2)", "smallest distance to a bound, less that of the continuous run", NOT_APPLICABLE,
-             value=float((margins[0] - margins[1])[joint]), unit="rad", joint=joint, note=MEASURED, counts=False),
-    )  # fmt: skip
-    nan = np.full(run.t.shape, np.nan)
-    traces = Traces(*(nan for _ in Traces._fields))._replace(
-        t=np.asarray(run.t), V=np.asarray(run.V), xi=np.asarray(run.xi), xi_bound=np.full(run.xi.shape, np.nan),
-        e2=np.linalg.norm(run.e2, axis=1),
-        f_tilde=np.linalg.norm(run.disturbance - run.disturbance_estimate, axis=1), held=np.ones(run.t.shape, bool),
-    )  # fmt: skip
     return Certificate(
         _heading(scenario),
-        (*lines, *measured),
+        (*unclaimed, *_compared(run, continuous)),
         certificate.numbers,
-        traces,
+        _sampled_traces(run),
         joints=joint_names(scenario.plant, run.n),
     )
 
 
-SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
-MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
+def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
+    """The differences of V2 and of the margin between a sampled and its continuous run."""
+    V_excess = run.V - continuous.V
+    at = int(np.argmax(V_excess))
+    margin_excess = _margins(run) - _margins(continuous)
+    joint = int(np.argmin(margin_excess))
+    V_line = Statement(
+        "V2, sampled less continuous",
+        "(3.12)",
+        "max over t of V2 of this run less V2 of the continuous one",
+    )
+    margin_line = Statement(
+        "margin, sampled less continuous",
+        "(2.2)",
+        "smallest distance to a bound, less that of the continuous run",
+        "rad",
+    )
+    measured: dict[str, Any] = {"note": MEASURED, "counts": False}
+    return (
+        V_line.line(NOT_APPLICABLE, value=float(V_excess[at]), time=float(run.t[at]), **measured),
+        margin_line.line(
+            NOT_APPLICABLE, value=float(margin_excess[joint]), joint=joint, **measured
+        ),
+    )
 
 
 def _margins(run: Rollout) -> np.ndarray:
@@ -259,135 +356,65 @@ def _margins(run: Rollout) -> np.ndarray:
     return np.min(np.minimum(run.q - run.lower, run.upper - run.q), axis=0)
 
 
-def _numbers(whole: Whole) -> dict[str, Any]:
-    """The constants of the claim."""
-    rho = {f"rho_{where}_case_{case}": value for (case, where), value in whole.rho.items()}
-    return rho | {
-        "case": whole.case,
-        "F_m": whole.F_m,
-        "F_d": whole.F_d,
-        "rho2": whole.F_d**2 / 2,
-        "V2_start": whole.V_ends[0],
-        "V2_end": whole.V_ends[1],
-        "lambda_min_run": whole.lambda_min,
-        "lambda_max_run": whole.lambda_max,
-        "lambda_min_box": whole.over_box.lambda_min,
-        "lambda_max_box": whole.over_box.lambda_max,
-        "lambda_searched": whole.over_box.searched,
-        "q_of_lambda_max_box": whole.over_box.q_max,
-        "jump_times": whole.jumps,
-        "lambda_min_K2_over_M0_run": whole.slowest,
-        **{
-            f"{name}_weighted_case_{case}": x
-            for case, found in whole.weights.items()
-            for name, x in found._asdict().items()
-        },
-        "samples": whole.samples,
-        "samples_left_out": whole.left_out,
-    }
-
-
-def _traces(trajectory: Trajectory) -> Traces:
-    """What the figure shows of a stretch, at its recorded samples; NaN where there is no claim.
-
-    Of a law that has only a claim of its own, V and the left side are those of that claim.
-    """
-    sample, proof, case = trajectory.sample, trajectory.proof, applicable_case(trajectory.whole)
-    nothing = np.full(trajectory.t.shape, np.nan)
-    envelope, left = (
-        (nothing, nothing)
-        if case is None
-        else (trajectory.envelope[case].bound, left_side(trajectory, case))
+def _sampled_traces(run: Rollout) -> Traces:
+    """The curves of a sampled run, of which nothing is claimed."""
+    nan = np.full(run.t.shape, np.nan)
+    return Traces(
+        t=np.asarray(run.t),
+        V=np.asarray(run.V),
+        envelope=nan,
+        left=nan,
+        dropped=nan,
+        xi=np.asarray(run.xi),
+        xi_bound=np.full(run.xi.shape, np.nan),
+        e2=np.linalg.norm(run.e2, axis=1),
+        e2_bound=nan,
+        f_tilde=np.linalg.norm(run.disturbance - run.disturbance_estimate, axis=1),
+        f_tilde_bound=nan,
+        excluded=np.ones(run.t.shape, bool),
     )
-    bounds = (
-        {"xi, by V1": np.full(sample.q.shape, np.nan), "e2": nothing, "f_tilde": nothing}
-        if case is None
-        else bounds_along(trajectory, envelope)
-    )
-    traces = Traces(
-        t=trajectory.t,
-        V=proof.V,
-        envelope=envelope,
-        left=np.where(proof.held, np.nan, left),
-        dropped=proof.dropped_e2 + proof.dropped_f,
-        xi=sample.xi,
-        xi_bound=bounds["xi, by V1"],
-        e2=np.linalg.norm(proof.e2, axis=1),
-        e2_bound=bounds["e2"],
-        f_tilde=np.linalg.norm(proof.f_tilde, axis=1),
-        f_tilde_bound=bounds["f_tilde"],
-        held=proof.held,
-    )
-    if case is None and own_law.applies(trajectory):
-        left = np.where(proof.held, np.nan, own_law.left_side(proof.own))
-        traces = traces._replace(V=proof.own.V, left=left, dropped=np.zeros_like(left))
-    return Traces(*(x[trajectory.recorded] for x in traces))
 
 
-def _many(
-    runs: Iterable[tuple[int, Rollout]] | Iterator[tuple[int, Rollout]], count: int
-) -> Certificate:
+# --- many runs -----------------------------------------------------------------------------------
+
+
+def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
     """One certificate over many runs: each line is that of its worst run; the traces are those of
     the worst run of all.
     """
-    if count == 0:
-        raise checks.fail("run", "no runs", "at least one run")
-    lines: dict[str, list[Line]] = {}
-    judged: list[int] = []
-    disbelieved: list[int] = []
-    worst: tuple[tuple, int, Certificate] | None = None
+    by_name: dict[str, list[Line]] = {}
+    indices: list[int] = []
+    invalid: list[int] = []
+    worst: tuple[tuple[float, float], int, Certificate] | None = None
     for index, run in runs:
-        certificate = _one(run)
-        judged.append(index)
-        disbelieved += [] if believed(run) else [index]
+        certificate = _certificate_of(run)
+        indices.append(index)
+        if not is_valid(run):
+            invalid.append(index)
         for line in certificate.lines:
-            lines.setdefault(line.name, []).append(dataclasses.replace(line, run=index))
-        badness = min(
-            map(_badness, filter(lambda line: "inequality" in line.name, certificate.lines))
-        )
-        badness = min(badness, (0.0 if certificate.verdict == FAILS else 1.0, badness[1]))
-        if worst is None or badness < worst[0]:
-            worst = (badness, index, certificate)
-    assert worst is not None
-    merged = tuple(_worst_line(same, disbelieved) for same in lines.values())
-    _, index, certificate = worst
+            by_name.setdefault(line.name, []).append(dataclasses.replace(line, run=index))
+        severity = _severity(certificate)
+        if worst is None or severity < worst[0]:
+            worst = (severity, index, certificate)
+    if worst is None:
+        raise checks.fail("run", "no runs", "at least one run")
+    _, worst_index, certificate = worst
     return Certificate(
         certificate.heading,
-        merged,
+        tuple(lines.over_runs(same, invalid) for same in by_name.values()),
         certificate.numbers,
         certificate.traces,
-        tuple(judged),
+        tuple(indices),
         certificate.joints,
-        index,
+        worst_index,
     )
 
 
-def _badness(line: Line) -> tuple[float, float]:
-    """Order of lines: failed first, then by margin, those that do not apply last; where there is no
-    margin, by value downward.
+def _severity(certificate: Certificate) -> tuple[float, float]:
+    """Sort key of certificates, the worst first: one that fails, then by the margin of the
+    inequality.
     """
-    rank = {FAILS: 0.0, NOT_APPLICABLE: 2.0}.get(line.verdict, 1.0)
-    if line.margin is not None:
-        return rank, line.margin
-    return rank, np.inf if line.value is None else -line.value
-
-
-def _worst_line(same: list[Line], disbelieved: list[int]) -> Line:
-    """The line of the worst run, with a word on how many runs failed or had no claim.
-
-    What is not judged in a run that is not to be believed does not hold in all runs.
-    """
-    worst = min(same, key=_badness)
-    if worst.verdict == HOLDS:
-        worst = next(
-            (line for line in same if line.run in disbelieved and line.verdict == NOT_APPLICABLE),
-            worst,
-        )
-    failed = sum(line.verdict == FAILS for line in same)
-    absent = sum(line.verdict == NOT_APPLICABLE for line in same)
-    notes = [f"fails in {failed} of {len(same)} runs"] if failed else []
-    if 0 < absent < len(same):
-        notes.append(f"not applicable in {absent} of {len(same)} runs")
-    return dataclasses.replace(
-        worst, note="; ".join([*notes, *([worst.note] if worst.note else [])])
-    )
+    inequalities = [line for line in certificate.lines if "inequality" in line.name]
+    worst = min(lines.severity(line, lines.OVER_RUNS) for line in inequalities)
+    verdict = 0.0 if certificate.verdict == FAILS else 1.0
+    return min(worst, (verdict, worst[1]))

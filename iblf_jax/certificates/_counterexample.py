@@ -1,20 +1,20 @@
 """Search for a start and gains at which the differential inequality of Theorem 2 is broken.
 
 The inequality is a statement about states, so a counterexample is one state: the start of a
-scenario.  The proof leaves
+scenario. The proof leaves
 
-    V2' - 1/2 |f'|^2 <= -Q,   Q = sum_i rate_i V1_i + e2^T (K2 - I/2) e2 + f_tilde^T (kf - I)
-    f_tilde >= rho V2,           (3.24)
+    V2' - 1/2 |f'|^2 <= -Q,
+    Q = sum_i rate_i V1_i + e2^T (K2 - I/2) e2 + f_tilde^T (kf - I) f_tilde >= rho V2,        (3.24)
 
-and `counterexample` climbs  g = (V2' - 1/2 |f'|^2) / Q  at t = 0 over perturbations of the scenario
-(`studies.cube`), from many starting points, with the exact gradient.  Where the proof is exact g
-never exceeds -1, whatever is varied.  g > -1 breaks (3.24); g > 0 breaks the claim itself, (3.18)
-and (3.26) for every rho > 0: V2 grows where the theorem has it fall.  For law and observer as
-printed such starts exist, because the terms dropped from the proof grow with the cube of the joint
-velocity, and Q with its square.
+and `counterexample` maximises g = (V2' - 1/2 |f'|^2) / Q at t = 0 over perturbations of the
+scenario (`studies.cube`), from many starting points, with the exact gradient. Where the proof is
+exact, g never exceeds -1, whatever is varied. g > -1 breaks (3.24); g > 0 breaks the claim itself,
+(3.18) and (3.26) for every rho > 0: V2 grows where the theorem claims a decrease. For law and
+observer as printed such starts exist, because the terms that the proof drops grow with the cube of
+the joint velocity, and Q with its square.
 
-What cannot be run (a start outside its bounds, a negative mass) and where nothing is claimed (the
-guard or a torque limit at work) is no counterexample: such points are passed over.
+Points at which the scenario cannot run (a start outside its bounds, a negative mass), or at which
+nothing is claimed (the guard or a torque limit is active), are no counterexamples and are skipped.
 """
 
 from __future__ import annotations
@@ -31,15 +31,18 @@ from iblf_jax.certificates.eigenvalues import maximise
 from iblf_jax.certificates.proof_terms import terms_at
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import bounded
 from iblf_jax.studies.distributions import Perturbation
 
+EXCLUDED = "The guard or a torque limit is at work at the start, where nothing is claimed."
+
 
 class Counterexample(NamedTuple):
-    """The worst that `counterexample` found."""
+    """The largest growth that `counterexample` found."""
 
     scenario: Scenario
     parameters: dict[str, np.ndarray]
@@ -57,16 +60,15 @@ def relative_growth(scenario: Scenario) -> jax.Array:
 
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
-    """The growth at the start, and whether the guard or a torque limit is at work there."""
-    seen = terms_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
-    constants: Any = claims.claim(scenario)
+    """The growth at the start, and whether the claim excludes the start."""
+    proof = terms_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
+    constants: Any = claims.constants_of(scenario)
     M0 = scenario.model.mass_matrix(scenario.initial.q)
-    V1 = seen.V - 0.5 * (seen.e2 @ (M0 @ seen.e2) + seen.f_tilde @ seen.f_tilde)
-    by_e2 = seen.e2 @ ((constants.K2 - claims.LOWEST_K2) * seen.e2)
-    by_f = seen.f_tilde @ ((constants.kf - claims.LOWEST_KF[2]) * seen.f_tilde)
-    return (seen.dV - 0.5 * seen.df @ seen.df) / (
-        jnp.min(constants.decay) * V1 + by_e2 + by_f
-    ), seen.held
+    V1 = proof.V - 0.5 * (proof.e2 @ (M0 @ proof.e2) + proof.f_tilde @ proof.f_tilde)
+    by_e2 = proof.e2 @ ((constants.K2 - claims.LOWEST_K2) * proof.e2)
+    by_f = proof.f_tilde @ ((constants.kf - claims.LOWEST_KF[2]) * proof.f_tilde)
+    Q = jnp.min(constants.decay) * V1 + by_e2 + by_f
+    return (proof.dV - 0.5 * proof.df @ proof.df) / Q, proof.excluded
 
 
 @checks.renamed(ranges="perturbations")
@@ -77,78 +79,93 @@ def counterexample(
     starts: int = 16,
     seed: int = 0,
 ) -> Counterexample:
-    """Climbs to the start and gains at which V2' - 1/2 |f'|^2 is largest relative to -Q of the
-    proof.                    (3.24)
+    """Maximises V2' - 1/2 |f'|^2, relative to the -Q of the proof, over starts and gains.    (3.24)
 
     Args:
-      scenario: a scenario for which Theorem 2 claims something.
+      scenario: a scenario about which Theorem 2 makes a claim.
       perturbations: path -> `factor`, `offset` or `value` of a bounded distribution, as in
-        `ij.falsify`: what may vary, and between which ends; what is inadmissible in them (a start
-          outside its bounds) is passed over.
-      starts: from how many random points to climb.
+        `ij.falsify`: what varies, and in which range; inadmissible points (a start outside its
+        bounds) are skipped.
+      starts: number of random points from which to ascend.
       seed: of the random points.
 
     Returns:
-      The worst that was found, a `Counterexample` if its `growth` is positive; its scenario can be
-      run.
+      The largest growth that was found, a counterexample if its `growth` is positive; its scenario
+      can be run.
 
     Raises:
-      ValueError: no claim to break, an unknown path, a perturbation without ends, perturbations in
-        which nothing admissible was found.
+      ValueError: no claim to break, an unknown path, a perturbation without finite ends, or
+        perturbations without an admissible point.
     """
     scenario = canonical(scenario)
-    reason = claims.why_no_claim(scenario)
-    if not reason and not isinstance(claims.law_of(scenario), Backstepping):
-        reason = (
-            f"Q is Theorem 2's; {type(claims.law_of(scenario)).__name__} has a claim of its own"
-        )
-    if reason:
-        raise checks.fail(
-            "scenario", type(scenario.controller).__name__, "a scenario with a claim", reason + "."
-        )
-    starts, seed = (
-        checks.positive_integer("starts", starts),
-        checks.positive_integer("seed", seed, least=0, most=2**32 - 1),
-    )
+    _check_claimed(scenario)
+    starts = checks.positive_integer("starts", starts)
+    seed = checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
     cube = bounded(scenario, perturbations, signs=False)
     checks.fits("starts", starts, 8.0 * 2 * cube.size)
-    growth = jax.jit(
-        jax.value_and_grad(
-            lambda u: _growth(with_parameters(scenario, cube.values(u))), has_aux=True
-        )
-    )
-    best = (-np.inf, np.zeros(0))
+    search = _Search(scenario, cube)
+    for point in cube.admissible_points(starts, seed, search.why_unusable):
+        search.ascend(point)
+    values = search.values(search.best_point)
+    found = {path: np.asarray(value) for path, value in values.items()}
+    return Counterexample(with_parameters(scenario, found), found, search.best_growth)
 
-    def seen(u):
-        """Why a point is no answer, g and its gradient there; the best point is kept."""
-        nonlocal best
-        why = cube.refused(u)
-        if why:
-            return why, -np.inf, np.zeros(cube.size)
-        (g, held), slope = growth(jnp.asarray(u, scenario.initial.q.dtype))
-        if held or not np.isfinite(g):
-            return (
-                "The guard or a torque limit is at work at the start, where nothing is claimed.",
-                -np.inf,
-                np.zeros(cube.size),
+
+def _check_claimed(scenario: Scenario) -> None:
+    """Raises ValueError for a scenario about which Theorem 2 makes no claim."""
+    law = unwrapped(scenario.controller)
+    reason = claims.why_no_theorem(scenario)
+    if not reason and not isinstance(law, Backstepping):
+        reason = f"Q is Theorem 2's; {type(law).__name__} has a claim of its own"
+    if reason:
+        got = type(scenario.controller).__name__
+        raise checks.fail("scenario", got, "a scenario with a claim", f"{reason}.")
+
+
+class _Search:
+    """Ascents over the unit cube of the perturbations, and the best point of all of them."""
+
+    def __init__(self, scenario: Scenario, cube: Any) -> None:
+        self.cube = cube
+        self.dtype = scenario.initial.q.dtype
+        self.best_growth = -np.inf
+        self.best_point = np.zeros(0)
+        self._growth = jax.jit(
+            jax.value_and_grad(
+                lambda u: _growth(with_parameters(scenario, cube.values(u))), has_aux=True
             )
-        best = max(best, (float(g), u.copy()), key=lambda pair: pair[0])
-        return "", float(g), np.asarray(slope)
-
-    def climb(u, worse):
-        """What the ascent sees: beyond what is admissible a plain below its start, from which the
-        line search turns back.
-        """
-        why, g, slope = seen(u)
-        return (worse, slope) if why else (g, slope)
-
-    for point in cube.admissible_points(starts, seed, lambda u: seen(u)[0]):
-        worse = seen(point)[1] - 1.0
-        maximise(
-            lambda u, worse=worse: climb(u, worse), point, np.zeros(cube.size), np.ones(cube.size)
         )
-    values = {
-        path: np.asarray(value)
-        for path, value in cube.values(jnp.asarray(best[1], scenario.initial.q.dtype)).items()
-    }
-    return Counterexample(with_parameters(scenario, values), values, best[0])
+
+    def values(self, point: np.ndarray) -> dict[str, jax.Array]:
+        """Path -> value at a point of the cube."""
+        return self.cube.values(jnp.asarray(point, self.dtype))
+
+    def evaluate(self, point: np.ndarray) -> tuple[str, float, np.ndarray]:
+        """Why a point is unusable ("" if it is usable), and g and its gradient there; the best
+        point is kept.
+        """
+        why = self.cube.refused(point)
+        if why:
+            return why, -np.inf, np.zeros(self.cube.size)
+        (g, excluded), gradient = self._growth(jnp.asarray(point, self.dtype))
+        if excluded or not np.isfinite(g):
+            return EXCLUDED, -np.inf, np.zeros(self.cube.size)
+        if float(g) > self.best_growth:
+            self.best_growth, self.best_point = float(g), point.copy()
+        return "", float(g), np.asarray(gradient)
+
+    def why_unusable(self, point: np.ndarray) -> str:
+        """Why a point is unusable; "" if it is usable."""
+        return self.evaluate(point)[0]
+
+    def ascend(self, start: np.ndarray) -> None:
+        """Ascends from one point. Unusable points have a constant value below that of the start,
+        from which the line search turns back.
+        """
+        floor = self.evaluate(start)[1] - 1.0
+
+        def value_and_gradient(point):
+            why, g, gradient = self.evaluate(point)
+            return (floor if why else g), gradient
+
+        maximise(value_and_gradient, start, np.zeros(self.cube.size), np.ones(self.cube.size))

@@ -1,10 +1,10 @@
 """The eigenvalues of the mass matrix over the admissible box of joint positions.
 
-rho (3.19), (3.27) holds lambda_max(M0), and (3.23), (3.31) hold lambda_min(M0).  Along one run they
-are known; before it, they must be taken over every position that the bounds admit, the box  min_t
-k_lc < q < max_t k_uc.  The maximum of an eigenvalue over a box has no closed form for a general
-arm: a grid (up to 3 joints) or a Sobol set (more) is searched, and the best points are improved by
-  projected quasi-Newton steps.  What was searched is said in words beside the number.
+rho (3.19), (3.27) contains lambda_max(M0), and (3.23), (3.31) contain lambda_min(M0). Along one run
+they are known. Before it, they must be taken over every position that the bounds admit, the box
+min_t k_lc < q < max_t k_uc. The maximum of an eigenvalue over a box has no closed form for a
+general arm: `eigenvalues_over` searches a grid (up to 3 joints) or a Sobol sequence (more), and
+improves the best points by projected quasi-Newton steps. It reports what it searched.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.plan import CERTIFY_TOGETHER
 from iblf_jax.world.robots import Robot
 
-GRID = {1: 257, 2: 65, 3: 21}
-"""Points an axis, by number of joints."""
+BATCH_SIZE = 512
+"""Positions whose eigenvalues are computed together; bounds the memory."""
+POINTS_PER_AXIS = {1: 257, 2: 65, 3: 21}
+"""Points of the grid per axis, by number of joints."""
 SOBOL_POINTS = 4096
 REFINED = 4
-"""How many of the best points are improved."""
+"""Number of the best points that are improved."""
 
 
 class Extremes(NamedTuple):
-    """Eigenvalues of M0 over a box [kg m^2], where they are taken, and what was searched."""
+    """Extreme eigenvalues of M0 over a box [kg m^2], their positions, and what was searched."""
 
     lambda_min: float
     lambda_max: float
@@ -46,9 +47,10 @@ def _with_gradient(robot: Robot, q: jax.Array, sign: int) -> jax.Array:
 
 
 @jax.jit
-def _both_ends(robot: Robot, points: jax.Array) -> jax.Array:
+def _eigenvalues(robot: Robot, points: jax.Array) -> jax.Array:
+    """Eigenvalues of M0 at each point, ascending, (m, n)."""
     return jax.lax.map(
-        lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=CERTIFY_TOGETHER
+        lambda q: jnp.linalg.eigvalsh(robot.mass_matrix(q)), points, batch_size=BATCH_SIZE
     )
 
 
@@ -73,12 +75,12 @@ def maximise(
 
 
 def points_in(low: np.ndarray, high: np.ndarray, *, seed: int = 0) -> tuple[np.ndarray, str]:
-    """Points that fill a box, (m, n), and in words how they were laid."""
+    """Points that fill a box, (m, n), and their description."""
     from scipy.stats import qmc
 
     n = low.size
-    if n in GRID:
-        axes = [np.linspace(a, b, GRID[n]) for a, b in zip(low, high, strict=True)]
+    if n in POINTS_PER_AXIS:
+        axes = [np.linspace(a, b, POINTS_PER_AXIS[n]) for a, b in zip(low, high, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)
         return points, f"{len(points)} grid points"
     with warnings.catch_warnings():
@@ -96,19 +98,20 @@ def eigenvalues_over(robot: Robot, low: np.ndarray, high: np.ndarray) -> Extreme
     """
     dtype = jax.eval_shape(robot.mass_matrix, jnp.asarray(low)).dtype
     low, high = np.asarray(low, float), np.asarray(high, float)
-    points, words = points_in(low, high)
-    ends = np.asarray(_both_ends(robot, points.astype(dtype)), float)
-    found = {}
-    for sign, values in ((1, ends[:, -1]), (-1, -ends[:, 0])):
-        starts = points[np.argsort(values)[::-1][:REFINED]]
-        tries = [
-            maximise(
-                lambda x, s=sign: _with_gradient(robot, np.asarray(x, dtype), s), start, low, high
-            )
-            for start in starts
+    points, description = points_in(low, high)
+    eigenvalues = np.asarray(_eigenvalues(robot, points.astype(dtype)), float)
+
+    def largest(sign: int, values: np.ndarray) -> tuple[float, np.ndarray]:
+        """The largest of sign * eigenvalue over the box: the best point, or an improvement."""
+        best = np.argsort(values)[::-1][:REFINED]
+        improved = [
+            maximise(lambda x: _with_gradient(robot, np.asarray(x, dtype), sign), start, low, high)
+            for start in points[best]
         ]
-        found[sign] = max(
-            [*tries, (float(values.max()), points[np.argmax(values)])], key=lambda pair: pair[0]
-        )
-    searched = f"{words}, the best {REFINED} improved by L-BFGS-B"
-    return Extremes(-found[-1][0], found[1][0], found[-1][1], found[1][1], searched)
+        on_grid = (float(values.max()), points[np.argmax(values)])
+        return max([*improved, on_grid], key=lambda pair: pair[0])
+
+    lambda_max, q_max = largest(1, eigenvalues[:, -1])
+    negative_min, q_min = largest(-1, -eigenvalues[:, 0])
+    searched = f"{description}, the best {REFINED} improved by L-BFGS-B"
+    return Extremes(-negative_min, lambda_max, q_min, q_max, searched)

@@ -1,10 +1,5 @@
-"""What `certify` gives back: a `Certificate`, which is a list of `Line`s, and the traces that the
+"""The result of `certify`: a `Certificate`, which is a list of `Line`s, and the traces that its
 figure shows.
-
-A line is one inequality of the theorem: what was checked, by what margin it holds (positive:
-  holds), where and when the margin is
-smallest, and the verdict.  "Not applicable" is a verdict of its own: no claim was made, so none was
-broken.
 """
 
 from __future__ import annotations
@@ -16,72 +11,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax.certificates.lines import (
+    FAILS,
+    HOLDS,
+    NOT_APPLICABLE,
+    OBSERVED_ONLY,
+    OWN_INEQUALITY,
+    Line,
+)
 from iblf_jax.core import checks, tables
+from iblf_jax.core.presentation import present
 
-HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
-OWN_INEQUALITY = "inequality, own V"
-"""Name of the inequality that a law states of itself."""
 FEW = 3
-"""Lines that do not apply are named up to this number."""
-SEEN_ONLY = "no claim, only seen ("
-"""Beginning of the note of a line that was seen to hold, and that nothing claims."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Line:
-    """One inequality of the theorem and what became of it."""
-
-    name: str
-    """Short name, unique in a certificate."""
-    equation: str
-    """Number in the paper."""
-    statement: str
-    """The inequality that was checked."""
-    verdict: str
-    """"holds", "fails" or "not applicable"."""
-    margin: float | None = None
-    """Smallest distance to breaking it, positive if it holds, in `unit`; None where there is
-    nothing to measure."""
-    tolerance: float = 0.0
-    """How far below zero the margin may be by rounding and by the integrator's error."""
-    value: float | None = None
-    """The number that the line is about, where it is about one (rho, F_d), in `unit`."""
-    unit: str = "1"
-    joint: int | None = None
-    """The joint with the smallest margin; None if the inequality is about all joints together."""
-    time: float | None = None
-    """When the margin is smallest [s]."""
-    run: int | None = None
-    """In a certificate over many runs: the run with the smallest margin."""
-    note: str = ""
-    """The reason of "not applicable", or what else should be known."""
-    counts: bool = True
-    """Whether the verdict enters `Certificate.verdict`; what is only measured does not."""
-    first: float | None = None
-    """The first instant at which a line about instants is broken [s]; None if none is."""
-
-    @property
-    def applies(self) -> bool:
-        """Whether the line says something of this run: a verdict, or a number that was measured
-        beside the claims.
-        """
-        return self.verdict != NOT_APPLICABLE or (self.value is not None and not self.counts)
-
-    def where(self) -> str:
-        """Run, joint and time of the smallest margin, and when the line was first broken, in
-        words.
-        """
-        if self.margin is None and self.value is None:
-            return ""
-        parts = [] if self.run is None else [f"run {self.run}"]
-        parts += [] if self.joint is None else [f"joint {self.joint}"]
-        parts += [] if self.time is None else [f"t = {self.time:.4g} s"]
-        parts += [] if self.first is None else [f"first broken at t = {self.first:.4g} s"]
-        return ", ".join(parts)
+"""Lines that do not apply are listed by name up to this number."""
 
 
 class Traces(NamedTuple):
-    """What `Certificate.plot` shows: arrays over the T recorded samples of one run; NaN where
+    """The curves of `Certificate.plot`: arrays over the T recorded samples of one run; NaN where
     nothing is claimed.
     """
 
@@ -101,8 +47,14 @@ class Traces(NamedTuple):
     f_tilde: np.ndarray
     """|f_tilde| [N m]."""
     f_tilde_bound: np.ndarray
-    held: np.ndarray
-    """bool: the guard or a torque limit was at work; nothing is claimed there."""
+    excluded: np.ndarray
+    """bool: the guard or a torque limit was active; nothing is claimed there."""
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        """`held`, the name of `excluded` in earlier versions."""
+        if name == "held":
+            return self.excluded
+        raise AttributeError(name)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,24 +64,24 @@ class Certificate:
     """
 
     heading: str
-    """Law, barrier, reading and observer that were judged."""
+    """Law, barrier, reading and observer of the certificate."""
     lines: tuple[Line, ...]
     numbers: dict[str, Any]
     """The constants of the claim: rho, rho2, lambda_min, lambda_max, V2(0), F_d, F_m, the case."""
     traces: Traces
     """Of the run, or of the worst of many."""
     runs: tuple[int, ...] = ()
-    """The runs that were judged, if there were many."""
+    """The runs that were checked, if there were many."""
     joints: tuple[str, ...] = ()
-    """What the joints are called."""
+    """Names of the joints."""
     worst_run: int | None = None
     """The run whose inequality has the smallest margin (or fails), if there were many; the traces
-    are its."""
+    are those of this run."""
 
     @property
     def verdict(self) -> str:
-        """All in one word: "fails" if a line does, "holds" if none does and the inequality was
-        checked, else "not applicable".
+        """The overall verdict: "fails" if a line fails, "holds" if none fails and the inequality
+        was checked, else "not applicable".
         """
         counted = [line for line in self.lines if line.counts]
         if any(line.verdict == FAILS for line in counted):
@@ -144,8 +96,8 @@ class Certificate:
 
     @property
     def is_of_own_claim(self) -> bool:
-        """Whether what was checked is a claim that the law states of itself, and not the paper's
-        theorem.
+        """Whether the checked inequality is one that the law states about itself, and not that of
+        the paper's theorem.
         """
         inequalities = [line.name for line in self.applicable if line.name.startswith("inequality")]
         return inequalities == [OWN_INEQUALITY]
@@ -164,18 +116,16 @@ class Certificate:
             ("", "equation", "verdict", "margin", "value", "where the margin is smallest"),
             *self._rows(),
         ]
+        shown = [f"Certificate: {self.verdict}  ({self.subject})", *tables.as_text(rows)]
         notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
-        shown = [
-            f"Certificate: {self.verdict}  ({self.subject})",
-            *tables.as_text(rows),
-            *(["notes", *notes] if notes else []),
-        ]
-        return "\n".join([*shown, *([self.omitted] if self.omitted else [])])
+        if notes:
+            shown += ["notes", *notes]
+        if self.omitted:
+            shown.append(self.omitted)
+        return "\n".join(shown)
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
     def table_html(self) -> str:
         """The lines that apply as an HTML table, those that fail in bold, and below it why the
@@ -192,7 +142,7 @@ class Certificate:
 
     @property
     def applicable(self) -> tuple[Line, ...]:
-        """The lines that say something of this run; `lines` has all."""
+        """The lines that are informative about this run; `lines` has all."""
         return tuple(line for line in self.lines if line.applies)
 
     @property
@@ -205,17 +155,13 @@ class Certificate:
         count = sum(map(len, reasons.values()))
         if count == 0:
             return ""
-        subject = (
-            "1 line of the paper's theorem does not apply"
-            if count == 1
-            else f"{count} lines of the paper's theorem do not apply"
-        )
+        subject = f"{count} lines of the paper's theorem do not apply"
+        if count == 1:
+            subject = "1 line of the paper's theorem does not apply"
         if len(reasons) == 1:
             return f"{subject}, because {next(iter(reasons))}."
-        return (
-            f"{subject}:"
-            f" {'; '.join(f'{_named(names)}, because {reason}' for reason, names in reasons.items())}."
-        )
+        parts = [f"{_listed(names)}, because {reason}" for reason, names in reasons.items()]
+        return f"{subject}: {'; '.join(parts)}."
 
     def _notes(self) -> dict[str, list[str]]:
         """Each note and the lines that it belongs to."""
@@ -227,10 +173,10 @@ class Certificate:
 
     @property
     def subject(self) -> str:
-        """What was judged, in words."""
-        return self.heading + (
-            f"; {len(self.runs)} runs, worst {self.worst_run}" if self.runs else ""
-        )
+        """What the certificate is about, in words."""
+        if not self.runs:
+            return self.heading
+        return f"{self.heading}; {len(self.runs)} runs, worst {self.worst_run}"
 
     def _rows(self) -> list[tuple[str, str, str, str, str, str]]:
         return [
@@ -262,20 +208,18 @@ class Certificate:
         """V2 under its envelope, the inequality's left side, and the errors under their bounds.
         Options as `plotting.certificate`.
         """
-        from iblf_jax.plotting import certificates
-
-        return certificates.certificate(self, **options)
+        return present("certificate figure", self, **options)
 
 
-def _named(names: list[str]) -> str:
-    """Lines by their names, or their number where there are many."""
+def _listed(names: list[str]) -> str:
+    """The names of lines, or their number where there are many."""
     return ", ".join(names) if len(names) <= FEW else f"{len(names)} lines"
 
 
 def _reason(note: str) -> str:
     """Why a line does not apply, from its note."""
-    if note.startswith(SEEN_ONLY):
-        return note.removeprefix(SEEN_ONLY).removesuffix(")")
+    if note.startswith(OBSERVED_ONLY):
+        return note.removeprefix(OBSERVED_ONLY).removesuffix(")")
     return note
 
 
@@ -286,7 +230,7 @@ def _number(value: float | None, unit: str) -> str:
 
 
 def _for_json(value: Any) -> Any:
-    """`value` with arrays as lists, NumPy numbers as Python's, and what is not finite as None."""
+    """`value` with arrays as lists, NumPy numbers as Python's, and non-finite numbers as None."""
     if isinstance(value, dict):
         return {str(key): _for_json(x) for key, x in value.items()}
     if isinstance(value, list | tuple):

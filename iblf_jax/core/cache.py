@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import platform
 import shutil
 import stat
 import time
@@ -28,6 +27,7 @@ import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax.core import notices
+from iblf_jax.kernels import cpuinfo, directory, processor
 
 LIMIT = 2 * 2**30
 """Bytes."""
@@ -39,30 +39,6 @@ DIGEST_SIZE = 32
 """Bytes of a digest."""
 IN_USE = 3600.0
 """Seconds for which nobody removes what was used: another process may be about to load it."""
-
-
-def directory() -> Path:
-    """The folder, mode 0700; OSError, whose text is one line for the user, if it cannot be made or
-    is not this user's.
-    """
-    path = None
-    try:
-        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if path.is_symlink():
-            raise OSError("it is a link and not a directory of this user")
-        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        try:
-            status = os.fstat(folder)
-            if status.st_uid != os.getuid():
-                raise OSError("it is not a directory of this user")
-            if stat.S_IMODE(status.st_mode) & 0o077:
-                os.fchmod(folder, 0o700)
-        finally:
-            os.close(folder)
-    except (OSError, RuntimeError) as error:
-        raise OSError(f"the cache {path or '~/.cache/iblf_jax'} cannot be made: {error}") from None
-    return path
 
 
 class VerifiedCache:
@@ -170,23 +146,6 @@ def keep_programs() -> None:
         _verify_entries(folder)
 
 
-@cache
-def processor() -> str:
-    """What a compiled program is tied to: the processor's model and features."""
-    names = ("model name", "flags", "Features", "CPU part")
-    return (
-        "\n".join(sorted({line for line in _cpuinfo() if line.startswith(names)}))
-        or platform.processor() + platform.machine()
-    )
-
-
-def _cpuinfo() -> list[str]:
-    try:
-        return Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return []
-
-
 def _reloads_badly() -> bool:
     """Whether XLA refuses its own programs here, with a line of complaint each
     (github.com/jax-ml/jax/issues/38445).
@@ -194,7 +153,7 @@ def _reloads_badly() -> bool:
     It takes "prefer no gather", with which LLVM tunes for the processors that have the bug GDS, for
     a feature that they lack.
     """
-    return any(line.startswith("bugs") and "gds" in line.split() for line in _cpuinfo())
+    return any(line.startswith("bugs") and "gds" in line.split() for line in cpuinfo())
 
 
 def _entries(folder: Path) -> list[tuple[os.DirEntry, os.stat_result]]:

@@ -4,7 +4,14 @@
 
 from __future__ import annotations
 
+import os
+
 import jax
+
+from iblf_jax.core import notices
+
+MOST_THREADS = 256
+"""Largest number of threads of a kernel (`kernels/c/driver.h`)."""
 
 
 def chosen() -> jax.Device | str | None:
@@ -23,3 +30,33 @@ def default() -> list[jax.Device]:
 def platform() -> str:
     """Their platform, as JAX names it: "cpu", "gpu" or "tpu"."""
     return jax.default_backend() if chosen() is None else default()[0].platform
+
+
+def processors() -> int:
+    """Number of processors that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def threads() -> int:
+    """Number of threads that a kernel may use.
+
+    It is $IBLF_JAX_THREADS if this is a whole number from 1 to 256, and otherwise the number of
+    processors divided by the number of CPU devices. A larger number counts as 256. Both this and
+    any other text give a warning.
+    """
+    default_threads = max(1, processors() // jax.local_device_count("cpu"))
+    text = os.environ.get("IBLF_JAX_THREADS", "")
+    if not text:
+        return default_threads
+    is_number = text.isascii() and text.isdigit()
+    digits = text.lstrip("0") if is_number else ""
+    if 0 < len(digits) < 10 and int(digits) <= MOST_THREADS:
+        return int(digits)
+    used = MOST_THREADS if digits else default_threads
+    notices.warn(
+        f"IBLF_JAX_THREADS: got {text[:40]!r}, expected a whole number from 1 to {MOST_THREADS}."
+        f" Running with {used} threads."
+    )
+    return used

@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 
 from iblf_jax._start import AT_END
+from iblf_jax.kernels import stop_compilers
 
 TASKS = Path("/proc/self/task")
 PATIENCE = 300.0
@@ -27,6 +28,9 @@ worst."""
 LOOKS, PAUSE = 5, 0.002
 """Times that threads are looked at before they count as idle, and seconds between: one that waits
 for memory is not running."""
+
+
+AT_END.append(stop_compilers)
 
 
 def native_threads_run() -> bool:

@@ -1,31 +1,15 @@
-"""What a waiting user sees: the bar of a study, and a line on what takes long; in terminals and in
-notebooks.
-"""
+"""The progress bar of a study, in terminals and in notebooks."""
 
 from __future__ import annotations
 
-import contextlib
-import sys
-import threading
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 from iblf_jax.core import checks
+from iblf_jax.kernels import has_reader
 
 DELAY = 1.0
-"""Seconds before a bar appears that was not asked for."""
-SLOW = 2.0
-"""Seconds before a line says what takes long."""
-
-
-def _has_reader() -> bool:
-    """Whether somebody watches: a terminal or a notebook."""
-    if "ipykernel" in sys.modules and "IPython" in sys.modules:
-        shell = sys.modules["IPython"].get_ipython()
-        if shell is not None and hasattr(shell, "kernel"):
-            return True
-    return sys.stderr is not None and sys.stderr.isatty()
+"""Seconds before a bar appears that the caller did not request."""
 
 
 def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") -> Any:
@@ -44,7 +28,7 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
             "ignore"
         )  # tqdm warns where a notebook lacks ipywidgets and then falls back to text by itself
         from tqdm.auto import tqdm
-    shown = _has_reader() if progress is None else progress
+    shown = has_reader() if progress is None else progress
     delay = DELAY if progress is None else 0.0
     return tqdm(
         total=total,
@@ -55,16 +39,3 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
         delay=delay,
         dynamic_ncols=True,
     )
-
-
-@contextlib.contextmanager
-def told(what: str) -> Iterator[None]:
-    """Says what is being done, once it has taken SLOW seconds and if somebody watches."""
-    line = threading.Timer(SLOW, lambda: sys.stderr.write(f"iblf_jax: {what}\n"))
-    line.daemon = True
-    if _has_reader():
-        line.start()
-    try:
-        yield
-    finally:
-        line.cancel()

@@ -1,7 +1,7 @@
 """What a robot's computer runs once a period, as scalar programs: the start, and a sample of
 velocity filter, observer and law.
 
-It is `closed_loop.answered`, with the sensor's velocity filter before it.  What an encoder does to
+It is `closed_loop.law_update`, with the sensor's velocity filter before it.  What an encoder does to
 a position (counts, offset, noise) the robot's own does.  Which leaves of the scenario the programs
 read decides what a user of the generated code can set.
 """
@@ -23,7 +23,7 @@ from iblf_jax.engine.plan import LIMITS
 from iblf_jax.kernels.packed import Shapes, lowered
 from iblf_jax.kernels.passes import written_out
 from iblf_jax.kernels.program import Program
-from iblf_jax.simulation.closed_loop import answered, stepping_observer
+from iblf_jax.simulation.closed_loop import discrete_observer, law_update
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -97,7 +97,7 @@ def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
     """The memory before the first sample, and the torque that holds the model still."""
     scenario, velocity = _at(scenario, told), _velocity(scenario)
     q, dq = told.q, told.dq
-    observer = stepping_observer(scenario).init(q, dq, scenario.model)
+    observer = discrete_observer(scenario).init(q, dq, scenario.model)
     filtered = () if velocity is None else velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
     return Memory(
         scenario.controller.init(q, dq, scenario.context), observer, filtered
@@ -114,7 +114,9 @@ def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Outp
         dq, filtered = velocity.estimate(
             told.q, told.dq, normal, scenario.sampling.period, memory.velocity
         )
-    answer = answered(scenario, told.t, Measurement(told.q, dq), memory.controller, memory.observer)
+    answer = law_update(
+        scenario, told.t, Measurement(told.q, dq), memory.controller, memory.observer
+    )
     command, tube = answer.command, scenario.context.tube(told.t)
     infeasible = jnp.zeros((), bool)
     for slack in jax.tree.leaves((command.slack, command.region_slack)):

@@ -25,7 +25,12 @@ from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
 from iblf_jax.engine.simulate import report
 from iblf_jax.engine.step import folded, sample_status
-from iblf_jax.simulation.closed_loop import LoopState, initial_state, observed, sampled_if_due
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    initial_state,
+    run_sampled_law_if_due,
+    sample_at,
+)
 from iblf_jax.simulation.jumps import APART
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
@@ -34,9 +39,9 @@ from iblf_jax.simulation.sampling import (
     Instant,
     Sampling,
     check_step,
+    commands_in_transit,
     has_noise,
     noise_key,
-    under_way,
 )
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import SIGNALS
@@ -174,7 +179,9 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
     period = checks.time_span("period", period)
     if scenario.sampling is None:
         return dataclasses.replace(scenario, sampling=Sampling(period))
-    queue = max(scenario.sampling.queue, under_way(float(scenario.sampling.delay), period))
+    queue = max(
+        scenario.sampling.queue, commands_in_transit(float(scenario.sampling.delay), period)
+    )
     return dataclasses.replace(
         scenario, sampling=dataclasses.replace(scenario.sampling, period=period, queue=queue)
     )
@@ -210,7 +217,7 @@ class _Motion(NamedTuple):
 @jax.jit
 def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
     """The state after a sample."""
-    return sampled_if_due(scenario, t, state, Instant(index, jnp.zeros_like(index)), noise)
+    return run_sampled_law_if_due(scenario, t, state, Instant(index, jnp.zeros_like(index)), noise)
 
 
 @jax.jit
@@ -322,7 +329,7 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
                     noise,
                 )
                 states.append(state)
-                commands.append(np.asarray(state.held.commands[0]))
+                commands.append(np.asarray(state.sampled.commands[0]))
             change(now + near)
             rows.append(row(now, True))
             while index < steps and now < end - near:
@@ -350,8 +357,8 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     half, zero = 0.5 * jnp.diff(t), jnp.zeros((1,), dt.dtype)
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
     step = jnp.where(motion.instant & (t > 0), dt, 0.0)
-    said = jax.tree.map(lambda x: x[motion.sample], motion.states.held.said)
-    see = jax.vmap(partial(observed, scenario))
+    said = jax.tree.map(lambda x: x[motion.sample], motion.states.sampled.signals)
+    see = jax.vmap(partial(sample_at, scenario))
     samples = see(t, weight, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, said)
     samples = dataclasses.replace(samples, step=step)
     raised = jax.vmap(sample_status)(samples)
@@ -379,7 +386,7 @@ def _rollout(
         fastest_mode=jnp.full_like(step_size, jnp.nan),
         dt=step_size,
         actuator_state=jax.tree.map(lambda x: jnp.asarray(x[at]), motion.actuator),
-        measured=states.held.measured,
+        measured=states.sampled.measured,
         method=method,
         steps=int(np.sum(motion.instant)) - 1,
         **{name: getattr(recorded, name) for name in SIGNALS},

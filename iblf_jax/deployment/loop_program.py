@@ -83,7 +83,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
             else jnp.zeros((4,), dtype)
         )
         inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), noise)
-        size = accuracy.places(state).size
+        size = accuracy.watched_indices(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(
             inputs,

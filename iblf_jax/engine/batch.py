@@ -28,7 +28,7 @@ from iblf_jax.engine.step import (
     verdict,
 )
 from iblf_jax.simulation import accuracy
-from iblf_jax.simulation.closed_loop import initial_state, surroundings
+from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.simulation.stability import resolved
@@ -188,10 +188,10 @@ def _initial_probe(batch: Batch, method: str) -> Probed:
     """The carry of a `Probe` at the start of every run."""
 
     def of_run(inputs):
-        estimate = accuracy.unseen(inputs.scenario, method, inputs.dt, inputs.steps)
+        estimate = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
         state = initial_state(inputs.scenario)
-        watched = accuracy.places(state).size
-        return probed(jnp.zeros_like(inputs.dt), surroundings(state), watched, estimate)
+        watched = accuracy.watched_indices(state).size
+        return probed(jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate)
 
     return batch.each(of_run)
 
@@ -216,7 +216,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry."""
 
     def of_run(inputs):
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     return jax.eval_shape(lambda: batch.each(of_run))
@@ -231,11 +231,11 @@ def finalize(
 
     def critical_instants(inputs, carry):
         watched = at_start.jacobian.shape[-1]
-        no_estimate = accuracy.Unseen(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        no_estimate = accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
         nearest, end = carry.nearest, inputs.dt * inputs.steps
         instants = (
             probed(nearest.t, nearest.state, watched, no_estimate),
-            probed(end, surroundings(carry.state), watched, no_estimate),
+            probed(end, perturbed_state(carry.state), watched, no_estimate),
         )
         return jax.tree.map(lambda *xs: jnp.stack(xs), *instants)
 

@@ -117,7 +117,7 @@ class TangentStep:
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step."""
     if not places:
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         # The estimate of the accuracy is the run's own: here nobody reads it.
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 

@@ -67,7 +67,7 @@ def first_that_works(
     for text in execution.notes:
         _warn_once(text)
     names = execution.executors
-    for name, following in zip(names, (*names[1:], "vmap"), strict=True):
+    for name, following in zip(names, (*names[1:], "vmap"), strict=False):
         try:
             return attempt(registry.EXECUTORS[name])
         except ToolchainError as error:

@@ -5,7 +5,7 @@ scalar program (`lowered_on`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import jax

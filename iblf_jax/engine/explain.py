@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.executors import program_of
@@ -21,7 +22,6 @@ from iblf_jax.engine.step import TimeStep
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.passes import written_out
 from iblf_jax.kernels.program import LANE, SHARED, TIME, Program
-from iblf_jax.kernels.toolchain import threads
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get

@@ -27,7 +27,7 @@ import numpy as np
 
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.step_size import start_and_along
-from iblf_jax.simulation.closed_loop import LoopState, initial_state, sampled
+from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Initial, Scenario
@@ -166,7 +166,7 @@ def _period_maps(scenario: Scenario, times: jax.Array, states: LoopState) -> jax
 
     def at(t: jax.Array, state: LoopState) -> jax.Array:
         draws = jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
-        state = sampled(scenario, t, state, draws)
+        state = run_sampled_law(scenario, t, state, draws)
         return period_map(scenario, state, jacobian(scenario, t, state))
 
     return jax.vmap(at)(times, states)

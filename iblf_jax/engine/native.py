@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.devices import threads
 from iblf_jax.engine import plan
 from iblf_jax.kernels.emit_c import header, source
 from iblf_jax.kernels.packed import Packed, Shapes, record_shapes
 from iblf_jax.kernels.program import Program
-from iblf_jax.kernels.toolchain import ToolchainError, build_ahead, built, compiler, loaded, threads
+from iblf_jax.kernels.toolchain import ToolchainError, build_ahead, built, compiler, loaded
 
 _registered: set[str] = set()
 

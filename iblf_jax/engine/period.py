@@ -18,8 +18,8 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.engine.step_size import LOOKS, round_down, start_and_along
-from iblf_jax.simulation.closed_loop import LoopState, sampled
-from iblf_jax.simulation.sampling import Sampling, under_way, with_room
+from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
+from iblf_jax.simulation.sampling import Sampling, commands_in_transit, with_sufficient_queue
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import jacobian, period_map
 
@@ -48,7 +48,9 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     sampling: Any = scenario.sampling
     dtype = scenario.initial.q.dtype
     changed = dataclasses.replace(
-        sampling, period=jnp.asarray(period, dtype), queue=under_way(float(sampling.delay), period)
+        sampling,
+        period=jnp.asarray(period, dtype),
+        queue=commands_in_transit(float(sampling.delay), period),
     )
     maps = np.asarray(
         _maps(dataclasses.replace(scenario, sampling=changed), jnp.asarray(times, dtype)), float
@@ -63,7 +65,7 @@ def _maps(scenario: Scenario, times: jax.Array) -> jax.Array:
 
     def at(t: jax.Array, state: LoopState) -> jax.Array:
         # The torque of the instant is the one that the law commands there.
-        state = sampled(
+        state = run_sampled_law(
             scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype)
         )
         return period_map(scenario, state, jacobian(scenario, t, state))
@@ -107,7 +109,7 @@ def recommended_period(
     margin = checks.number_between("margin", margin, *MARGINS, "1")
     if isinstance(scenario, Scenario) and scenario.sampling is None:
         scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))
-    scenario = with_room(canonical(scenario))
+    scenario = with_sufficient_queue(canonical(scenario))
     if not checks.is_concrete(scenario):
         raise checks.fail(
             "scenario", "traced values", "numbers", "Call it outside of jit, vmap and grad."

@@ -127,17 +127,6 @@ processor's vectors hold."""
 TUNE_FRESH = 10_000_000
 """Steps up to which fresh runs are made in the shape of a search's values: half a second of work
 for the paper's scenario, where XLA compiles a block of them in 1.5 s."""
-CERTIFY_STRETCH = 1024
-"""Steps that a certificate looks at together: memory does not grow with the length of a run, and
-one program serves every length."""
-CERTIFY_RECORDED = 20_000
-"""Steps that a certificate has recorded at most of the run that it makes; the others are made
-again."""
-CERTIFY_TOGETHER = 512
-"""Positions whose mass matrices' eigenvalues a certificate works out together: bounds the
-memory."""
-CERTIFY_KEPT = 100_000
-"""Steps up to which a certificate keeps a run in memory between its two looks at it."""
 
 
 class BatchLayout(NamedTuple):

@@ -35,13 +35,13 @@ from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 from iblf_jax.simulation import accuracy, integrators, jumps, sampling, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
-    change,
     evaluate,
     initial_state,
-    moving,
-    sampled_if_due,
-    still,
-    surroundings,
+    integrated_part,
+    perturbed_rate,
+    perturbed_state,
+    run_sampled_law_if_due,
+    with_integrated_part,
 )
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
@@ -58,6 +58,7 @@ class Run(RunRequest):
         record_every: int | None = None,
         mechanism: Mechanism | None = None,
     ):
+        """The request."""
         return RunRequest(steps, method, record_every, mechanism)
 
 
@@ -83,7 +84,7 @@ class Nearest(NamedTuple):
     xi: jax.Array
     t: jax.Array
     state: Any
-    """What `closed_loop.surroundings` gives there."""
+    """What `closed_loop.perturbed_state` gives there."""
 
 
 class Carry(NamedTuple):
@@ -135,7 +136,7 @@ def is_sound(state: LoopState) -> jax.Array:
     """Whether a state is finite and slow enough to be a robot's, () bool."""
     slow, others = (
         jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT),
-        jax.tree.leaves((state.q, moving(state)[2:])),
+        jax.tree.leaves((state.q, integrated_part(state)[2:])),
     )
     return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))
 
@@ -164,7 +165,7 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
         state,
         blank,
         jnp.int32(0),
-        Nearest(-jnp.ones_like(zero), zero, surroundings(there)),
+        Nearest(-jnp.ones_like(zero), zero, perturbed_state(there)),
         estimate,
     )
 
@@ -282,7 +283,7 @@ class _Loop(NamedTuple):
         return self.evaluate(
             self.inputs.scenario,
             jumps.stage_time(piece, t),
-            still(self.state, moved),
+            with_integrated_part(self.state, moved),
             self.inputs.dt,
             *torque,
         )
@@ -351,8 +352,8 @@ def advance(
         now = sampling.instant(scenario.sampling, dt, index)
         due = (now.phase == 0) & (index > 0)
         t = index.astype(dt.dtype) * dt
-        state = sampled_if_due(scenario, t, state, now, inputs.noise)
-        arriving = sampling.arriving(scenario.sampling, dt, now, state.held.commands)
+        state = run_sampled_law_if_due(scenario, t, state, now, inputs.noise)
+        arriving = sampling.arriving(scenario.sampling, dt, now, state.sampled.commands)
         before = sampling.arrival_before(scenario.sampling, dt, now)
         arrivals = None if before is None else ((arriving.place * dt, arriving.changes), before)
         moment = _moment(inputs, index, method, arrivals)
@@ -361,7 +362,7 @@ def advance(
         moment = moment._replace(behind=jnp.where(due, jnp.zeros_like(dt), moment.behind))
 
     first = moment.division.pieces[0]
-    stepped = _integrated(along, first, moving(state), method, options)
+    stepped = _integrated(along, first, integrated_part(state), method, options)
     ahead = jnp.where(moment.span.counts, first.length, jnp.zeros_like(dt))
     step = jnp.where(index > 0, dt, jnp.zeros_like(dt))
     sample = _weighed(stepped.first, moment.span.start, 0.5 * (moment.behind + ahead), step)
@@ -380,11 +381,11 @@ def advance(
 
     def at_the_end(inputs, carry, index, sample, parts, later, before, goes_on, restarts, overfull):
         near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-        here = Nearest(near, sample.t, jax.lax.stop_gradient(surroundings(before)))
+        here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
         nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
         held = inputs.scenario.sampling is not None
         width = sample.upper - sample.lower
-        estimate = accuracy.observed(
+        estimate = accuracy.update(
             carry.accuracy, method, inputs.dt, index, parts, width, held, restarts, overfull
         )
         moved, raised = later
@@ -394,7 +395,7 @@ def advance(
         status |= flag(~sound & goes_on, Status.NOT_FINITE)
         return keep_if(sound & goes_on, moved, before), status, nearest, estimate
 
-    moved, division = still(state, later.moved), moment.division
+    moved, division = with_integrated_part(state, later.moved), moment.division
     after, status, nearest, estimate = options.piece(at_the_end)(
         inputs,
         carry,
@@ -493,8 +494,8 @@ def _before_sample(
     folds, scenario, dt = along.inputs.folds, along.inputs.scenario, along.inputs.dt
     if not folds:
         return carry.accumulators, ()
-    held = carry.state.held.commands
-    torque = sampling.torque_before(scenario.sampling, dt, held, along.state.held.commands)  # type: ignore[arg-type]
+    held = carry.state.sampled.commands
+    torque = sampling.torque_before(scenario.sampling, dt, held, along.state.sampled.commands)  # type: ignore[arg-type]
     t, behind = moment.span.start, moment.behind
     seen_at = (
         t
@@ -594,7 +595,7 @@ def recorded(folds: Any, found: Advanced):
         state.controller,
         state.observer,
         state.actuator,
-        state.held.measured if state.held else (),
+        state.sampled.measured if state.sampled else (),
     )
     return {name: getattr(found.sample, name) for name in SIGNALS}, *states
 
@@ -626,8 +627,9 @@ class TimeStep:
 
 
 class Probed(NamedTuple):
-    """A state whose surroundings are looked at; it stays as it is, so what it decides is computed
-    once.
+    """The carry of a `Probe`: a state around which the closed loop is linearized.
+
+    The state does not change, so what it decides is computed once.
     """
 
     time: jax.Array
@@ -638,7 +640,7 @@ class Probed(NamedTuple):
     jacobian: jax.Array
     """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
     `stability.resolved` makes one of them."""
-    unseen: accuracy.Unseen
+    unseen: accuracy.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
 
@@ -656,8 +658,8 @@ class Probe:
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
         watched, whole, x = (
-            accuracy.places(start),
-            ravel_pytree(surroundings(start))[1],
+            accuracy.watched_indices(start),
+            ravel_pytree(perturbed_state(start))[1],
             carry.state,
         )
         iteration = index - 3 * watched.size
@@ -671,12 +673,12 @@ class Probe:
 
         def rate_at(y):
             return ravel_pytree(
-                change(inputs.scenario, carry.time, whole(y), inputs.dt, options.piece)
+                perturbed_rate(inputs.scenario, carry.time, whole(y), inputs.dt, options.piece)
             )[0]
 
         around = whole(x)
         plant = around if inputs.scenario.sampling is None else around.plant
-        rooms = stability.room_around(inputs.scenario, carry.time, plant, x.size)
+        rooms = stability.largest_difference_sizes(inputs.scenario, carry.time, plant, x.size)
         room = jnp.where(
             iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype)
         )
@@ -691,22 +693,24 @@ class Probe:
         size = jnp.where(
             widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
         )
-        w, growth = stability.along(rate_at, x, direction, size), carry.growth
+        w, growth = stability.directional_derivative(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
             growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
         columns = jnp.arange(watched.size, dtype=index.dtype) == number
         chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
         jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
-        unseen = keep_if(index == 0, accuracy.kicked(inputs.scenario, carry.unseen), carry.unseen)
+        unseen = keep_if(
+            index == 0, accuracy.with_acceleration(inputs.scenario, carry.unseen), carry.unseen
+        )
         return Probed(carry.time, x, growth, jacobian, unseen), ()
 
 
 def probe_steps(scenario: Scenario) -> int:
     """Steps of a `Probe`."""
     state = initial_state(scenario)
-    watched = accuracy.places(state).size
+    watched = accuracy.watched_indices(state).size
     return 3 * watched + (
-        0 if watched == ravel_pytree(surroundings(state))[0].size else stability.POWER_ITERATIONS
+        0 if watched == ravel_pytree(perturbed_state(state))[0].size else stability.POWER_ITERATIONS
     )
 
 
@@ -714,14 +718,16 @@ def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
     """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
     jacobian = stability.resolved(probed.jacobian, scenario.sampling is not None)
     if scenario.sampling is not None:
-        size = ravel_pytree(moving(initial_state(scenario)))[0].size
+        size = ravel_pytree(integrated_part(initial_state(scenario)))[0].size
         return stability.growth_rate_by(jacobian[:size, :size])
     complete = len(jacobian) == probed.state.size
     return stability.growth_rate_by(jacobian) if complete else stability.growth_rate(probed.growth)
 
 
-def probed(time: jax.Array, around: Any, watched: int, unseen: accuracy.Unseen) -> Probed:
-    """The carry of a `Probe` of what `surroundings` gave, of which `accuracy` watches so many
+def probed(
+    time: jax.Array, around: Any, watched: int, unseen: accuracy.UnresolvedSignals
+) -> Probed:
+    """The carry of a `Probe` of what `perturbed_state` gave, of which `accuracy` watches so many
     numbers.
     """
     x = ravel_pytree(around)[0]
@@ -752,7 +758,7 @@ def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
 
 
 def verdict(
-    inputs: Inputs, method: str, carry: Carry, unseen: accuracy.Unseen, instants: Probed
+    inputs: Inputs, method: str, carry: Carry, unseen: accuracy.UnresolvedSignals, instants: Probed
 ) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
 
@@ -763,7 +769,7 @@ def verdict(
       unseen: what a `Probe` has found for the run.
       instants: what it has found at some of them.
     """
-    estimate = accuracy.between_stages(carry.accuracy, unseen)
+    estimate = accuracy.with_unresolved(carry.accuracy, unseen)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability

@@ -79,10 +79,13 @@ def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> P
 def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
-    watched = accuracy.places(start)
+    watched = accuracy.watched_indices(start)
     estimate = accuracy.begin(method, jacobian(scenario, zero, start)[watched][:, watched], start)
-    estimate = accuracy.between_stages(
-        estimate, accuracy.kicked(scenario, accuracy.unseen(scenario, method, dt, steps))
+    estimate = accuracy.with_unresolved(
+        estimate,
+        accuracy.with_acceleration(
+            scenario, accuracy.unresolved_signals(scenario, method, dt, steps)
+        ),
     )
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
@@ -127,7 +130,7 @@ def _advanced(
             reach = accuracy.steps_back(method)
             restarts = jumps.within(times, (number - reach) * dt, after) if times.size else None
             overfull = None if overfull is None else overfull[0]
-            estimate = accuracy.observed(
+            estimate = accuracy.update(
                 pair.estimate,
                 method,
                 dt,

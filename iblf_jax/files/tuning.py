@@ -7,37 +7,47 @@ is that of a study file (`files.study`):
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # the arguments of `tune`: runs, seed, risk, level,
-    starts, iterations, report_runs, ... parameters = ["controller.k1", { path = "controller.K2",
-    low = 0.6, high = 40.0, tied = true }] [[objective]]                           # functions of
-    iblf_jax.objectives with their arguments, and a weight kind = "tracking"
+    [tune]                                  # arguments of `tune`: runs, seed, risk, level, iterations
+    parameters = [
+      "controller.k1",
+      { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
+    ]
+    [tune.solver]                           # or solver = "sqp"; without it, `tune` chooses one
+    kind = "sqp"                            # "sqp", "lbfgs" or "adam", with the options of
+    starts = 4                              # ij.tuning.SQP, LBFGS or Adam
+    [tune.report]                           # the options of ij.tuning.Report
+    runs = 2000
+    [[objective]]                           # functions of iblf_jax.objectives with their arguments,
+    kind = "tracking"                       # and a weight
     [[objective]]
     kind = "effort"
     weight = 0.5
     [[objective]]                           # any metric by its name; `fold` only for one with
-    thresholds of one's own kind = "metric"
+    kind = "metric"                         # thresholds of one's own
     name = "iae"
     [[requirement]]
     kind = "margin_above"
     limit = 0.05
-    [[requirement]]                         # of some joints, by index, name or slice; a limit for
-    each, or one for all kind = "peak_torque_below"
+    [[requirement]]                         # of some joints, by index, name or slice;
+    kind = "peak_torque_below"              # a limit for each, or one for all
     joints = ["shoulder", "elbow"]          # or [0, 1], or "0:2"
     limit = [140.0, 27.0]
     [perturbations]
     "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02, shared = true }
 
-In files of earlier versions `joints` was a list of weights, which is now `weights`.  Floating-point
-numbers are still read so, and so are whole numbers that are no selection of joints; both with a
-DeprecationWarning.
+Options of solver and report that stand in [tune] itself, as in files of earlier versions, are read
+with a DeprecationWarning.  In files of earlier versions `joints` was a list of weights, which is
+now `weights`.  Floating-point numbers are still read so, and so are whole numbers that are no
+selection of joints; both with a DeprecationWarning.
 
-Everything is checked; each refusal is a ValueError that names the dotted key.  A saved result is
-JSON with all its numbers in full.
+Everything is checked; each error is a ValueError that names the dotted key.  A saved result is JSON
+with all its numbers in full precision.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 import os
@@ -48,7 +58,6 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import holds_weights
-from iblf_jax.engine.plan import BACKENDS
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
@@ -64,9 +73,12 @@ from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
+from iblf_jax.tuning.options import EARLIER_NAMES, REPLACED, Report
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
+from iblf_jax.tuning.runs import BACKENDS
+from iblf_jax.tuning.solvers import SOLVERS
 from iblf_jax.world.robots import joint_names
 
 components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
@@ -100,22 +112,10 @@ HISTORY = dict.fromkeys(
     "evaluations": "iu",
 }
 """What a result's history holds, and the kinds of its numbers."""
-ARGUMENTS = (
-    *(
-        "runs",
-        "seed",
-        "resample",
-        "optimiser",
-        "mode",
-        "starts",
-        "sharpenings",
-        "iterations",
-        "tolerance",
-        "patience",
-    ),
-    *("learning_rate", "backend", "report_runs", "report_seed", "confidence"),
-)
-"""What [tune] may hold besides `parameters`, `risk` and `level`."""
+ARGUMENTS = ("runs", "seed", "backend", "iterations")
+"""What [tune] may contain besides `parameters`, `risk`, `level`, `solver` and `report`."""
+EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
+"""What it contained in earlier versions."""
 
 
 def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
@@ -163,21 +163,40 @@ def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
 
 
 def _options(table: dict[str, Any]) -> dict[str, Any]:
-    known_keys(table, "tune", ("parameters", "risk", "level", *ARGUMENTS))
-    if not isinstance(table.get("parameters"), list):
-        raise checks.fail(
-            "tune.parameters",
-            table.get("parameters", Words("nothing")),
-            'a list of paths, such as ["controller.K2"]',
-        )
-    parameters = [_parameter(x, f"tune.parameters[{i}]") for i, x in enumerate(table["parameters"])]
-    options = {"parameters": parameters, **{key: table[key] for key in ARGUMENTS if key in table}}
+    """The arguments of `tune` in the table [tune]."""
+    allowed = ("parameters", "risk", "level", "solver", "report", *ARGUMENTS, *EARLIER_ARGUMENTS)
+    known_keys(table, "tune", allowed)
+    parameters = table.get("parameters", Words("nothing"))
+    if not isinstance(parameters, list):
+        expected = 'a list of paths, such as ["controller.K2"]'
+        raise checks.fail("tune.parameters", parameters, expected)
+    options: dict[str, Any] = {
+        "parameters": [_parameter(x, f"tune.parameters[{i}]") for i, x in enumerate(parameters)]
+    }
+    options |= {key: table[key] for key in (*ARGUMENTS, *EARLIER_ARGUMENTS) if key in table}
+    if "solver" in table:
+        options["solver"] = _solver(table["solver"])
+    if "report" in table:
+        report = as_table(table["report"], "tune.report")
+        options["report"] = components.construct(Report, dict(report), "tune.report")
     if "risk" in table:
         checks.one_of("tune.risk", table["risk"], KINDS)
         options["risk"] = table["risk"]
     if options.get("risk") == "cvar" and "level" in table:
         options["risk"] = components.construct(cvar, {"level": table["level"]}, "tune.level")
     return options
+
+
+def _solver(given: Any) -> Any:
+    """The solver of a name, or of a table with its kind and options."""
+    if isinstance(given, str):
+        given = {"kind": given}
+    table = dict(as_table(given, "tune.solver"))
+    kind = table.pop("kind", Words("nothing"))
+    checks.one_of("tune.solver.kind", kind, SOLVERS)
+    options = [field.name for field in dataclasses.fields(SOLVERS[kind])]
+    known_keys(table, "tune.solver", ("kind", *options))
+    return components.construct(SOLVERS[kind], table, "tune.solver")
 
 
 def _parameter(entry: Any, key: str) -> Any:
@@ -433,6 +452,8 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     words = {
         name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")
     }
+    # Earlier versions called SQP "newton".
+    words["optimiser"] = EARLIER_NAMES.get(words["optimiser"], words["optimiser"])
     names = tuple(checks.word("names", name, "a string") for name in data["names"])
     history = {name: _array(data["history"][name], kinds) for name, kinds in HISTORY.items()}
     steps, starts, size = history["x"].shape

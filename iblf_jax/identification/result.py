@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks, tables
+from iblf_jax.core.presentation import present
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, to_x
 from iblf_jax.identification.regression import Start
 from iblf_jax.identification.shooting import Prior, Refined, Windows
@@ -236,9 +237,7 @@ class Identification:
         )
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
     def words(self) -> list[str]:
         """What there is to say besides the tables, line by line."""
@@ -341,17 +340,13 @@ class Identification:
                 json.dumps(self.to_dict(), indent=1, allow_nan=False), encoding="utf-8"
             )
             return
-        from iblf_jax import reports
-
-        reports.report(self, target)
+        present("report", self, target)
 
     def plot(self, **options):
         """Figure: values with their errors, what is known how well, and what is left.  Options as
         `plotting.identification`.
         """
-        from iblf_jax import plotting
-
-        return plotting.identification(self, **options)
+        return present("identification figure", self, **options)
 
 
 TOLD, UNTOLD, LIMITED, FREE, BIASED = (

@@ -1,12 +1,8 @@
-"""Lowering: a step of a run as a scalar program, and that program as C.
+"""A compiler for the time step of a simulation: from JAX to C or CUDA."""
 
-    from_jaxpr, rules, structure    a jaxpr taken apart into numbers
-    functions                       its inner functions, read once and called if they are long
-    program, identities, passes     what comes of it, simplified
-    operations                      what a program may hold, one row each
-    packed                          the arrays that go in and out
-    layout, emit_c, c/              its text in C, for CPUs and GPUs
-    toolchain, nvrtc                compilers, and what they have built before
-
-What runs such programs is in `engine`.
-"""
+from iblf_jax.kernels.drafts import draft as draft
+from iblf_jax.kernels.folder import cpuinfo as cpuinfo
+from iblf_jax.kernels.folder import directory as directory
+from iblf_jax.kernels.folder import processor as processor
+from iblf_jax.kernels.messages import has_reader as has_reader
+from iblf_jax.kernels.toolchain import stop_compilers as stop_compilers

@@ -37,11 +37,9 @@ from typing import NamedTuple
 
 import jax
 
-from iblf_jax._start import AT_END
-from iblf_jax.core import notices
-from iblf_jax.core.cache import directory, processor
-from iblf_jax.core.drafts import draft, remove_abandoned
-from iblf_jax.core.progress import told
+from iblf_jax.kernels.drafts import draft, remove_abandoned
+from iblf_jax.kernels.folder import directory, processor
+from iblf_jax.kernels.messages import announce_if_slow
 
 COMMON_FLAGS = (
     "-x", "c++", "-std=gnu++17", "-nostdinc++", "-O1", "-fPIC", "-shared", "-pthread",
@@ -77,8 +75,6 @@ VERSION_TIMEOUT = 20.0
 """Seconds that it may take to say its version."""
 MOST_TEXT = 1 << 20
 """Bytes of a compiler's text that are read."""
-MOST_THREADS = 256
-"""Threads that a kernel takes at most (`c/driver.h`)."""
 DIGEST = hashlib.sha256
 """Of the key and the content, at the end of every kept file."""
 
@@ -227,7 +223,6 @@ def stop_compilers() -> None:
             os.killpg(pid, signal.SIGKILL)
 
 
-AT_END.append(stop_compilers)
 atexit.register(stop_compilers)
 
 
@@ -307,7 +302,7 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
         text.write_text(source)
         files = [f"-I{jax.ffi.include_dir()}", str(text), "-o", str(result), "-lm", "-ldl"]
         lines = source.count("\n")
-        with told(
+        with announce_if_slow(
             f"{_name_of(command)} is compiling a step of {lines:,} lines: once, the result is kept"
         ):
             _run([*command, *flags, *files], "stderr", TIMEOUT)
@@ -467,26 +462,3 @@ def _load(image: bytes) -> ctypes.CDLL:
         path = Path(folder) / "kernel.so"
         path.write_bytes(image)
         return ctypes.CDLL(str(path))
-
-
-def processors() -> int:
-    """Processors that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def threads() -> int:
-    """Threads that a kernel may use: $IBLF_JAX_THREADS, else the process's processors, divided
-    among its CPU devices.
-
-    What is no whole number from 1 to 256 is warned of: a larger one counts as 256, anything else as
-      not given.
-    """
-    wanted = os.environ.get("IBLF_JAX_THREADS", "")
-    usual = max(1, processors() // jax.local_device_count("cpu"))
-    number = wanted.lstrip("0") if wanted.isascii() and wanted.isdigit() else ""
-    if not wanted or (0 < len(number) < 10 and int(number) <= MOST_THREADS):
-        return int(number) if wanted else usual
-    chosen = MOST_THREADS if number else usual
-    expected = f"expected a whole number from 1 to {MOST_THREADS}. Running with {chosen} threads."
-    notices.warn(f"IBLF_JAX_THREADS: got {wanted[:40]!r}, {expected}")
-    return chosen

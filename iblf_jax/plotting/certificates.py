@@ -80,7 +80,7 @@ def certificate(
         "N m",
     )
     _verdicts(panels[1, 2], shown)
-    _mark_held(panels.flat[:5], traces)
+    _mark_excluded(panels.flat[:5], traces)
     run = "" if shown.worst_run is None else f", worst run {shown.worst_run}"
     colour = _style.alarm() if shown.verdict == "fails" else _style.ink()
     _style.head(figure, [f"{title}{run}: {shown.verdict}", shown.heading], color=colour)
@@ -177,16 +177,16 @@ def _relative_error(axes: Axes, traces: Traces, joints: tuple[str, ...]) -> None
     axes.legend(loc="upper center", ncols=columns, **LEGEND, **small)
 
 
-def _mark_held(panels: Any, traces: Traces) -> None:
+def _mark_excluded(panels: Any, traces: Traces) -> None:
     """A grey shade over the samples at which nothing is claimed."""
-    if not traces.held.any():
+    if not traces.excluded.any():
         return
     for axes in panels:
         axes.fill_between(
             traces.t,
             0,
             1,
-            where=traces.held,
+            where=traces.excluded,
             transform=axes.get_xaxis_transform(),
             color=_style.shade(0.149),
             step="mid",

@@ -1,33 +1,33 @@
-"""How accurate a run is: the error of its positions that the time step is to blame for, estimated
-along every run.
+"""Estimate of the position error that the time step causes, computed along every run.
 
-A step's own error shows in the differences of the rates x' at the last instants; for rk4, whose
-third stage is half a step on,
+The local error of a step follows from differences of the rates x' at the last instants. For rk4,
+whose third stage lies in the middle of a step,
 
     l_k = dt (x'_{k-2} - 4 x'_{k-3/2} + 6 x'_{k-1} - 4 x'_{k-1/2} + x'_k) / 18,
 
-and likewise for the other methods (`integrators.Tableau.differences`).  The factor is ten times
-that of a smooth loop, so that a torque that jumps within a step is seen too.  Such errors add up
-and are forgotten,
+and the other methods have formulas of their own (`integrators.Tableau.differences`). The factor is
+ten times that of a smooth loop, so that the estimate also covers a torque that jumps within a step.
+Local errors accumulate and decay,
 
     L_k = (1 - dt r) L_{k-1} + l_k,   r = `stability.SLOWEST`,
 
-and an error y of the velocities and of the observer moves the positions by R y, R = [I 0] (r I -
-J)^-1, J the Jacobian of their rates at the start.  So the error of the positions is about
+and an error y of the velocities and of the observer displaces the positions by R y, with
+R = [I 0] (r I - J)^-1 and J the Jacobian of their rates at the start. The position error is about
 
     max_k max(|L_q|, |L_q + R L_y|).
 
-Where the law is sampled its torque jumps from step to step, and no difference of steps says
-anything: there a step's own error is told by its stages alone.  For x' = A x those of rk4 have k_3
-  - k_2 = (dt A / 2) (k_2 - k_1), which says how large |dt A| is, and the step's error
-is dt |k_3 - k_2| |dt A|^2 / 30; Heun's is dt |k_2 - k_1| |dt A| / 6, where |dt A| is |k_2 - k_1| /
-|k_1|.  Again ten times that is taken.  J is what the map from a period to the next is as a rate.
+The torque of a sampled law jumps from step to step, so differences between steps carry no
+information, and the local error is estimated from the stages of each step. For x' = A x the stages
+of rk4 satisfy k_3 - k_2 = (dt A / 2) (k_2 - k_1), which gives |dt A|, and the local error is
+dt |k_3 - k_2| |dt A|^2 / 30. That of Heun's method is dt |k_2 - k_1| |dt A| / 6, where |dt A| is
+|k_2 - k_1| / |k_1|. The same factor of ten applies. J is the one-period map expressed as a rate.
 
-What the stages of a step cannot see, a reference or a disturbance that goes through whole periods
-between them, is looked for on its own (`between_stages`).  At the jump times of a scenario a step
-is divided (`jumps`), and no difference reaches over one of them: there, too, the stages of a step
-give its error.  Against runs at a sixteenth of the step the estimate is a third to thirty times the
-error where that matters, above 1e-4 of the tube, and larger below.
+The stages cannot resolve a reference or a disturbance with whole periods between them;
+`unresolved_signals` measures these separately. A step is divided at the jump times of a scenario
+(`jumps`). Differences are not taken across a jump: the stages of that step give its error.
+
+Compared with runs at a sixteenth of the step, the estimate is 1/3 to 30 times the error where the
+error exceeds 1e-4 of the tube, and larger below.
 """
 
 from __future__ import annotations
@@ -42,36 +42,38 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
-from iblf_jax.simulation.closed_loop import LoopState, surroundings
+from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.jumps import within
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST
+from iblf_jax.world.bounds import Tube
 from iblf_jax.world.robots import at_time
 
 TOLERANCE = 0.005
-"""Estimated error of a position, relative to the width of its tube, above which a run is flagged
+"""Estimated position error, relative to the width of the tube, above which a run is flagged
 INACCURATE."""
 INSTANTS = 16
-"""Steps, spread over a run, in which signals are looked at between the stages."""
+"""Steps, spread over a run, in which `unresolved_signals` examines the signals between stages."""
 ONSET = 3.0
-"""How much further a torque moves the positions when it sets in than when an observer has learnt
-it."""
+"""Ratio of the displacement by a torque at its onset to that by a torque that the observer has
+learnt."""
 GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 8 / 18), (0.5 + 0.15**0.5, 5 / 18))
-"""Places and weights of the quadrature that a step's own is held against."""
+"""Nodes and weights of Gauss's quadrature, the reference for the quadrature of a method."""
+GOLDEN_RATIO = 0.6180339887498949
 ERROR, RELATIVE = "numerical_error", "relative_numerical_error"
 UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
-"""Name and unit of what every run says of its accuracy, beside its metrics."""
+"""Name and unit of the accuracy results that every run has beside its metrics."""
 
 
 class Accuracy(NamedTuple):
-    """The estimate as it goes from step to step.  m numbers: positions, velocities, state of the
-    observer.
+    """The estimate between two steps. Of m watched numbers, n are positions and the others are
+    velocities and the states of observer and actuator.
     """
 
     pending: tuple[jax.Array, ...]
-    """What the rates so far add to the step errors of the next instants, (2 n,) each: of the
-    positions, and of where they end up, from x'_q + R x'_y."""
+    """Contributions of past rates to the local errors of the next instants, (2 n,) each: of the
+    positions, and of their final displacement, from x'_q + R x'_y."""
     drift: jax.Array
     """L of these, (2 n,)."""
     response: jax.Array
@@ -82,43 +84,63 @@ class Accuracy(NamedTuple):
     """The largest, relative to the width of its tube, () [1]."""
 
 
-def _watched(state: LoopState, of: LoopState | None = None) -> list:
-    """The leaves of `of`, `state` if not given, that stand where `state` has positions, velocities
-    and the floating-point state of observer and actuator.
+# --- the watched numbers and their response ------------------------------------------------------
 
-    What a law has learnt is left out.
+
+def _watched(state: LoopState, values: LoopState) -> list:
+    """The leaves of `values` at the positions, velocities and floating-point observer and actuator
+    states of `state`. The state of the law is not watched.
     """
-    parts = [jax.tree.leaves((x.q, x.dq, x.observer, x.actuator)) for x in (state, of or state)]
-    return [x for kind, x in zip(*parts, strict=True) if jnp.issubdtype(kind.dtype, jnp.floating)]
+    kinds = jax.tree.leaves((state.q, state.dq, state.observer, state.actuator))
+    found = jax.tree.leaves((values.q, values.dq, values.observer, values.actuator))
+    pairs = zip(kinds, found, strict=True)
+    return [x for kind, x in pairs if jnp.issubdtype(kind.dtype, jnp.floating)]
 
 
-def places(state: LoopState) -> np.ndarray:
-    """Where the numbers that are watched, m of them, stand in what `closed_loop.surroundings`
-    gives, flat; all of a sampled loop.
+def watched_indices(state: LoopState) -> np.ndarray:
+    """Indices of the m watched numbers in the flat `closed_loop.perturbed_state`; all of them for a
+    sampled loop.
     """
-    if state.held:
-        return np.arange(sum(x.size for x in jax.tree.leaves(surroundings(state))))
+    if state.sampled:
+        return np.arange(sum(x.size for x in jax.tree.leaves(perturbed_state(state))))
     leaves, structure = jax.tree.flatten(state)
     ends = np.cumsum([0, *(x.size for x in leaves)])
-    numbered = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
-    return np.concatenate(_watched(state, jax.tree.unflatten(structure, numbered)))
+    indices = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
+    return np.concatenate(_watched(state, jax.tree.unflatten(structure, indices)))
 
 
-@partial(jax.jit, static_argnames="n", inline=True)  # so that it is traced once
+@partial(jax.jit, static_argnames="n", inline=True)  # inline, so that JAX traces it once
 def response(jacobian: jax.Array, n: int) -> jax.Array:
-    """R from the Jacobian by the numbers that are watched, (m, m) [1/s]; 0 where there is none."""
+    """R of the Jacobian by the watched numbers, (m, m) [1/s]; 0 where it is not finite."""
     inner = jacobian[n:, n:]
     size = len(inner)
-    found = solve(
-        SLOWEST * jnp.eye(size, dtype=inner.dtype) - inner.T, jnp.eye(size, n, dtype=inner.dtype)
-    ).T
+    resolvent = SLOWEST * jnp.eye(size, dtype=inner.dtype) - inner.T
+    found = solve(resolvent, jnp.eye(size, n, dtype=inner.dtype)).T
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
+def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
+    """The rate of the positions and of their final displacement, (2 n,)."""
+    n = slope.q.size
+    flat = jnp.concatenate([jnp.ravel(x) for x in _watched(slope, slope)])
+    flat = jax.lax.stop_gradient(flat)
+    return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
+
+
+# --- local errors from step to step --------------------------------------------------------------
+
+
+def _rates_per_step(table: Tableau) -> int:
+    """Rates of a step that enter the differences: at its start, and in its middle if the method
+    has a stage there.
+    """
+    return 2 if table.halfway else 1
+
+
 def steps_back(method: str) -> int:
-    """Over how many steps the differences reach that tell of a step's error."""
+    """Number of past steps that enter the differences."""
     table = tableau(method)
-    return (len(table.differences) - 1) // (2 if table.halfway else 1)
+    return (len(table.differences) - 1) // _rates_per_step(table)
 
 
 def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
@@ -126,125 +148,95 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
 
     Args:
       method: the integrator.
-      jacobian: of the closed loop at the start, by the numbers that are watched, (m, m) [1/s].
-      state: the state at the start.
+      jacobian: of the closed loop at the start by the watched numbers, (m, m) [1/s].
+      state: state at the start.
     """
     n = state.q.size
-    table = tableau(method)
+    R = response(jacobian, n)
     none = jnp.zeros((2 * n,), jacobian.dtype)
-    if state.held:
-        return Accuracy(
-            (none,) if len(table.c) == 1 else (),
-            none,
-            response(jacobian, n)[:, :n],
-            none[:n],
-            none[0],
-        )
     pending = (none,) * steps_back(method)
-    return Accuracy(pending, none, response(jacobian, n), none[:n], none[0])
+    if state.sampled:
+        # Only a method of one stage uses an earlier rate; only velocities have a local error.
+        pending = (none,) if len(tableau(method).c) == 1 else ()
+        R = R[:, :n]
+    return Accuracy(pending, none, R, none[:n], none[0])
 
 
-def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
-    """The rate of the positions, and of where they end up, (2 n,)."""
-    flat, n = (
-        jax.lax.stop_gradient(jnp.concatenate([jnp.ravel(x) for x in _watched(slope)])),
-        slope.q.size,
-    )
-    return jnp.concatenate([flat[:n], flat[:n] + matvec(accuracy.response, flat[n:])])
-
-
-def observed(
+def update(
     accuracy: Accuracy,
     method: str,
     dt: jax.Array,
     index: jax.Array,
     pieces: list[tuple[jax.Array, list[LoopState]]],
     width: jax.Array,
-    held: bool = False,
+    sampled: bool = False,
     restarts: Any = None,
     overfull: Any = None,
 ) -> Accuracy:
-    """The estimate after one more instant.
+    """The estimate after one more step.
 
     Args:
       accuracy: before it.
       method: the integrator.
       dt: time step, () [s].
-      index: number of the instant, () int.
-      pieces: length [s] of each piece of the step from it (`jumps`), and the slopes of the stages
-        there.
+      index: number of the step, () int.
+      pieces: length [s] of each piece of the step (`jumps`), and the slopes of its stages.
       width: of the tube, (n,) [rad].
-      held: whether the torque is, as in a sampled loop.
-      restarts: whether the differences reach over a jump, or there is one in this step, () bool;
-        None where there are no jumps.
-      overfull: whether a step has more jumps than it is divided at, () bool; None where that cannot
-        be.
+      sampled: whether the law is sampled.
+      restarts: whether a jump lies in this step or in one of those that the differences cover,
+        () bool; None for scenarios without jumps.
+      overfull: whether a step has more jumps than it is divided at, () bool; None where this cannot
+        happen.
     """
-    table, n = tableau(method), width.size
+    table = tableau(method)
     if overfull is not None:
         accuracy = accuracy._replace(
             error=jnp.where(overfull, jnp.inf, accuracy.error),
             relative=jnp.where(overfull, jnp.inf, accuracy.relative),
         )
-    if held:
-        return _observed_within(accuracy, table, dt, pieces, width, restarts)
-    slopes = pieces[0][1]
-    weights, each = table.differences[::-1], 2 if table.halfway else 1
     width = jax.lax.stop_gradient(width)
+    if sampled:
+        return _update_by_stages(accuracy, table, dt, pieces, width, restarts)
+    return _update_by_differences(accuracy, table, dt, index, pieces, width, restarts)
+
+
+def _update_by_differences(
+    accuracy: Accuracy,
+    table: Tableau,
+    dt: jax.Array,
+    index: jax.Array,
+    pieces: list[tuple[jax.Array, list[LoopState]]],
+    width: jax.Array,
+    restarts: Any,
+) -> Accuracy:
+    """The estimate of a continuous loop: differences of rates over several steps.
+
+    `pending[k]` collects the local error of the step k later. Its oldest entry is complete with
+    the rate at this instant; the others receive the weighted rates of this step.
+    """
+    slopes = pieces[0][1]
+    newest_first = table.differences[::-1]
+    per_step = _rates_per_step(table)
     here = _rate(accuracy, slopes[0])
-    complete = index >= len(accuracy.pending)
-    error = accuracy.pending[0] + weights[0] * here
-    added = jnp.where(complete, dt, 0.0) * error
+    local_error = accuracy.pending[0] + newest_first[0] * here
+    has_history = index >= len(accuracy.pending)
+    added = jnp.where(has_history, dt, 0.0) * local_error
     if restarts is not None:
-        added = jnp.where(
-            restarts,
-            sum(
-                _by_stages(partial(_rate, accuracy), table, length, slopes)
-                for length, slopes in pieces
-            ),
-            added,
-        )
+        rate = partial(_rate, accuracy)
+        by_stages = sum(_error_by_stages(rate, table, length, each) for length, each in pieces)
+        added = jnp.where(restarts, by_stages, added)
     drift = (1.0 - SLOWEST * dt) * accuracy.drift + added
     pending = [
-        x + weights[each * (k + 1)] * here
+        x + newest_first[per_step * (k + 1)] * here
         for k, x in enumerate((*accuracy.pending[1:], jnp.zeros_like(here)))
     ]
     if table.halfway:
         middle = _rate(accuracy, slopes[table.halfway])
-        pending = [x + weights[2 * k + 1] * middle for k, x in enumerate(pending)]
-    size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
-    relative = jnp.maximum(accuracy.relative, jnp.max(size / width))
-    return Accuracy(
-        tuple(pending), drift, accuracy.response, jnp.maximum(accuracy.error, size), relative
-    )
+        pending = [x + newest_first[2 * k + 1] * middle for k, x in enumerate(pending)]
+    return _with_drift(accuracy, tuple(pending), drift, width)
 
 
-def _by_stages(
-    rate: Callable, table: Tableau, length: jax.Array, slopes: list[LoopState]
-) -> jax.Array:
-    """The error of one step of this length by the slopes of its stages, in terms of `rate` of a
-    slope; 0 for a method of one stage.
-    """
-    if len(table.c) == 1:
-        return jnp.zeros_like(rate(slopes[0]))
-    late = table.halfway or 1
-    later = jax.tree.map(jnp.subtract, slopes[late], slopes[late - 1])
-    early = jax.tree.map(jnp.subtract, slopes[1], slopes[0]) if table.halfway else slopes[0]
-    sizes = [
-        sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(part)))
-        for part in (early, later)
-    ]
-    fast = jnp.minimum(
-        (2.0 if table.halfway else 1.0)
-        * sizes[1]
-        / jnp.maximum(sizes[0], jnp.finfo(length.dtype).tiny),
-        2.0,
-    )
-    error = rate(later) * (fast**2 / 3.0 if table.halfway else fast * 5.0 / 3.0)
-    return jax.lax.stop_gradient(length) * error
-
-
-def _observed_within(
+def _update_by_stages(
     accuracy: Accuracy,
     table: Tableau,
     dt: jax.Array,
@@ -252,123 +244,173 @@ def _observed_within(
     width: jax.Array,
     restarts: Any,
 ) -> Accuracy:
-    """As `observed`, from the stages of one step; a method of one stage is held against the step
-    before.
+    """The estimate of a sampled loop: from the stages of one step. A method of one stage is
+    compared with the step before.
     """
-    n, drift, before = width.size, (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending
+    drift, before = (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending
 
-    def moved(slope: LoopState) -> jax.Array:
+    def motion_rate(slope: LoopState) -> jax.Array:
         return _rate(accuracy, slope._replace(observer=(), actuator=()))
 
     for length, slopes in pieces:
         if not before:
-            drift = drift + _by_stages(moved, table, length, slopes)
+            drift = drift + _error_by_stages(motion_rate, table, length, slopes)
             continue
-        here = moved(slopes[0])
-        error, before = (here - before[0]) / 2.0, (here,)
+        here = motion_rate(slopes[0])
+        local_error, before = (here - before[0]) / 2.0, (here,)
         if restarts is not None:
-            error = jnp.where(restarts, 0.0, error)
-        drift = drift + jax.lax.stop_gradient(length) * error
+            local_error = jnp.where(restarts, 0.0, local_error)
+        drift = drift + jax.lax.stop_gradient(length) * local_error
+    pending = (motion_rate(pieces[0][1][0]),) if before else ()
+    return _with_drift(accuracy, pending, drift, width)
+
+
+def _error_by_stages(
+    rate: Callable, table: Tableau, length: jax.Array, slopes: list[LoopState]
+) -> jax.Array:
+    """Local error of one step of this length from the slopes of its stages, in terms of `rate` of a
+    slope; 0 for a method of one stage.
+    """
+    if len(table.c) == 1:
+        return jnp.zeros_like(rate(slopes[0]))
+    late = table.halfway or 1
+    later = jax.tree.map(jnp.subtract, slopes[late], slopes[late - 1])
+    early, fraction = slopes[0], 1.0
+    if table.halfway:
+        early, fraction = jax.tree.map(jnp.subtract, slopes[1], slopes[0]), 2.0
+    tiny = jnp.finfo(length.dtype).tiny
+    ratio = fraction * _size(later) / jnp.maximum(_size(early), tiny)
+    dt_A = jnp.minimum(ratio, 2.0)
+    factor = dt_A**2 / 3.0 if table.halfway else dt_A * 5.0 / 3.0
+    return jax.lax.stop_gradient(length) * (rate(later) * factor)
+
+
+def _size(slope: LoopState) -> Any:
+    """Sum of the absolute values of all numbers of a slope."""
+    return sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(jax.lax.stop_gradient(slope)))
+
+
+def _with_drift(
+    accuracy: Accuracy, pending: tuple[jax.Array, ...], drift: jax.Array, width: jax.Array
+) -> Accuracy:
+    """The estimate with a new accumulated error."""
+    n = width.size
     size = jnp.maximum(jnp.abs(drift[:n]), jnp.abs(drift[n:]))
-    relative = jnp.maximum(accuracy.relative, jnp.max(size / jax.lax.stop_gradient(width)))
-    pending = (moved(pieces[0][1][0]),) if before else ()
-    return Accuracy(pending, drift, accuracy.response, jnp.maximum(accuracy.error, size), relative)
+    return Accuracy(
+        pending,
+        drift,
+        accuracy.response,
+        error=jnp.maximum(accuracy.error, size),
+        relative=jnp.maximum(accuracy.relative, jnp.max(size / width)),
+    )
 
 
-class Unseen(NamedTuple):
-    """The worst that the stages of a step cannot see, in the steps that were looked at."""
+# --- signals that the stages cannot resolve ------------------------------------------------------
+
+
+class UnresolvedSignals(NamedTuple):
+    """Largest quadrature errors of a method for the signals of a scenario."""
 
     missed: jax.Array
     """Of the rates of reference and bounds, (n,) [rad/s]."""
     push: jax.Array
-    """Of the disturbance, (n,) [N m]; after `kicked` what it accelerates, (n,) [rad/s^2]."""
+    """Of the disturbance, (n,) [N m]; after `with_acceleration` the acceleration by it, (n,)
+    [rad/s^2]."""
     width: jax.Array
-    """Of the tube, where it is narrowest, (n,) [rad]."""
+    """Smallest width of the tube, (n,) [rad]."""
 
 
-def unseen(scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Array) -> Unseen:
-    """What reference, bounds and disturbance do between the stages of a step.
+def unresolved_signals(
+    scenario: Scenario, method: str, dt: jax.Array, steps: int | jax.Array
+) -> UnresolvedSignals:
+    """Quadrature errors of a method for reference, bounds and disturbance, in some steps of a run.
 
-    In some steps the method's own quadrature of each signal is held against what the signal does:
-    the rates of reference and bounds against their change over the step, the disturbance's torque
-    against Gauss's three points.
+    The weighted rates of reference and bounds at the stages are compared with their change over the
+    step, and the weighted torque of the disturbance with Gauss's three-point quadrature.
     """
     table, n = tableau(method), scenario.n
     scenario, dt = jax.lax.stop_gradient((scenario, dt))
-    own, exact = (
-        np.asarray(weights, dt.dtype)[:, None] for weights in (table.b, [w for _, w in GAUSS])
-    )
-    places = jnp.asarray([*table.c, *(place for place, _ in GAUSS), 1.0], dt.dtype)
-    stages, others = slice(len(table.c)), slice(len(table.c), -1)
-    # Steps in the places of the golden section, so that they share no period with a signal.
-    spread = jnp.asarray(np.arange(INSTANTS) * 0.6180339887498949 % 1.0, dt.dtype)
+    # Fractions of the golden ratio, so that the steps share no period with a signal.
+    spread = jnp.asarray(np.arange(INSTANTS) * GOLDEN_RATIO % 1.0, dt.dtype)
     starts = jnp.floor(spread * jnp.asarray(steps, spread.dtype)) * dt
-    times = starts[:, None] + places * dt
+    nodes = jnp.asarray([*table.c, *(node for node, _ in GAUSS), 1.0], dt.dtype)
+    times = starts[:, None] + nodes * dt
+    tube = _at_all_times(scenario.context.tube, times)
+    missed = _missed_rates(table, tube, starts, dt).reshape(INSTANTS, -1, n)
+    missed = jnp.max(missed, axis=1)
+    push = _missed_torque(scenario, table, tube, times)
+    jumps = scenario.jump_times()
+    if jumps.size:
+        # A step is divided at declared jumps, so its stages resolve them.
+        before = starts - 0.5 * dt
+        divided = jax.vmap(lambda start: within(jumps, start, start + 2.0 * dt))(before)[:, None]
+        missed, push = jnp.where(divided, 0.0, missed), jnp.where(divided, 0.0, push)
+    missed = jnp.max(missed, axis=0)
+    if scenario.sampling is not None:
+        # A sampled law reads reference and bounds at its samples only.
+        missed = jnp.zeros_like(missed)
+    width = jnp.min((tube.upper - tube.lower)[:, 0], axis=0)
+    return UnresolvedSignals(missed, jnp.max(push, axis=0), width)
 
-    def at_all(signal: Callable, *args: jax.Array) -> Any:
-        """A signal at all places of all steps, (INSTANTS, places, ...), from arrays with these two
-        axes.
-        """
-        found = jax.vmap(signal)(*(x.reshape(times.size, *x.shape[2:]) for x in args))
-        return jax.tree.map(lambda x: x.reshape(*times.shape, *x.shape[1:]), found)
+
+def _at_all_times(signal: Callable, times: jax.Array, *others: jax.Array) -> Any:
+    """A signal at all nodes of all steps, (steps, nodes, ...), from arrays with these two axes."""
+    flat = [x.reshape(times.size, *x.shape[2:]) for x in (times, *others)]
+    found = jax.vmap(signal)(*flat)
+    return jax.tree.map(lambda x: x.reshape(*times.shape, *x.shape[1:]), found)
+
+
+def _missed_rates(table: Tableau, tube: Tube, starts: jax.Array, dt: jax.Array) -> jax.Array:
+    """Quadrature error of the rates of reference and bounds, beyond rounding, (steps, 3 n)."""
+    weights = np.asarray(table.b, dt.dtype)[:, None]
+    values = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
+    rates = jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper], axis=-1)
+    rate = jnp.sum(weights * rates[:, : len(table.c)], axis=1)
+    change = (values[:, -1] - values[:, 0]) / dt
+    # Rounding of the two values grows with the time at which they are evaluated.
+    sizes = jnp.abs(values[:, 0]) + starts[:, None] * jnp.abs(rate)
+    rounding = 4.0 * jnp.finfo(dt.dtype).eps * sizes / dt
+    return jnp.maximum(jnp.abs(rate - change) - rounding, 0.0)
+
+
+def _missed_torque(scenario: Scenario, table: Tableau, tube: Tube, times: jax.Array) -> jax.Array:
+    """Quadrature error of the disturbance, (steps, n) [N m], along the reference at the start of
+    each step.
+    """
 
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
         return scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
 
-    tube = at_all(scenario.context.tube, times)
-    ends = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
-    rates = jnp.concatenate([tube.dq_d, tube.dlower, tube.dupper], axis=-1)
+    stages = len(table.c)
+    own = np.asarray(table.b, times.dtype)[:, None]
+    exact = np.asarray([weight for _, weight in GAUSS], times.dtype)[:, None]
     # The first stage of every method is at the start of the step.
-    torques = at_all(
-        torque, times, *(jnp.broadcast_to(x[:, :1], x.shape) for x in (tube.q_d, tube.dq_d))
-    )
-    rate = jnp.sum(own * rates[:, stages], axis=1)
-    # The difference of two positions is rounded, the more so the later it is: that much is no
-    # error.
-    noise = (
-        4.0 * jnp.finfo(dt.dtype).eps * (jnp.abs(ends[:, 0]) + starts[:, None] * jnp.abs(rate)) / dt
-    )
-    missed = jnp.maximum(jnp.abs(rate - (ends[:, -1] - ends[:, 0]) / dt) - noise, 0.0)
-    missed = jnp.max(missed.reshape(INSTANTS, -1, n), axis=1)
-    push = jnp.abs(
-        jnp.sum(own * torques[:, stages], axis=1) - jnp.sum(exact * torques[:, others], axis=1)
-    )
-    jumps = scenario.jump_times()
-    if jumps.size:
-        # A step is divided at the jumps that are declared: its stages see them.
-        divided = jax.vmap(lambda start: within(jumps, start, start + 2.0 * dt))(starts - 0.5 * dt)[
-            :, None
-        ]
-        missed, push = jnp.where(divided, 0.0, missed), jnp.where(divided, 0.0, push)
-    missed = jnp.max(missed, axis=0)
-    width = jnp.min((tube.upper - tube.lower)[:, 0], axis=0)
-    # A sampled law reads them at its samples: what they do between is no error of the step.
-    return Unseen(
-        missed if scenario.sampling is None else jnp.zeros_like(missed),
-        jnp.max(push, axis=0),
-        width,
-    )
+    start = [jnp.broadcast_to(x[:, :1], x.shape) for x in (tube.q_d, tube.dq_d)]
+    torques = _at_all_times(torque, times, *start)
+    by_stages = jnp.sum(own * torques[:, :stages], axis=1)
+    by_gauss = jnp.sum(exact * torques[:, stages:-1], axis=1)
+    return jnp.abs(by_stages - by_gauss)
 
 
-def kicked(scenario: Scenario, found: Unseen) -> Unseen:
-    """`found`, its torque turned into what it accelerates at the start."""
+def with_acceleration(scenario: Scenario, found: UnresolvedSignals) -> UnresolvedSignals:
+    """`found` with its torque replaced by the acceleration of the plant by it at the start."""
     M = at_time(scenario.plant, jnp.zeros_like(found.push[0])).mass_matrix(scenario.initial.q)
     return found._replace(push=jax.lax.stop_gradient(solve_spd(M, found.push)))
 
 
-def between_stages(accuracy: Accuracy, found: Unseen) -> Accuracy:
-    """The estimate, with what the stages did not see, given as accelerations; the worst is taken to
-    last for 1/r.
+def with_unresolved(accuracy: Accuracy, found: UnresolvedSignals) -> Accuracy:
+    """The estimate with the unresolved signals, given as accelerations; the largest of them is
+    assumed to last for 1/r.
     """
-    pushed = jnp.abs(matvec(accuracy.response[:, : found.push.size], found.push))
-    error = (found.missed + ONSET * pushed) / SLOWEST
-    relative = jnp.max(error / found.width)
+    displaced = jnp.abs(matvec(accuracy.response[:, : found.push.size], found.push))
+    error = (found.missed + ONSET * displaced) / SLOWEST
     return accuracy._replace(
-        error=jnp.maximum(accuracy.error, error), relative=jnp.maximum(accuracy.relative, relative)
+        error=jnp.maximum(accuracy.error, error),
+        relative=jnp.maximum(accuracy.relative, jnp.max(error / found.width)),
     )
 
 
 def results(accuracy: Accuracy) -> dict[str, jax.Array]:
-    """What a run says of its accuracy: infinite where nothing can be said."""
+    """The accuracy results of a run; infinite where the estimate is not a number."""
     found = {ERROR: accuracy.error, RELATIVE: accuracy.relative}
     return {name: jnp.where(jnp.isnan(x), jnp.inf, x) for name, x in found.items()}

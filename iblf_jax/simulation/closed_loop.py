@@ -1,17 +1,18 @@
 """The closed loop: the one place where plant, sensor, law, observer and actuator meet.
 
     state  x = (q, q', state of the law, state of the observer, state of the actuator)
-    q" = M^-1 (tau + disturbance + friction - C q' - G)                 with the plant's M, C, G,
-    friction at time t f  = M0 q" + C0 q' + G0 - tau                                       what the
-    observer should have estimated      (2.1) V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde,
-    without the second term where V1 `includes_e2`             (3.12)
+    q" = M^-1 (tau + disturbance + friction - C q' - G)      M, C, G, friction of the plant at t
+    f  = M0 q" + C0 q' + G0 - tau                            the uncertain term             (2.1)
+    V2 = sum V1 + 1/2 e2^T M0 e2 + 1/2 f_tilde^T f_tilde                                   (3.12)
 
-`evaluate` gives the rate of the state and everything that can be looked at; where only the rate is
-used (the inner stages of an integrator) the compiler drops the rest.
+The second term of V2 is left out for a law whose V1 `includes_e2`.
 
-Where the law is sampled (`Sampling`), `sampled` runs sensor, law and observer at the start of a
-period, and the rate is that of what moves between: q, q' and the actuator.  Then alpha, V1 and
-  f_hat of a sample are what the law said last.
+`evaluate` returns the rate of the state and a `Sample` of every signal. Where a caller uses the
+rate only, as in the later stages of an integrator, the compiler removes the rest.
+
+A law with a `Sampling` runs in discrete time. `run_sampled_law` runs sensor, law and observer once
+at the start of a period. Within the period the integrator advances the plant and the actuator, and
+the signals of the law (alpha, V1, f_hat) keep the values of its last run.
 """
 
 from __future__ import annotations
@@ -30,19 +31,25 @@ from iblf_jax.control.sensors import Measurement
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
+from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.sampling import Instant, normals
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world.regions import margins
 from iblf_jax.world.robots import at_time, friction_torque
 
+# --- the state ---------------------------------------------------------------------------------
+
 
 class LawSignals(NamedTuple):
-    """What a law says at an instant, besides its torque."""
+    """Signals of a law at one instant, besides its torque; (n,) unless noted."""
 
     alpha: jax.Array
+    """Virtual velocity [rad/s]."""
     V1: jax.Array
+    """Lyapunov function of the position error, joint by joint."""
     f_hat: jax.Array
+    """Estimate of the uncertain term that the law used [N m]."""
     guard_active: jax.Array
     saturated: jax.Array
     slack: Any = ()
@@ -50,7 +57,7 @@ class LawSignals(NamedTuple):
 
 
 def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
-    """What a command says besides its torque."""
+    """The signals of a law that answered with `command` to the estimate `f_hat`."""
     return LawSignals(
         command.alpha,
         command.V1,
@@ -63,257 +70,113 @@ def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
 
 
 class SampledState(NamedTuple):
-    """What a sampled loop keeps from sample to sample, besides the states of law and observer."""
+    """State of a sampled loop between samples, besides the states of law and observer."""
 
     commands: jax.Array
-    """Newest first, (queue + 1, n) [N m]."""
+    """Commands in transit to the actuator, newest first, (queue + 1, n) [N m]."""
     sensor: Any
     """State of the sensor."""
     measured: Measurement
-    """What the sensor told last."""
-    said: LawSignals
+    """The last measurement."""
+    signals: LawSignals
+    """Signals of the law at its last run."""
 
 
 class LoopState(NamedTuple):
-    """The state of the loop; also the form of its rate."""
+    """State of the closed loop; its rate has the same structure."""
 
     q: jax.Array
     dq: jax.Array
     controller: Any
     observer: Any
     actuator: Any = ()
-    held: Any = ()
+    sampled: Any = ()
     """A `SampledState` where the law is sampled."""
 
 
-@partial(jax.jit, inline=True)  # so that it is traced once for all the places that ask for it
+# inline, so that JAX traces it once for all of its call sites
+@partial(jax.jit, inline=True)
 def initial_state(scenario: Scenario) -> LoopState:
-    """The state at t = 0; torques that are under way then are those that hold the model still."""
-    q, dq, n = scenario.initial.q, scenario.initial.dq, scenario.n
+    """The state at t = 0; an actuator starts with the torque that balances the model's gravity."""
+    q, dq = scenario.initial.q, scenario.initial.dq
     state = LoopState(
         q,
         dq,
         scenario.controller.init(q, dq, scenario.context),
-        stepping_observer(scenario).init(q, dq, scenario.model),
+        discrete_observer(scenario).init(q, dq, scenario.model),
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
-    still = scenario.model.gravity(q)
-    state = state._replace(actuator=scenario.actuator.init(still))
+    balance = scenario.model.gravity(q)
+    state = state._replace(actuator=scenario.actuator.init(balance))
     if scenario.sampling is None:
         return state
-    zero, no = jnp.zeros_like(q), jnp.zeros((n,), bool)
-    command = jax.eval_shape(
-        scenario.controller.command, zero[0], q, dq, zero, scenario.context, state.controller
-    )[0]
-    slack, region_slack = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), (command.slack, command.region_slack)
-    )
-    commands = jnp.repeat(still[None], scenario.sampling.queue + 1, axis=0)
-    sensor = scenario.sensor.init(q, dq, scenario.sampling.period)
-    return state._replace(
-        held=SampledState(
-            commands,
-            sensor,
-            Measurement(q, dq),
-            LawSignals(zero, zero, zero, no, no, slack, region_slack),
-        )
-    )
+    return state._replace(sampled=_initial_sampled_state(scenario, state, balance))
 
 
-def moving(state: LoopState) -> LoopState:
-    """What an integrator moves: all of the state, or what is not held between samples."""
-    return state if state.held == () else state._replace(controller=(), observer=(), held=())
-
-
-def still(state: LoopState, moved: LoopState) -> LoopState:
-    """The state, with what has moved."""
-    return (
-        moved
-        if state.held == ()
-        else state._replace(q=moved.q, dq=moved.dq, actuator=moved.actuator)
-    )
-
-
-@jax.jit
-def sampled(scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Array) -> LoopState:
-    """The state after sensor, law and observer have run.
-
-    Args:
-      scenario: with a sampling.
-      t: start of the period, () [s].
-      state: at t.
-      normal: what the sensor draws, (draws, n).
-    """
-    held = state.held
-    assert scenario.sampling is not None
-    measured, sensor = scenario.sensor.measure(
-        state.q, state.dq, normal, scenario.sampling.period, held.sensor
-    )
-    answer = answered(scenario, t, measured, state.controller, state.observer)
-    commands = jnp.concatenate([answer.command.tau[None], held.commands[:-1]])
-    return state._replace(
-        controller=answer.controller,
-        observer=answer.observer,
-        held=SampledState(commands, sensor, measured, law_signals(answer.command, answer.f_hat)),
-    )
-
-
-class Answer(NamedTuple):
-    """What a sampled law and its observer make of a measurement."""
-
-    command: Command
-    f_hat: jax.Array
-    controller: Any
-    """State of the law at the next sample."""
-    observer: Any
-    """State of the observer there."""
-
-
-def answered(
-    scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any
-) -> Answer:
-    """What law and observer make of what was measured at the start of a period: this is what runs
-    on a robot's computer.
-
-    Args:
-      scenario: with a sampling.
-      t: start of the period, () [s].
-      measured: there.
-      controller, observer: states there.
-    """
+def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array) -> SampledState:
+    """State of a sampled loop before its first sample: every command in transit is `tau`."""
     sampling: Any = scenario.sampling
-    q, dq, stepping = measured.q, measured.dq, stepping_observer(scenario)
-    f_hat = stepping.estimate(t, q, dq, scenario.model, observer)
-    command, rate = scenario.controller.command(t, q, dq, f_hat, scenario.context, controller)
-    after = _advanced(sampling, stepping, (t, q, dq, command.tau, scenario.model, observer))
-    moved = jax.tree.map(lambda x, dx: x + sampling.period * dx, controller, rate)
-    return Answer(command, f_hat, moved, after)
-
-
-def stepping_observer(scenario: Scenario) -> Any:
-    """The observer as it runs: in a sampled loop, the one whose step of Euler has the poles, where
-    that is asked for.
-    """
-    sampling, observer = scenario.sampling, scenario.observer
-    if sampling is not None and sampling.observer == "poles" and hasattr(observer, "at_period"):
-        return observer.at_period(sampling.period)
-    return observer
-
-
-def _advanced(sampling: Any, observer: Any, told: tuple) -> Any:
-    """The observer's state at the start of the next period."""
-    if sampling.observer == "exact" and hasattr(observer, "advance"):
-        return observer.advance(*told, sampling.period)
-    return jax.tree.map(
-        lambda x, dx: x + sampling.period * dx, told[-1], observer.derivative(*told)
+    q, dq = state.q, state.dq
+    zero, no = jnp.zeros_like(q), jnp.zeros(q.shape, bool)
+    command, _ = jax.eval_shape(
+        scenario.controller.command, zero[0], q, dq, zero, scenario.context, state.controller
+    )
+    slacks = (command.slack, command.region_slack)
+    slack, region_slack = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), slacks)
+    return SampledState(
+        commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
+        sensor=scenario.sensor.init(q, dq, sampling.period),
+        measured=Measurement(q, dq),
+        signals=LawSignals(zero, zero, zero, no, no, slack, region_slack),
     )
 
 
-def sampled_if_due(
-    scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array
-) -> LoopState:
-    """The state after an instant's sample, if it is the start of a period."""
-    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
-    return jax.lax.cond(
-        now.phase == 0,
-        lambda state: sampled(scenario, t, state, normal),
-        lambda state: state,
-        state,
-    )
+def integrated_part(state: LoopState) -> LoopState:
+    """The part of the state that the integrator advances.
 
-
-class Surroundings(NamedTuple):
-    """What may be moved a little in a sampled loop to see what it does: the plant, its torque, and
-    what its law remembers.
+    This is the whole state of a continuous loop. Of a sampled loop it is the plant and the
+    actuator; law, observer and sensor change at samples only.
     """
-
-    plant: LoopState
-    torque: jax.Array
-    memory: Any
-
-
-def surroundings(state: LoopState) -> Any:
-    """What decides how a loop goes on: its state, or the `Surroundings` of a sampled one."""
-    if state.held == ():
+    if state.sampled == ():
         return state
-    return Surroundings(
-        moving(state), state.held.commands[0], (state.controller, state.observer, state.held.sensor)
-    )
+    return state._replace(controller=(), observer=(), sampled=())
 
 
-def change(
-    scenario: Scenario,
-    t: jax.Array,
-    around: Any,
-    dt: jax.Array | None = None,
-    piece: Callable = lambda function: function,
-) -> Any:
-    """How what `surroundings` gives changes: its rate, or of a sampled loop the plant's rate, the
-    next command and what is remembered then.
+def with_integrated_part(state: LoopState, part: LoopState) -> LoopState:
+    """The state with its `integrated_part` replaced."""
+    if state.sampled == ():
+        return part
+    return state._replace(q=part.q, dq=part.dq, actuator=part.actuator)
 
-    Rounding of a sensor (`unrounded`) and limits of an actuator (`unlimited`) are left out: their
-    derivatives are 0, as without a law.
 
-    Args:
-      scenario: what runs.
-      t: time, () [s].
-      around: at t.
-      dt: of the step, () [s]: nothing depends on it, but what is called alike is traced once.
-      piece: what is made of a function that is compiled on its own.
-    """
-    if not isinstance(around, Surroundings):
-        return piece(evaluate)(scenario, t, around, *(() if dt is None else (dt,)))[0]
-    sensor, actuator = scenario.sensor, scenario.actuator
-    sensor, actuator = (
-        getattr(sensor, "unrounded", sensor),
-        getattr(actuator, "unlimited", actuator),
-    )
-    scenario = dataclasses.replace(scenario, sensor=sensor, actuator=actuator)
-    state = still(initial_state(scenario), around.plant)
-    controller, observer, sensor = around.memory
-    state = state._replace(
-        controller=controller, observer=observer, held=state.held._replace(sensor=sensor)
-    )
-    after = piece(sampled)(
-        scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
-    )
-    rate = piece(evaluate)(scenario, t, state, 0.0 if dt is None else dt, around.torque)[0]
-    return Surroundings(
-        rate, after.held.commands[0], (after.controller, after.observer, after.held.sensor)
-    )
+# --- continuous time: the rate of the state ------------------------------------------------------
 
 
 def acceleration(
     scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
 ) -> jax.Array:
-    """q" of the plant under a torque that acts, (n,) [rad/s^2]."""
+    """Acceleration of the plant under the torque `tau`, (n,) [rad/s^2]."""
     plant = at_time(scenario.plant, t)
-    pushed = (
-        tau
-        + scenario.disturbance.torque(t, q, dq, plant, scenario.model)
-        + friction_torque(plant, dq)
-    )
-    return solve_spd(plant.mass_matrix(q), pushed - plant.coriolis(q, dq, dq) - plant.gravity(q))
+    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
+    applied = tau + external + friction_torque(plant, dq)
+    return solve_spd(plant.mass_matrix(q), applied - plant.coriolis(q, dq, dq) - plant.gravity(q))
 
 
 def torque_needed(
     scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array
 ) -> jax.Array:
-    """The torque under which the plant moves like this, (n,) [N m]: the inverse of
+    """The torque for which the plant has the acceleration `ddq`, (n,) [N m]: the inverse of
     `acceleration`.
     """
     plant = at_time(scenario.plant, t)
-    against = scenario.disturbance.torque(t, q, dq, plant, scenario.model) + friction_torque(
-        plant, dq
-    )
-    return (
-        matvec(plant.mass_matrix(q), ddq) + plant.coriolis(q, dq, dq) + plant.gravity(q) - against
-    )
+    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
+    passive = external + friction_torque(plant, dq)
+    inertial = matvec(plant.mass_matrix(q), ddq)
+    return inertial + plant.coriolis(q, dq, dq) + plant.gravity(q) - passive
 
 
-# so that it is traced once for all the places that call it, and `lowering` sees that they call one
-# function
+# jit, so that JAX traces it once for all of its call sites and `kernels` compiles one function
 @jax.jit
 def evaluate(
     scenario: Scenario,
@@ -325,32 +188,39 @@ def evaluate(
     """The rate of the state and the sample at time t.
 
     Args:
-      scenario: what runs.
+      scenario: the scenario.
       t: time, () [s].
       state: state at t.
       dt: weight of the sample in an integral over time, () [s].
-      torque: what arrives at the actuator, (n,) [N m], where the law is sampled; the last command
-        if not given.
+      torque: command at the actuator, (n,) [N m], where the law is sampled; the newest command if
+        not given.
     """
     model, q, dq = scenario.model, state.q, state.dq
+    controller_rate: Any = ()
+    observer_rate: Any = ()
     if scenario.sampling is None:
         f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
-        command, controller_rate = scenario.controller.command(
-            t, q, dq, f_hat, scenario.context, state.controller
-        )
-        asked, said = command.tau, law_signals(command, f_hat)
+        law, context = scenario.controller, scenario.context
+        answer, controller_rate = law.command(t, q, dq, f_hat, context, state.controller)
+        command, signals = answer.tau, law_signals(answer, f_hat)
     else:
-        asked, said = state.held.commands[0] if torque is None else torque, state.held.said
-    delivered = as_at(scenario.actuator, t).deliver(asked, dq, state.actuator)
+        command = state.sampled.commands[0] if torque is None else torque
+        signals = state.sampled.signals
+    delivered = as_at(scenario.actuator, t).deliver(command, dq, state.actuator)
     ddq = acceleration(scenario, t, q, dq, delivered.tau)
-    rate = LoopState(dq, ddq, (), (), delivered.rate)
     if scenario.sampling is None:
-        told = scenario.observer.derivative(t, q, dq, asked, model, state.observer)
-        rate = rate._replace(controller=controller_rate, observer=told)
-    return rate, observed(scenario, t, dt, q, dq, ddq, delivered.tau, delivered.limited, said)
+        observer_rate = scenario.observer.derivative(t, q, dq, command, model, state.observer)
+    rate = LoopState(dq, ddq, controller_rate, observer_rate, delivered.rate)
+    sample = sample_at(scenario, t, dt, q, dq, ddq, delivered.tau, delivered.limited, signals)
+    return rate, sample
 
 
-def observed(
+def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:
+    """The rate of the state at time t: the vector field of the closed loop."""
+    return evaluate(scenario, t, state)[0]
+
+
+def sample_at(
     scenario: Scenario,
     t: jax.Array,
     dt: jax.Array | float,
@@ -359,28 +229,32 @@ def observed(
     ddq: jax.Array,
     tau: jax.Array,
     limited: jax.Array,
-    said: LawSignals,
+    signals: LawSignals,
 ) -> Sample:
-    """The sample at time t of a loop whose robot moves like this, whatever moves it.
+    """The sample at time t of a loop with a given motion, torque and signals of the law.
 
     Args:
-      scenario: its reference, bounds and model are looked at.
+      scenario: its reference, bounds and model are used.
       t: time, () [s].
       dt: weight of the sample in an integral over time, () [s].
       q, dq, ddq: motion, (n,) each.
-      tau: torque that acts, (n,) [N m].
-      limited: whether the actuator gave less than was asked, (n,) bool.
-      said: what the law says.
+      tau: torque on the joints, (n,) [N m].
+      limited: whether the actuator delivered less than the command, (n,) bool.
+      signals: of the law.
     """
     model, tube = scenario.model, scenario.context.tube(t)
     M0, G0 = model.mass_matrix(q), model.gravity(q)
     f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
-    e2, f_tilde = dq - said.alpha, f - said.f_hat
-    if getattr(unwrapped(scenario.controller), "includes_e2", False):
-        V = jnp.sum(said.V1) + 0.5 * inner(f_tilde, f_tilde)
+    e2, f_tilde = dq - signals.alpha, f - signals.f_hat
+    if optional_member(unwrapped(scenario.controller), "includes_e2"):
+        V = jnp.sum(signals.V1) + 0.5 * inner(f_tilde, f_tilde)
     else:
-        V = jnp.sum(said.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
-    limits = () if scenario.velocity_bounds is None else scenario.context.speed_limits(t)
+        V = jnp.sum(signals.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
+    optional: dict[str, Any] = {}
+    if scenario.velocity_bounds is not None:
+        optional["dq_lower"], optional["dq_upper"] = scenario.context.speed_limits(t)
+    if scenario.regions:
+        optional["region_margin"] = margins(scenario.regions, scenario.plant, q)
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
@@ -395,20 +269,193 @@ def observed(
         dq_d=tube.dq_d,
         lower=tube.lower,
         upper=tube.upper,
-        alpha=said.alpha,
+        alpha=signals.alpha,
         gravity=G0,
         disturbance=f,
-        disturbance_estimate=said.f_hat,
+        disturbance_estimate=signals.f_hat,
         V=V,
-        guard_active=said.guard_active,
-        saturated=said.saturated | limited,
-        slack=said.slack,
-        region_slack=said.region_slack,
-        region_margin=margins(scenario.regions, scenario.plant, q) if scenario.regions else (),
-        **dict(zip(("dq_lower", "dq_upper"), limits, strict=False)),
+        guard_active=signals.guard_active,
+        saturated=signals.saturated | limited,
+        slack=signals.slack,
+        region_slack=signals.region_slack,
+        **optional,
     )
 
 
-def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:
-    """The rate of the state at time t: the vector field of the closed loop."""
-    return evaluate(scenario, t, state)[0]
+# --- discrete time: a sampled law ----------------------------------------------------------------
+
+
+class LawUpdate(NamedTuple):
+    """Result of one run of a sampled law and its observer."""
+
+    command: Command
+    f_hat: jax.Array
+    controller: Any
+    """State of the law at the next sample."""
+    observer: Any
+    """State of the observer at the next sample."""
+
+
+def discrete_observer(scenario: Scenario) -> Any:
+    """The observer as the loop runs it.
+
+    For `Sampling(observer="poles")` it is the observer whose Euler step has the poles that the
+    continuous observer has over a period.
+    """
+    sampling, observer = scenario.sampling, scenario.observer
+    if sampling is None or sampling.observer != "poles":
+        return observer
+    at_period = optional_member(observer, "at_period")
+    return observer if at_period is None else at_period(sampling.period)
+
+
+def law_update(
+    scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any
+) -> LawUpdate:
+    """Command and next states of law and observer for one measurement: the program that runs on
+    the robot's computer.
+
+    Args:
+      scenario: with a sampling.
+      t: start of the period, () [s].
+      measured: measurement at t.
+      controller, observer: their states at t.
+    """
+    sampling: Any = scenario.sampling
+    q, dq = measured.q, measured.dq
+    running = discrete_observer(scenario)
+    f_hat = running.estimate(t, q, dq, scenario.model, observer)
+    command, controller_rate = scenario.controller.command(
+        t, q, dq, f_hat, scenario.context, controller
+    )
+    arguments = (t, q, dq, command.tau, scenario.model, observer)
+    next_observer = _next_observer_state(sampling, running, arguments)
+    next_controller = _euler(controller, controller_rate, sampling.period)
+    return LawUpdate(command, f_hat, next_controller, next_observer)
+
+
+def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
+    """The observer's state one period later; `arguments` are those of `Observer.derivative`."""
+    advance = optional_member(observer, "advance")
+    if sampling.observer == "exact" and advance is not None:
+        return advance(*arguments, sampling.period)
+    return _euler(arguments[-1], observer.derivative(*arguments), sampling.period)
+
+
+def _euler(state: Any, rate: Any, period: jax.Array) -> Any:
+    """One step of Euler's method on a pytree."""
+    return jax.tree.map(lambda x, dx: x + period * dx, state, rate)
+
+
+@jax.jit
+def run_sampled_law(
+    scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Array
+) -> LoopState:
+    """The state after one run of sensor, law and observer.
+
+    Args:
+      scenario: with a sampling.
+      t: start of the period, () [s].
+      state: at t.
+      normal: standard normal numbers for the sensor, (draws, n).
+    """
+    before, sampling = state.sampled, scenario.sampling
+    assert sampling is not None
+    measured, sensor = scenario.sensor.measure(
+        state.q, state.dq, normal, sampling.period, before.sensor
+    )
+    update = law_update(scenario, t, measured, state.controller, state.observer)
+    commands = jnp.concatenate([update.command.tau[None], before.commands[:-1]])
+    signals = law_signals(update.command, update.f_hat)
+    return state._replace(
+        controller=update.controller,
+        observer=update.observer,
+        sampled=SampledState(commands, sensor, measured, signals),
+    )
+
+
+def run_sampled_law_if_due(
+    scenario: Scenario, t: jax.Array, state: LoopState, now: Instant, noise: jax.Array
+) -> LoopState:
+    """The state after `run_sampled_law` if the instant is the start of a period, else the state."""
+    normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
+    return jax.lax.cond(
+        now.phase == 0,
+        lambda state: run_sampled_law(scenario, t, state, normal),
+        lambda state: state,
+        state,
+    )
+
+
+# --- variables of the linearisation --------------------------------------------------------------
+
+
+class PerturbedState(NamedTuple):
+    """The variables of a sampled loop that `stability` perturbs to linearise it."""
+
+    plant: LoopState
+    """The `integrated_part`."""
+    torque: jax.Array
+    """The newest command, (n,) [N m]."""
+    memory: Any
+    """States of law, observer and sensor."""
+
+
+def perturbed_state(state: LoopState) -> Any:
+    """The variables by which the loop is linearised: its state, or the `PerturbedState` of a
+    sampled loop.
+    """
+    if state.sampled == ():
+        return state
+    memory = (state.controller, state.observer, state.sampled.sensor)
+    return PerturbedState(integrated_part(state), state.sampled.commands[0], memory)
+
+
+def perturbed_rate(
+    scenario: Scenario,
+    t: jax.Array,
+    perturbed: Any,
+    dt: jax.Array | None = None,
+    compiled: Callable = lambda function: function,
+) -> Any:
+    """The function whose derivative linearises the loop.
+
+    For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
+    plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor
+    and limits of an actuator are left out (`Sensor.unrounded`, `Actuator.unlimited`), because their
+    derivatives vanish and would show an open loop.
+
+    Args:
+      scenario: the scenario.
+      t: time, () [s].
+      perturbed: a `perturbed_state` at t.
+      dt: of the step, () [s]. The result does not depend on it; a caller that passes the same
+        arguments to `evaluate` elsewhere shares the traced function.
+      compiled: wrapper of functions that are compiled on their own.
+    """
+    if not isinstance(perturbed, PerturbedState):
+        weight = () if dt is None else (dt,)
+        return compiled(evaluate)(scenario, t, perturbed, *weight)[0]
+    scenario = _without_rounding_and_limits(scenario)
+    controller, observer, sensor = perturbed.memory
+    state = with_integrated_part(initial_state(scenario), perturbed.plant)
+    state = state._replace(
+        controller=controller, observer=observer, sampled=state.sampled._replace(sensor=sensor)
+    )
+    normal = jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
+    after = compiled(run_sampled_law)(scenario, t, state, normal)
+    weight = 0.0 if dt is None else dt
+    plant_rate = compiled(evaluate)(scenario, t, state, weight, perturbed.torque)[0]
+    memory = (after.controller, after.observer, after.sampled.sensor)
+    return PerturbedState(plant_rate, after.sampled.commands[0], memory)
+
+
+def _without_rounding_and_limits(scenario: Scenario) -> Scenario:
+    """The scenario with the smooth variants of its sensor and its actuator."""
+    sensor = optional_member(scenario.sensor, "unrounded")
+    actuator = optional_member(scenario.actuator, "unlimited")
+    return dataclasses.replace(
+        scenario,
+        sensor=scenario.sensor if sensor is None else sensor,
+        actuator=scenario.actuator if actuator is None else actuator,
+    )

@@ -1,8 +1,9 @@
-"""Explicit Runge-Kutta steps on pytrees, each method a Butcher table.
+"""Explicit Runge-Kutta steps on pytrees; each method is a Butcher tableau.
 
-What is integrated may say more than its rate (the closed loop has a sample to record): a step hands
-on what was said at its start. Fixed steps: the loop is sampled in practice, gradients are exact,
-  and a batch stays in step.  A new method is a new row of TABLEAUS.
+The time step is fixed, because the loop is sampled in practice, gradients are then exact, and the
+runs of a batch stay in step. The integrated function may return other values besides the rate (the
+closed loop returns a sample to record); a step passes on those of its start. A new method is a new
+row of TABLEAUS.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Tableau(NamedTuple):
     differences: tuple[float, ...]
     """Weights of the last rates, oldest first, in the estimate of a step's error (`accuracy`)."""
     halfway: int = 0
-    """The stage in the middle of a step, whose rate is one of these; 0 if there is none."""
+    """Index of the stage in the middle of a step that enters `differences`; 0 if there is none."""
 
 
 TABLEAUS = {
@@ -54,39 +55,40 @@ TABLEAUS = {
 
 
 def tableau(method: str) -> Tableau:
-    """The table of a method by name; ValueError for another name."""
+    """The tableau of a method by name; ValueError for an unknown name."""
     checks.one_of("method", method, tuple(TABLEAUS))
     return TABLEAUS[method]
 
 
 class Stepped(NamedTuple):
-    """One step of the integrator."""
+    """Result of one step of the integrator."""
 
     state: Any
     """The state one step later."""
     slopes: list
     """The slopes of the stages."""
     first: Any
-    """What was said besides the slope at the start."""
+    """What the function returned besides the rate at the start."""
 
 
 def step(
     method: str, evaluate, t: jax.Array, state, dt: jax.Array, *, rolled: bool = False
 ) -> Stepped:
-    """One step.
+    """One step of an explicit Runge-Kutta method.
 
     Args:
       method: a name in TABLEAUS.
-      evaluate: function (t, state) -> (rate of the state, same structure; anything else).
+      evaluate: function (t, state) -> (rate of the state, of its structure; anything else).
       t, dt: time and step, () [s].
       state: pytree of arrays.
-      rolled: the stages as a loop: `evaluate` is compiled once, not once a stage.
+      rolled: run the stages as a loop, so that `evaluate` is compiled once and not once a stage.
     """
-    table = tableau(method)
-    return (_rolled if rolled else _unrolled)(table, evaluate, t, state, dt)
+    take_step = _rolled if rolled else _unrolled
+    return take_step(tableau(method), evaluate, t, state, dt)
 
 
 def _unrolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
+    """A step whose stages are written out."""
     slope, first = evaluate(t, state)
     slopes = [slope]
     for c, row in zip(table.c[1:], table.a[1:], strict=True):
@@ -100,33 +102,31 @@ def stage_states(method: str, state, dt: jax.Array, slopes: list) -> list:
 
 
 def _combine(state, dt, weights, slopes):
-    def one(x, *ks):
-        # Weights times dt are shared by all numbers and runs; x is added last, so that it is
-        # rounded once.
+    """State + dt sum_i weights_i slopes_i, leaf by leaf."""
+
+    def combine_leaf(x, *ks):
+        # weight * dt is shared by all leaves and runs; x is added last, so it is rounded once.
         terms = [weight * dt * k for weight, k in zip(weights, ks, strict=True) if weight != 0.0]
         return x + sum(terms[1:], terms[0]) if terms else x
 
-    return jax.tree.map(one, state, *slopes)
+    return jax.tree.map(combine_leaf, state, *slopes)
 
 
 def _rolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
-    x, whole = ravel_pytree(state)
-    count = len(table.c)
-    rows = jnp.asarray([(*row, *[0.0] * (count - len(row))) for row in table.a], x.dtype)
+    """A step whose stages are a loop over the rows of the tableau, on the flat state."""
+    x, unflatten = ravel_pytree(state)
+    stages = len(table.c)
+    rows = jnp.asarray([(*row, *[0.0] * (stages - len(row))) for row in table.a], x.dtype)
 
     def stage(slopes, at):
         index, c, row = at
-        slope, besides = evaluate(
-            t + c * dt, whole(x + dt * jnp.sum(row[:, None] * slopes, axis=0))
-        )
-        return (
-            jax.lax.dynamic_update_index_in_dim(slopes, ravel_pytree(slope)[0], index, 0),
-            besides,
-        )
+        stage_state = unflatten(x + dt * jnp.sum(row[:, None] * slopes, axis=0))
+        slope, other = evaluate(t + c * dt, stage_state)
+        flat, _ = ravel_pytree(slope)
+        return jax.lax.dynamic_update_index_in_dim(slopes, flat, index, 0), other
 
-    stages = (jnp.arange(count), jnp.asarray(table.c, x.dtype), rows)
-    slopes, besides = jax.lax.scan(stage, jnp.zeros((count, x.size), x.dtype), stages)
+    at_stages = (jnp.arange(stages), jnp.asarray(table.c, x.dtype), rows)
+    slopes, others = jax.lax.scan(stage, jnp.zeros((stages, x.size), x.dtype), at_stages)
     total = jnp.sum(jnp.asarray(table.b, x.dtype)[:, None] * slopes, axis=0)
-    return Stepped(
-        whole(x + dt * total), [whole(k) for k in slopes], jax.tree.map(lambda y: y[0], besides)
-    )
+    first = jax.tree.map(lambda y: y[0], others)
+    return Stepped(unflatten(x + dt * total), [unflatten(k) for k in slopes], first)

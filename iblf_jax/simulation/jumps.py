@@ -1,20 +1,19 @@
-"""Where a step is divided: at the instants at which the right-hand side of the closed loop jumps.
+"""Division of a time step at the instants at which the right-hand side of the loop jumps.
 
-A Runge-Kutta step across a jump is of first order, whatever the method.  So a step is integrated in
-pieces that end where
+A Runge-Kutta step across a jump is of first order, whatever the method. A step is therefore
+integrated in pieces that end where
 
     a jump time of the scenario lies in it,   t_k < t_j <= t_(k+1)   (`Scenario.jump_times`),
     a command of a sampled law arrives in it  (`sampling.arriving`).
 
-A jump at the end of a step belongs to that step.  A piece of length 0 follows it, through which the
-state has a derivative by the jump time there, too.  The lengths of the pieces carry the derivatives
-by jump times and delays, so the jump of the right-hand side reaches the derivative of the state.
-Jumps at one time are one cut.  They have the derivative of all together, which the first of them
-gets.
+A jump at the end of a step belongs to that step. A piece of length 0 follows it, through which the
+state has a derivative by the jump time there, too. The lengths of the pieces carry the derivatives
+by jump times and delays, so the jump of the right-hand side enters the derivative of the state.
+Jumps at equal times are one cut; the first of them receives the derivative of all together.
 
-The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, one
-that begins there after it.  A jump time may be the result of rounding, so stages keep away from it
-by `APART` units in the last place.
+The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, and
+one that begins there after it. A jump time may carry a rounding error, so stages keep a distance of
+`APART` units in the last place from it.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ import numpy as np
 from iblf_jax.simulation import integrators
 
 MOST_CUTS = 4
-"""Different jump times at which one step is divided at most; the accuracy of a step with more is
-not known."""
+"""Largest number of different jump times at which one step is divided; the accuracy of a step with
+more is unknown."""
 APART = 4.0
 """Units in the last place between a stage and a jump time."""
 
 
 class Span(NamedTuple):
-    """A step in time."""
+    """Start, end and length of a step."""
 
     start: jax.Array
     """() [s]."""
@@ -45,7 +44,7 @@ class Span(NamedTuple):
     length: jax.Array
     """() [s]."""
     counts: Any = True
-    """Whether the step is one of the run, () bool; a step after the end is not divided."""
+    """Whether the step belongs to the run, () bool; a step after the end is not divided."""
 
 
 class Piece(NamedTuple):
@@ -60,7 +59,7 @@ class Piece(NamedTuple):
     earliest: Any
     """Time before which no stage is evaluated, () [s]; None in scenarios without jump times."""
     latest: Any
-    """Time after which none is."""
+    """Time after which no stage is evaluated, () [s]; None likewise."""
     arrived: Any
     """Whether the command that arrives within the step has arrived, () bool."""
 
@@ -75,7 +74,7 @@ class Division(NamedTuple):
 
 @jax.custom_jvp
 def _limited(t: jax.Array, least: jax.Array, most: jax.Array) -> jax.Array:
-    """The time t within two limits, with the derivative of t itself."""
+    """The time t clipped to two limits, with the derivative of t itself."""
     return jnp.minimum(jnp.maximum(t, least), most)
 
 
@@ -85,7 +84,7 @@ def _(primals, tangents):
 
 
 def stage_time(piece: Piece, t: jax.Array) -> jax.Array:
-    """The time at which a stage is evaluated, () [s]: on its piece's side of every jump."""
+    """The time at which a stage is evaluated, () [s]: on the piece's own side of every jump."""
     return t if piece.earliest is None else _limited(t, piece.earliest, piece.latest)
 
 
@@ -94,6 +93,9 @@ def divided(
 ) -> Division:
     """The pieces of a step.
 
+    The events of a step are the arrival of a command and the jumps, at offsets from the start of
+    the step. Each of a fixed number of cuts takes the earliest event that no cut has taken yet.
+
     Args:
       times: the scenario's jump times, (J,) [s].
       span: the step.
@@ -101,74 +103,70 @@ def divided(
         one does; None where none can.
     """
     count = times.size
-    most = min(count, MOST_CUTS) + (arrival is not None)
-    if most == 0:
+    cuts = min(count, MOST_CUTS) + (arrival is not None)
+    if cuts == 0:
         return Division((Piece(span.start, span.length, True, None, None, False),), None)
     passed = times <= span.start
-    places = _limited(times - span.start, jnp.zeros_like(span.length), span.length)
+    offsets = _limited(times - span.start, jnp.zeros_like(span.length), span.length)
     pending = ~passed & (times <= span.end) & span.counts
     if arrival is not None:
-        places = jnp.concatenate([arrival[0][None], places])
+        offsets = jnp.concatenate([arrival[0][None], offsets])
         pending = jnp.concatenate([(arrival[1] & span.counts)[None], pending])
     pieces: list[Piece] = []
     begin, done = span.start, jnp.zeros_like(pending)
-    since: Any = None
+    since: Any = None  # offset at which the piece begins; None for the first
     made: Any = True
-    for number in range(most + 1):
+    for number in range(cuts + 1):
         until, chosen = span.length, None
-        if number < most:
-            first = _first(places, pending)
-            until = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, places, 0.0)), span.length)
-            chosen = (
-                _with_equal_times(first, places, pending, count, span)
-                if count > MOST_CUTS
-                else first
-            )
-        earliest, latest = _limits(times, passed | done[-count:], span) if count else (None, None)
+        if number < cuts:
+            chosen = first = _first(offsets, pending)
+            until = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, offsets, 0.0)), span.length)
+            if count > MOST_CUTS:
+                chosen = _with_equal_times(first, offsets, pending, count, span)
+        earliest, latest = None, None
+        if count:
+            earliest, latest = _limits(times, passed | done[-count:], span)
         arrived = _arrived(done, number, count, arrival is not None)
-        pieces.append(
-            Piece(begin, until if since is None else until - since, made, earliest, latest, arrived)
-        )
+        length = until if since is None else until - since
+        pieces.append(Piece(begin, length, made, earliest, latest, arrived))
         if chosen is not None:
             begin, since, made = span.start + until, until, jnp.any(chosen)
             pending, done = pending & ~chosen, done | chosen
-    return Division(tuple(pieces), jnp.any(pending) if count > MOST_CUTS else None)
+    overfull = jnp.any(pending) if count > MOST_CUTS else None
+    return Division(tuple(pieces), overfull)
 
 
-def _first(places: jax.Array, pending: jax.Array) -> jax.Array:
+def _first(offsets: jax.Array, pending: jax.Array) -> jax.Array:
     """Which of the pending events comes first, (E,) bool: one, or none."""
-    if places.size == 1:
+    if offsets.size == 1:
         return pending
-    order = jnp.where(pending, jax.lax.stop_gradient(places), jnp.inf)
-    return pending & (
-        jnp.arange(places.size, dtype=jnp.int32) == jnp.argmin(order).astype(jnp.int32)
-    )
+    order = jnp.where(pending, jax.lax.stop_gradient(offsets), jnp.inf)
+    earliest = jnp.argmin(order).astype(jnp.int32)
+    return pending & (jnp.arange(offsets.size, dtype=jnp.int32) == earliest)
 
 
 def _with_equal_times(
-    first: jax.Array, places: jax.Array, pending: jax.Array, jumps: int, span: Span
+    first: jax.Array, offsets: jax.Array, pending: jax.Array, jumps: int, span: Span
 ) -> jax.Array:
-    """The event that comes first with those of the pending jumps at its time, (E,) bool, if it is a
-    jump itself.
-    """
-    apart = APART * jnp.finfo(places.dtype).eps * jnp.abs(span.end)
-    place = jax.lax.stop_gradient(jnp.sum(jnp.where(first, places, 0.0)))
-    equal = jnp.abs(jax.lax.stop_gradient(places) - place) <= apart
-    is_jump = np.arange(places.size) >= places.size - jumps
+    """The first event and, if it is a jump, the pending jumps at its time, (E,) bool."""
+    apart = APART * jnp.finfo(offsets.dtype).eps * jnp.abs(span.end)
+    offset = jax.lax.stop_gradient(jnp.sum(jnp.where(first, offsets, 0.0)))
+    equal = jnp.abs(jax.lax.stop_gradient(offsets) - offset) <= apart
+    is_jump = np.arange(offsets.size) >= offsets.size - jumps
     together = pending & equal & is_jump & jnp.any(first & is_jump)
     return first | together
 
 
 def _arrived(done: jax.Array, number: int, jumps: int, can_arrive: bool) -> Any:
-    """Whether the command has arrived before a piece of this number begins."""
+    """Whether the command has arrived before the piece of this number begins."""
     if not can_arrive or number == 0:
         return False
     return done[0] if jumps else True
 
 
 def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array, jax.Array]:
-    """Between which times the stages of a piece lie, () [s] each: after some jumps, before
-    others.
+    """Between which times the stages of a piece lie, () [s] each: after the passed jumps, before
+    the others.
     """
     times = jax.lax.stop_gradient(times)
     apart = APART * jnp.finfo(times.dtype).eps * jnp.abs(times)
@@ -178,7 +176,7 @@ def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array,
 
 
 def before_jumps(times: jax.Array, t: jax.Array) -> jax.Array:
-    """A time, or just before it where there is a jump, () [s]."""
+    """The time t, or a time just before it where there is a jump, () [s]."""
     times = jax.lax.stop_gradient(times)
     apart = APART * jnp.finfo(times.dtype).eps * jnp.abs(times)
     least = jnp.min(jnp.where(jnp.abs(times - t) <= apart, times - apart, t))
@@ -193,7 +191,7 @@ def within(times: jax.Array, after: jax.Array, until: jax.Array) -> jax.Array:
 def since_last(
     times: jax.Array, before: Span, arrival: tuple[jax.Array, jax.Array] | None = None
 ) -> jax.Array:
-    """How long before the end of a step its last piece begins, () [s]; the step if it is whole.
+    """Length of the last piece of a step, () [s]; that of the step if it is not divided.
 
     Args:
       times: the scenario's jump times, (J,) [s].
@@ -203,22 +201,22 @@ def since_last(
     zero, found = jnp.zeros_like(before.length), before.length
     if times.size:
         here = (times > before.start) & (times <= before.end)
-        ago = _limited(before.end - times, zero, before.length)
-        found = jnp.min(jnp.where(here, ago, before.length))
+        elapsed = _limited(before.end - times, zero, before.length)
+        found = jnp.min(jnp.where(here, elapsed, before.length))
     if arrival is not None:
         found = jnp.minimum(found, jnp.where(arrival[1], before.length - arrival[0], before.length))
     return found
 
 
 class Passage(NamedTuple):
-    """What integrating over a step gives."""
+    """Result of integrating over the pieces of a step."""
 
     state: Any
-    """At its end."""
+    """At the end of the step."""
     first: Any
-    """What was said besides the slope at its start."""
+    """What the function returned besides the rate at the start of the step."""
     parts: list[tuple[jax.Array, list]]
-    """Length [s] of each piece, and the slopes of its stages; 0 where it is not made."""
+    """Length [s] of each piece, and the slopes of its stages; 0 where there is no such piece."""
 
 
 def integrated(
@@ -247,13 +245,17 @@ def integrated(
 
     start = over(division.pieces[0], state)
     state, parts = start.state, [(division.pieces[0].length, start.slopes)]
-    nothing = jax.tree.map(jnp.zeros_like, start.slopes)
+    no_slopes = jax.tree.map(jnp.zeros_like, start.slopes)
+
+    def skip(state):
+        return state, no_slopes
+
     for piece in division.pieces[1:]:
 
-        def further(state, piece=piece):
-            made = over(piece, state)
-            return made.state, made.slopes
+        def integrate(state, piece=piece):
+            result = over(piece, state)
+            return result.state, result.slopes
 
-        state, slopes = jax.lax.cond(piece.made, further, lambda state: (state, nothing), state)
+        state, slopes = jax.lax.cond(piece.made, integrate, skip, state)
         parts.append((piece.length, slopes))
     return Passage(state, start.first, parts)

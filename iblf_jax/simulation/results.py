@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.presentation import present
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
@@ -159,22 +160,16 @@ class Rollout(Signals):
         return f"Rollout({shape}; status: {describe(int(self.status))}{accuracy})"
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
     def to_xarray(self):
         """An `xarray.Dataset` with named dimensions, units, and the scenario's parameters in its
         attributes.
         """
-        from iblf_jax.files.rollouts import rollout_to_xarray
-
-        return rollout_to_xarray(self)
+        return present("rollout dataset", self)
 
     def plot(self, **options):
         """Overview figure: tube, errors, torque, estimate, phase portrait.  Options as
         `plotting.overview`.
         """
-        from iblf_jax import plotting
-
-        return plotting.overview(self, **options)
+        return present("rollout figure", self, **options)

@@ -1,9 +1,8 @@
-"""When a law runs that is sampled: its period, when its torque arrives, and the noise of what it is
-told.
+"""Timing of a sampled law: its period, the arrival of its commands, and the noise of its sensor.
 
-Time goes in steps dt, of which a period holds m.  Instant k is the start of a sample where k is a
-multiple of m.  A command arrives `delay` after its sample's start, wherever that lies in a step:
-the integrator makes two of that step.
+A period holds m time steps dt. Instant k is the start of a sample where k is a multiple of m. A
+command arrives `delay` after the start of its sample, anywhere in a step: the integrator divides
+that step in two.
 """
 
 from __future__ import annotations
@@ -23,36 +22,36 @@ if TYPE_CHECKING:
     from iblf_jax.simulation.scenario import Scenario
 
 OBSERVER_STEPS = ("exact", "poles", "euler")
-NEARLY = 1e-6
-"""Steps.  A delay that is so near to a whole number of steps is one."""
-WHOLE = 1e-4
-"""How far, relatively, a period may be from a whole number of steps."""
+DELAY_TOLERANCE = 1e-6
+"""A delay that is this near to a whole number of steps counts as one [steps]."""
+PERIOD_TOLERANCE = 1e-4
+"""Largest relative distance of a period from a whole number of steps."""
 WORD = 1 << 16
-"""The generator works on words of 16 bits, whose products every backend's whole numbers hold."""
+"""The generator works on words of 16 bits, whose products fit the integers of every backend."""
 
 
 @component
 class Sampling:
-    """Law and observer run once a period on what was measured at its start; their torque is held,
-    and arrives `delay` later.
+    """Law and observer run once a period on the measurement at its start; their torque is constant
+    over a period (zero-order hold) and arrives `delay` later.
 
         y_k = sensor(x(t_k)),   (tau_k, z_(k+1)) = law(t_k, y_k, z_k),   tau(t) = tau_k for t_k +
         delay <= t < t_(k+1) + delay
 
-    Until the first command arrives the torque is G0(q(0)) of the model.  Which instants are samples
-    has no derivative by the period, the torque has one by the delay, unless that is 0.
+    Until the first command arrives the torque is G0(q(0)) of the model.  The instants of the
+    samples have no derivative by the period; the torque has one by the delay, unless that is 0.
 
     Args:
       period: () [s], > 0; a whole number of steps dt.
       delay: () [s], >= 0, of any length; 0 if not given.
-      observer: how an observer goes to the next period; "exact" if not given.  "exact": (3.11)
-        integrated over the period with what was measured and commanded at its start; as the robot
-        moves on meanwhile, f_hat is off by about kf period / 2 times the torque that accelerates
-        it.  "poles": a step of Euler with gains that forget in a period what the observer does,
-        without that bias.  "euler": one with the observer's own gains, unstable from kf period = 2
-        on.
-      queue: how many commands may be under way at once; as many as the delay needs if not given.  A
-        study that makes it longer needs more.
+      observer: discretisation of the observer; "exact" if not given.  "exact": (3.11) integrated
+        over the period with the measurement and the command at its start; as the robot moves
+        meanwhile, f_hat is off by about kf period / 2 times the torque that accelerates it.
+        "poles": an Euler step with gains that give the observer's poles over a period, without
+        that bias.  "euler": an Euler step with the observer's own gains, unstable from
+        kf period = 2 on.
+      queue: largest number of commands in transit at once; as many as the delay needs if not given.
+        A study with longer delays needs more.
 
     Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 2 and
       3.
@@ -92,17 +91,21 @@ class Sampling:
 
     @property
     def needed(self) -> int:
-        """Commands that are under way at once."""
-        return under_way(float(self.delay), float(self.period))
+        """Largest number of commands in transit at once."""
+        return commands_in_transit(float(self.delay), float(self.period))
 
 
-def under_way(delay: float, period: float) -> int:
-    """Commands that are under way at once, the one that arrives with a sample included; [s]."""
-    return math.floor(delay / period + NEARLY) + 1 if delay > 0 else 0
+def commands_in_transit(delay: float, period: float) -> int:
+    """Largest number of commands in transit at once, the one that arrives with a sample included;
+    delay and period in [s].
+    """
+    if not delay > 0:
+        return 0
+    return math.floor(delay / period + DELAY_TOLERANCE) + 1
 
 
 class Instant(NamedTuple):
-    """Where an instant lies between samples."""
+    """Position of an instant between samples."""
 
     sample: jax.Array
     """Number of the last sample, () int."""
@@ -111,12 +114,12 @@ class Instant(NamedTuple):
 
 
 def _steps(sampling: Sampling, dt: jax.Array) -> jax.Array:
-    """Steps of a period, () [1]."""
+    """Number of steps in a period, () [1]."""
     return jnp.maximum(jnp.round(sampling.period / dt), 1.0)
 
 
 def instant(sampling: Sampling, dt: jax.Array, index: jax.Array) -> Instant:
-    """Where the instant with this number lies."""
+    """Position of the instant with this number between samples."""
     steps = _steps(sampling, dt).astype(index.dtype)
     sample = jax.lax.div(index, steps)
     return Instant(sample, index - sample * steps)
@@ -126,20 +129,20 @@ class Arriving(NamedTuple):
     """The torque of a step, (n,) each [N m]."""
 
     torque: jax.Array
-    """From its start on."""
+    """From the start of the step."""
     next: jax.Array
-    """From where the next command arrives."""
+    """From the arrival of the next command."""
     place: jax.Array
-    """Where that is, () [1]: 0 is the start of the step, 1 its end; 1 too where none arrives."""
+    """Its position in the step, () [1]: 0 is the start, 1 the end; 1 where none arrives."""
     changes: jax.Array
-    """Whether one arrives, at the end of the step at the latest, () bool."""
+    """Whether a command arrives, at the end of the step at the latest, () bool."""
 
 
 def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array) -> Arriving:
     """The torque of a step that may change once within it.
 
-    A command that arrives with the end of a step is its own: then the step's torque has a
-      derivative by the delay there too.
+    A command that arrives at the end of a step belongs to that step, so that its torque has a
+    derivative by the delay there, too.
 
     Args:
       sampling: the period and the delay.
@@ -149,29 +152,29 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
     """
     if sampling.queue == 0:
         one = jnp.ones_like(dt)
-        return Arriving(
-            _if_possible(sampling, dt, sampling.delay, commands[0]), commands[0], one, one < 0
-        )
+        torque = _if_consistent(sampling, dt, sampling.delay, commands[0])
+        return Arriving(torque, commands[0], one, one < 0)
     age, place, changes = _arrival(sampling, dt, now.phase)
     old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
-    return Arriving(
-        _if_possible(sampling, dt, age, old), new, jnp.where(changes, place, 1.0), changes
-    )
+    torque = _if_consistent(sampling, dt, age, old)
+    return Arriving(torque, new, jnp.where(changes, place, 1.0), changes)
 
 
 def _arrival(
     sampling: Sampling, dt: jax.Array, phase: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of a step so many steps after a sample: the age of the command at work at its start, counted
-    from the newest, in samples; where the one after it arrives [steps]; and whether that is within
-    the step.
+    """Commands at a step that begins `phase` steps after a sample.
+
+    Returns:
+      The age of the active command at the start of the step, counted from the newest [samples]; the
+      arrival of the command after it, from the start of the step [steps]; and whether that lies
+      within the step.
     """
     delay = sampling.delay / dt
-    whole = jnp.round(delay)
-    near = NEARLY + 4.0 * jnp.finfo(dt.dtype).eps * delay
-    delay = delay + jax.lax.stop_gradient(
-        jnp.where(jnp.abs(delay - whole) < near, whole - delay, 0.0)
-    )
+    rounded = jnp.round(delay)
+    tolerance = DELAY_TOLERANCE + 4.0 * jnp.finfo(dt.dtype).eps * delay
+    correction = jnp.where(jnp.abs(delay - rounded) < tolerance, rounded - delay, 0.0)
+    delay = delay + jax.lax.stop_gradient(correction)
     steps, phase = _steps(sampling, dt), phase.astype(dt.dtype)
     age = jnp.maximum(jnp.ceil(jax.lax.stop_gradient(delay - phase) / steps), 0.0)
     place = delay - phase - (age - 1.0) * steps
@@ -181,8 +184,8 @@ def _arrival(
 def arrival_before(
     sampling: Sampling, dt: jax.Array, now: Instant
 ) -> tuple[jax.Array, jax.Array] | None:
-    """When a command arrived in the step before an instant, counted from that step's start, () [s],
-    and whether one did.
+    """The arrival of a command in the step before an instant, counted from the start of that step,
+    () [s], and whether one arrived; None where commands have no delay.
     """
     if sampling.queue == 0:
         return None
@@ -194,7 +197,7 @@ def arrival_before(
 def torque_before(
     sampling: Sampling, dt: jax.Array, before: jax.Array, after: jax.Array
 ) -> jax.Array:
-    """The torque that is at work just before a sample, (n,) [N m].
+    """The active torque just before a sample, (n,) [N m].
 
     Args:
       sampling: the period and the delay.
@@ -204,35 +207,34 @@ def torque_before(
     """
     if sampling.queue == 0:
         return before[0]
-    # A command that arrives with the sample is that of the step before, so what is at work is at
+    # A command that arrives with the sample belongs to the step before, so the active command is at
     # least one sample old.
     age, _, _ = _arrival(sampling, dt, jnp.zeros((), jnp.int32))
     return _chosen(after, jnp.maximum(age, 1.0))
 
 
-def _if_possible(sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array) -> jax.Array:
-    """The torque; no number where a command has left the queue before it arrived, or a period is no
-    whole number of steps.
+def _if_consistent(
+    sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array
+) -> jax.Array:
+    """The torque; NaN where a command has left the queue before its arrival, or where a period is
+    not a whole number of steps.
     """
     steps = sampling.period / dt
-    return jnp.where(
-        (age <= sampling.queue) & (jnp.abs(steps - _steps(sampling, dt)) <= WHOLE * steps),
-        torque,
-        jnp.nan,
-    )
+    is_whole = jnp.abs(steps - _steps(sampling, dt)) <= PERIOD_TOLERANCE * steps
+    return jnp.where((age <= sampling.queue) & is_whole, torque, jnp.nan)
 
 
 def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:
-    """The command at a place that is a number."""
+    """The command at a place in the queue, which is a floating-point number."""
     found = commands[0]
     for k in range(1, len(commands)):
         found = jnp.where(place >= k, commands[k], found)
     return found
 
 
-def with_room(scenario: Scenario) -> Scenario:
-    """The scenario with a queue that is long enough for its delay, whatever it was when the
-    sampling was made.
+def with_sufficient_queue(scenario: Scenario) -> Scenario:
+    """The scenario with a queue that is long enough for its delay, which may have changed since the
+    sampling was constructed.
     """
     sampling = scenario.sampling
     if sampling is None or not checks.is_concrete(sampling) or sampling.queue >= sampling.needed:
@@ -243,13 +245,13 @@ def with_room(scenario: Scenario) -> Scenario:
 
 
 def check_step(scenario: Scenario, dt: float) -> None:
-    """Raises ValueError where a period is no whole number of steps dt [s]."""
+    """Raises ValueError where a period is not a whole number of steps dt [s]."""
     sampling = scenario.sampling
     if sampling is None or not checks.is_concrete(sampling):
         return
     period = float(sampling.period)
     steps = period / dt
-    if round(steps) < 1 or abs(steps - round(steps)) > WHOLE * steps:
+    if round(steps) < 1 or abs(steps - round(steps)) > PERIOD_TOLERANCE * steps:
         fitting = period / max(math.ceil(steps - 1e-9), 1)
         raise checks.fail(
             "dt",
@@ -259,7 +261,7 @@ def check_step(scenario: Scenario, dt: float) -> None:
         )
 
 
-# ------------------------------------------------------------------------------------------------------------------- noise
+# --- noise ---------------------------------------------------------------------------------------
 
 
 def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
@@ -271,19 +273,23 @@ def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
 
 
 def has_noise(scenario: Scenario) -> bool:
-    """Whether its sensor draws any."""
+    """Whether the sensor of a scenario draws noise."""
     return scenario.sampling is not None and scenario.sensor.draws > 0
 
 
 def noise_of(scenario: Scenario, key: jax.Array, run: int | jax.Array) -> dict[str, jax.Array]:
-    """What a study's run replaces besides its leaves: the key of its noise, if it has any."""
-    return {NOISE_NAME: noise_key(key, run)} if has_noise(scenario) else {}
+    """The noise key of one run of a study, by `NOISE_NAME`, as the run replaces it besides leaves;
+    empty for a scenario without noise.
+    """
+    if not has_noise(scenario):
+        return {}
+    return {NOISE_NAME: noise_key(key, run)}
 
 
 NOISE_NAME = "noise"
-"""Name of the key among what runs replace; no leaf of a scenario has it."""
+"""Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
 NOISE = 0x6E6F6973
-"""Tells the numbers of the noise from those of the draws."""
+"""Folded into a key so that the noise is independent of the draws of a study."""
 ROUNDS = 10
 MULTIPLIERS = (0x6A09, 0x5BB7)
 """Odd, below 2^15."""
@@ -291,29 +297,31 @@ WEYL = (0x9E37, 0xBB67)
 
 
 def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
-    """Independent standard normal numbers of one sample, (draws, n): they depend on nothing but
-    key, sample and place.
+    """Independent standard normal numbers of one sample, (draws, n); they depend on key, sample and
+    index only.
 
-    A counter-based generator: ten rounds of products, their halves crossed and joined with the key,
-      as in Philox; then Box and Muller.
-    JAX's own does not lower to scalar programs.
+    The generator is counter-based: ten rounds of products whose halves are exchanged and combined
+    with the key, as in Philox, then the Box-Muller transform.  JAX's own generator does not lower
+    to scalar programs.
 
     Args:
       key: of the run, four words of 16 bits.
-      sample: its number, () int.
-      draws: how many a joint.
-      n: joints.
+      sample: number of the sample, () int.
+      draws: numbers a joint.
+      n: number of joints.
     """
     words = [w.astype(jnp.int32) for w in key]
     count = draws * n
     flat: list[jax.Array] = []
     for pair in range((count + 1) // 2):
         flat += _pair(words, sample.astype(jnp.int32), pair, key.dtype)
-    return jnp.stack(flat[:count]).reshape(draws, n) if count else jnp.zeros((0, n), key.dtype)
+    if not count:
+        return jnp.zeros((0, n), key.dtype)
+    return jnp.stack(flat[:count]).reshape(draws, n)
 
 
 def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax.Array]:
-    """Two of them."""
+    """Two independent standard normal numbers."""
     low = WORD - 1
     x = [sample & low, _upper(sample) & low, key[2] ^ pair, key[3]]
     k = [key[0], key[1]]
@@ -329,5 +337,5 @@ def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax
 
 
 def _upper(x: jax.Array) -> jax.Array:
-    """The bits of a whole number above its lowest word."""
+    """The bits of an integer above its lowest word."""
     return jax.lax.div(x, jnp.asarray(WORD, x.dtype))

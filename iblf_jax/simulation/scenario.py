@@ -22,10 +22,11 @@ from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, notices
 from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
-from iblf_jax.simulation.sampling import Sampling, with_room
+from iblf_jax.simulation.sampling import Sampling, with_sufficient_queue
 from iblf_jax.world import regions
 from iblf_jax.world.bounds import Bounds, speed_limits_at, tube_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
@@ -238,9 +239,7 @@ class Scenario:
         return self.context
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
 
 def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
@@ -376,7 +375,7 @@ def canonical(scenario: Scenario) -> Scenario:
         )
     keep_programs()
     check_values(scenario)
-    scenario = with_room(scenario)
+    scenario = with_sufficient_queue(scenario)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
     if checks.is_concrete(scenario):

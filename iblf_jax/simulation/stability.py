@@ -1,25 +1,25 @@
-"""How fast the closed loop's fastest mode is.
+"""The fastest mode of the closed loop, and the stability of a sampled loop.
 
 The gain K2 acts through M0^-1, so the fastest mode is about K2 / lambda_min(M0): near 1000 1/s for
-the paper's gains.  An explicit step is stable only while dt times that mode stays inside the
-method's stability region; beyond it the numbers grow without any physics behind them.  So every run
-measures its fastest mode, at its start, where it was nearest to its bound (there the barrier is
-stiffest) and at its end, and says when the step was too large.
+the paper's gains. An explicit step is stable only while dt times that mode lies inside the method's
+stability region; beyond it the numbers grow without a physical cause. Every run therefore measures
+its fastest mode at its start, where it was nearest to its bound (there the barrier is stiffest),
+and at its end, and its status reports a step that was too large.
 
-Derivatives of the loop are central differences of its rate: the rate is compiled as it is, its
-  derivative would take thrice as long.
+Derivatives of the loop are central differences of its rate, because compiling its derivative would
+take three times as long as compiling the rate.
 
-A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0, and one instant
-there says nothing about the time step: the oscillation that a step excites ends where the
-  difference quotient over its amplitude is small enough.  A smooth loop has the same
-derivative by differences of any small size.  So every derivative is measured by differences of
-three sizes, h0, 10 h0 and WIDEST (less near a bound, where the barrier is stiff indeed); where one
-of the larger ones gives much less than h0, the one of WIDEST counts (`resolved`).
+A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0. One instant there
+says nothing about the time step: an oscillation that a step excites stops growing at the amplitude
+at which the difference quotient is small enough. A smooth loop has the same derivative by
+differences of any small size. Every derivative is therefore measured by differences of three sizes,
+h0, 10 h0 and WIDEST (less near a bound, where the barrier is stiff). Where one of the larger ones
+gives much less than h0, the one of WIDEST counts (`resolved`).
 
-Where the law is sampled, what counts is the map from one period to the next.  Its derivative
-follows from those of plant and law: the plant's state goes with exp(A t), A its rate's derivative,
-  while the torque is held.  The loop is stable only while the spectral radius of
-that map, of all that is remembered, is below 1.
+Stability of a sampled loop is that of the map from one period to the next. The derivative of the
+map follows from those of plant and law: the plant's state evolves with exp(A t), A the derivative
+of its rate, while the torque is constant. The loop is stable only while the spectral radius of the
+map, taken over all states with memory, is below 1.
 """
 
 from __future__ import annotations
@@ -33,19 +33,24 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.linalg import matmul_in_order
-from iblf_jax.simulation.closed_loop import LoopState, change, moving, surroundings
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    integrated_part,
+    perturbed_rate,
+    perturbed_state,
+)
 from iblf_jax.simulation.scenario import Scenario
 
 POWER_ITERATIONS, AVERAGED = 48, 16
-"""Steps of the power iteration, and how many of the last are averaged over: a power of two, and a
-third of the steps."""
+"""Steps of the power iteration, and the number of the last steps in its average: a power of two,
+and a third of the steps."""
 TAYLOR, HALVINGS = 8, 8
-"""Terms of a flow, and how often its time is halved before: exact to rounding for |A| t up to
-30."""
+"""Terms of the Taylor series of a flow, and halvings of its time before: exact to rounding for
+|A| t up to 30."""
 SQUARINGS = 20
-"""Of a map, for its spectral radius."""
+"""Squarings of a map for its spectral radius."""
 RADIUS = "sampling_radius"
-"""Name of what a sampled run says of this, beside its metrics."""
+"""Name of the spectral radius among the results of a sampled run."""
 WIDER, WIDEST = 10.0, 1e-2
 """The second size of a difference, relative to the first, and the third [rad/s or the state's
 unit]: an oscillation of 0.01 rad/s with the period of a few steps moves the positions by some 1e-5
@@ -58,7 +63,7 @@ STEEP = 0.8
 """Ratio of the derivatives by differences of the second and the first size below which the
 derivative is taken to be infinite."""
 SLOWEST = 1.0
-"""1/s.  A loop slower than this still follows a reference."""
+"""Rate of the slowest mode of a loop that follows a reference [1/s]."""
 
 
 class Growth(NamedTuple):
@@ -77,24 +82,22 @@ def growth_start(x: jax.Array) -> Growth:
 
 
 def grown(growth: Growth, w: jax.Array, iteration: jax.Array) -> Growth:
-    """The growth after one of POWER_ITERATIONS, in which the Jacobian has made w of the
-    direction.
-    """
+    """The growth after one of POWER_ITERATIONS; w is the Jacobian times the direction."""
     size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(w.dtype).tiny)
     counted = iteration >= POWER_ITERATIONS - AVERAGED
     return Growth(w / size, growth.total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size)))
 
 
 def growth_rate(growth: Growth) -> jax.Array:
-    """The mode that was found, () [1/s].  It is averaged over iterations, so that a pair of complex
-    modes is measured too.
+    """The rate of the fastest mode, () [1/s]; the average over iterations covers a pair of complex
+    modes, too.
     """
     return jnp.exp(growth.total / AVERAGED)
 
 
 def growth_rate_by(jacobian: jax.Array) -> jax.Array:
-    """The mode that the power iteration of a Jacobian finds, () [1/s]: of all its steps at once, as
-    J^16 and J^32 are found by squaring.
+    """The rate that the power iteration of a Jacobian gives, () [1/s], from J^16 and J^32 by
+    squaring.
     """
     tiny = jnp.finfo(jacobian.dtype).tiny
 
@@ -104,7 +107,8 @@ def growth_rate_by(jacobian: jax.Array) -> jax.Array:
         last = last / size
         return last, matmul_in_order(last, last), 2.0 * (logarithm + jnp.log(size))
 
-    # J^AVERAGED and its square in the end, up to a factor, and the logarithm of the square's.
+    # After the loop: J^AVERAGED and its square, each up to a factor, and the logarithm of the
+    # factor of the square.
     powers = (jacobian, jacobian, jnp.zeros((), jacobian.dtype))
     last, first, logarithm = jax.lax.fori_loop(0, AVERAGED.bit_length(), squared, powers)
     before = matmul_in_order(first, growth_start(jacobian[0]).direction[:, None])
@@ -117,14 +121,16 @@ def growth_rate_by(jacobian: jax.Array) -> jax.Array:
 
 def difference_sizes(x: jax.Array, direction: jax.Array, room: jax.Array) -> jax.Array:
     """The three sizes of central differences at x along a direction, (3,); `room` is the largest
-    that makes sense, ().
+    useful one, ().
     """
     first = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
     third = jnp.maximum(first, room)
     return jnp.stack([first, jnp.minimum(WIDER * first, third), third])
 
 
-def along(rate_at: Callable, x: jax.Array, direction: jax.Array, size: jax.Array) -> jax.Array:
+def directional_derivative(
+    rate_at: Callable, x: jax.Array, direction: jax.Array, size: jax.Array
+) -> jax.Array:
     """The derivative of `rate_at`, (m,) -> (m,), at x along a direction by a central difference,
     one evaluation at a time.
     """
@@ -132,9 +138,11 @@ def along(rate_at: Callable, x: jax.Array, direction: jax.Array, size: jax.Array
     return (rates[0] - rates[1]) / (2.0 * size)
 
 
-def room_around(scenario: Scenario, t: jax.Array, plant: LoopState, size: int) -> jax.Array:
-    """The largest sizes of differences of what `closed_loop.surroundings` gives, (size,): small
-    near bounds, WIDEST elsewhere.
+def largest_difference_sizes(
+    scenario: Scenario, t: jax.Array, plant: LoopState, size: int
+) -> jax.Array:
+    """The largest sizes of differences of a `closed_loop.perturbed_state`, (size,): small near
+    bounds, WIDEST elsewhere.
     """
     tube = scenario.context.tube(t, acceleration=False)
     side = jnp.minimum(plant.q - tube.lower, tube.upper - plant.q)
@@ -153,8 +161,8 @@ def is_steep(jacobians: jax.Array, sampled: bool) -> jax.Array:
     Args:
       jacobians: by differences of three sizes, (..., 3, m, m).  Close to an infinite derivative the
         two small ones agree, and the large one is smaller.
-      sampled: whether they are of a sampled loop.  There the large one tells nothing: a position
-        that moves so far between two samples is a velocity at which the torque saturates.
+      sampled: whether they are of a sampled loop.  There the large one is not used: a position
+        that moves so far between two samples means a velocity at which the torque saturates.
     """
     lengths = jnp.sum(jnp.abs(jacobians), axis=-2)
     larger = lengths[..., 1, :]
@@ -173,44 +181,43 @@ def resolved(jacobians: jax.Array, sampled: bool) -> jax.Array:
 
 @jax.jit
 def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
-    """The derivative of `closed_loop.change` at (t, state), (m, m): the closed loop's Jacobian
-    [1/s] where the law is not sampled.
+    """The derivative of `closed_loop.perturbed_rate` at (t, state), (m, m): the Jacobian of the
+    closed loop [1/s] where the law is not sampled.
     """
-    x, whole = ravel_pytree(surroundings(state))
-    room = room_around(scenario, t, state, x.size)
+    x, unflatten = ravel_pytree(perturbed_state(state))
+    room = largest_difference_sizes(scenario, t, state, x.size)
 
     def rate_at(y):
-        return ravel_pytree(change(scenario, t, whole(y)))[0]
+        return ravel_pytree(perturbed_rate(scenario, t, unflatten(y)))[0]
 
     def column(each):
         unit, size = each
-        return along(rate_at, x, unit, size)
+        return directional_derivative(rate_at, x, unit, size)
 
     units = jnp.eye(x.size, dtype=x.dtype)
     sizes = jax.vmap(lambda unit, room: difference_sizes(x, unit, room))(units, room)
     found = jax.lax.map(column, (jnp.repeat(units, 3, axis=0), sizes.ravel()))
-    return resolved(
-        jnp.transpose(found.reshape(x.size, 3, x.size), (1, 2, 0)), scenario.sampling is not None
-    )
+    by_size = jnp.transpose(found.reshape(x.size, 3, x.size), (1, 2, 0))
+    return resolved(by_size, scenario.sampling is not None)
 
 
 def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
-    """Where x' = A x + B u goes in a time t: its state by the one before and by u, which is held;
-    (m, m + n) for A (m, m) and B (m, n).
+    """The flow of x' = A x + B u over a time t with a constant u: the derivative of x(t) by x(0)
+    and by u, (m, m + n) for A (m, m) and B (m, n).
     """
     m, scale = len(A), t / 2.0**HALVINGS
-    held = jnp.concatenate([jnp.zeros_like(A), B], axis=1) * scale
+    by_input = jnp.concatenate([jnp.zeros_like(A), B], axis=1) * scale
     unit, small = jnp.eye(m, m + B.shape[1], dtype=A.dtype), A * scale
 
     def next_term(k, found):
-        return unit + (matmul_in_order(small, found) + held) / (TAYLOR - k).astype(A.dtype)
+        return unit + (matmul_in_order(small, found) + by_input) / (TAYLOR - k).astype(A.dtype)
 
-    def twice(_, found):
-        return matmul_in_order(found[:, :m], found) + jnp.concatenate(
-            [jnp.zeros_like(A), found[:, m:]], axis=1
-        )
+    def doubled(_, found):
+        constant_part = jnp.concatenate([jnp.zeros_like(A), found[:, m:]], axis=1)
+        return matmul_in_order(found[:, :m], found) + constant_part
 
-    return jax.lax.fori_loop(0, HALVINGS, twice, jax.lax.fori_loop(0, TAYLOR, next_term, unit))
+    short = jax.lax.fori_loop(0, TAYLOR, next_term, unit)
+    return jax.lax.fori_loop(0, HALVINGS, doubled, short)
 
 
 def spectral_radius(A: jax.Array) -> jax.Array:
@@ -228,56 +235,70 @@ def spectral_radius(A: jax.Array) -> jax.Array:
 
 
 def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
-    """The derivative of a sampled loop's state a period later by its state: plant, what is
-    remembered, commands under way; (m, m) [1].
+    """The one-period map of a sampled loop: the derivative of its state (plant, memory, commands in
+    transit) at the next sample by that at this one, (m, m) [1].
 
     Args:
       scenario: with a sampling.
       state: of the loop, for its structure.
-      derivative: of `closed_loop.change` by `closed_loop.surroundings`, (M, M).
+      derivative: of `closed_loop.perturbed_rate` by `closed_loop.perturbed_state`, (M, M).
     """
     sampling: Any = scenario.sampling
-    n = scenario.n
-    plant, size, queue = ravel_pytree(moving(state))[0].size, len(derivative), sampling.queue
+    n, queue, size = scenario.n, sampling.queue, len(derivative)
+    plant = ravel_pytree(integrated_part(state))[0].size
+    memory = size - plant - n
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + n]
-    knows = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
-    law, memory = derivative[plant : plant + n, knows], derivative[plant + n :, knows]
+    # The law and the memory depend on the plant and the memory, not on the newest command.
+    known = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
+    law_by_known = derivative[plant : plant + n, known]
+    memory_by_known = derivative[plant + n :, known]
+    by_plant, by_command = _plant_over_period(sampling, A, B)
+    plant_by_known = jnp.concatenate(
+        [by_plant, jnp.zeros((plant, memory), A.dtype)], axis=1
+    ) + matmul_in_order(by_command[0], law_by_known)
 
-    if queue:
-        whole = jnp.floor(sampling.delay / sampling.period + 1e-9)
-        late = jnp.maximum(sampling.delay - whole * sampling.period, 0.0)
-        before, after = jax.lax.map(partial(flow, A, B), jnp.stack([late, sampling.period - late]))
-        then, after = after[:, plant:], after[:, :plant]
-        by_state, before = jnp.split(matmul_in_order(after, before), [plant], axis=1)
-        # Commands: the new one first, then those under way.
-        each = [
-            jnp.where(whole == k, then, 0.0) + jnp.where(whole == k - 1, before, 0.0)
-            for k in range(queue + 1)
-        ]
-    else:
-        by_state, then = jnp.split(flow(A, B, sampling.period), [plant], axis=1)
-        each = [then]
-    remembered = size - plant - n
-    moved = jnp.concatenate(
-        [by_state, jnp.zeros((plant, remembered), A.dtype)], axis=1
-    ) + matmul_in_order(each[0], law)
+    def zeros(rows: int, columns: int) -> jax.Array:
+        return jnp.zeros((rows, columns), A.dtype)
+
     rows = [
-        jnp.concatenate([moved, *each[1:]], axis=1),
-        jnp.concatenate([memory, jnp.zeros((remembered, queue * n), A.dtype)], axis=1),
+        jnp.concatenate([plant_by_known, *by_command[1:]], axis=1),
+        jnp.concatenate([memory_by_known, zeros(memory, queue * n)], axis=1),
     ]
     if queue:
-        rows.append(jnp.concatenate([law, jnp.zeros((n, queue * n), A.dtype)], axis=1))
-        kept = jnp.eye((queue - 1) * n, queue * n, dtype=A.dtype)
-        rows.append(
-            jnp.concatenate(
-                [jnp.zeros(((queue - 1) * n, plant + remembered), A.dtype), kept], axis=1
-            )
-        )
+        older = (queue - 1) * n
+        shift = jnp.eye(older, queue * n, dtype=A.dtype)
+        rows.append(jnp.concatenate([law_by_known, zeros(n, queue * n)], axis=1))
+        rows.append(jnp.concatenate([zeros(older, plant + memory), shift], axis=1))
     return jnp.concatenate(rows)
 
 
+def _plant_over_period(
+    sampling: Any, A: jax.Array, B: jax.Array
+) -> tuple[jax.Array, list[jax.Array]]:
+    """The derivative of the plant's state a period later by its state, (m, m), and by each command,
+    (m, n): the new one first, then those in transit.
+    """
+    plant = len(A)
+    if not sampling.queue:
+        by_state, by_torque = jnp.split(flow(A, B, sampling.period), [plant], axis=1)
+        return by_state, [by_torque]
+    # A delay of `periods` and a rest: the torque changes once within a period, after the rest.
+    periods = jnp.floor(sampling.delay / sampling.period + 1e-9)
+    rest = jnp.maximum(sampling.delay - periods * sampling.period, 0.0)
+    before, after = jax.lax.map(partial(flow, A, B), jnp.stack([rest, sampling.period - rest]))
+    after, by_later = after[:, :plant], after[:, plant:]
+    by_state, by_earlier = jnp.split(matmul_in_order(after, before), [plant], axis=1)
+    by_command = [
+        jnp.where(periods == k, by_later, 0.0) + jnp.where(periods == k - 1, by_earlier, 0.0)
+        for k in range(sampling.queue + 1)
+    ]
+    return by_state, by_command
+
+
 def per_time(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
-    """What a period map is as a rate, (m, m) [1/s]: how errors of a sampled loop grow or fade."""
+    """The one-period map as a rate, (m, m) [1/s]: the rate at which errors of a sampled loop grow
+    or decay.
+    """
     sampling: Any = scenario.sampling
     found = period_map(scenario, state, derivative)
     return (found - jnp.eye(len(found), dtype=found.dtype)) / sampling.period

@@ -13,6 +13,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Integral
 from iblf_jax.core import tables
+from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
 from iblf_jax.simulation.results import Rollout
@@ -214,9 +215,7 @@ class Comparison:
         return "\n".join(parts)
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)
 
     def tables_html(self) -> dict[str, str]:
         """What is held equal -> its HTML table and notes."""
@@ -243,9 +242,7 @@ class Comparison:
         """Overlaid figure of all laws, at their gains and at equal effort.  Options as
         `plotting.comparison`.
         """
-        from iblf_jax import plotting
-
-        return plotting.comparison(self, joint, **options)
+        return present("comparison figure", self, joint, **options)
 
 
 def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:

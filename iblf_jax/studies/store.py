@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core.drafts import draft
+from iblf_jax.kernels import draft
 
 FORMAT = 1
 DONE = "done"

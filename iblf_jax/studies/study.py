@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.presentation import present
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.core.status import VIOLATED as LEFT
 from iblf_jax.engine.simulate import SimulationWarning, simulate_unchecked
@@ -339,9 +340,7 @@ class Study:
         """Overview figure: the tube with bands, margins, and margin against each parameter.
         Options as `plotting.study_overview`.
         """
-        from iblf_jax import plotting
-
-        return plotting.study_overview(self, **options)
+        return present("study figure", self, **options)
 
     @notices.each_warning_once
     def replay(self, index: int, *, record_every: int = 1) -> Rollout:
@@ -445,6 +444,4 @@ class Study:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)

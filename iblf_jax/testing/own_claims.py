@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.certificates.own_law import REQUIRED
+from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, in_dtype, probe, shape_of
 
@@ -24,11 +24,11 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     The last is checked where the estimate is exact, f_tilde = 0.
     """
     law: Any = scenario.controller
-    stated = [name for name in REQUIRED if hasattr(law, name)]
+    stated = [name for name in OWN_CLAIM_METHODS if hasattr(law, name)]
     if not stated:
         return
     remedy = "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
-    for name in REQUIRED:
+    for name in OWN_CLAIM_METHODS:
         findings.require(name in stated, f"it has {stated[0]} and no {name}", remedy)
     findings.stop_if_any()
     for dtype in ("float64", "float32"):
@@ -39,7 +39,9 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
 
     def outputs(law, t, q, dq, f_tilde, context):
         own = law.init(q, dq, context)
-        return {name: getattr(law, name)(t, q, dq, f_tilde, context, own) for name in REQUIRED}
+        return {
+            name: getattr(law, name)(t, q, dq, f_tilde, context, own) for name in OWN_CLAIM_METHODS
+        }
 
     probe(findings, outputs, law, (t, q[0], dq[0], f_tilde, context))
 
@@ -74,7 +76,7 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
     own = law.init(q, dq, context)
     arguments = (t, q, dq, zero, context, own)
     calls: dict[str, tuple[Any, tuple]] = {}
-    for name in REQUIRED:
+    for name in OWN_CLAIM_METHODS:
         calls[f"{name}(t, q, dq, f_tilde, context, state)"] = (getattr(law, name), arguments)
     if hasattr(law, "disturbance_terms"):
         label = "disturbance_terms(t, q, dq, f_tilde, df, context, state)"

@@ -1,17 +1,28 @@
-"""Gain tuning by gradient through the closed loop, under requirements, over perturbed runs, checked
-on fresh ones.
+"""Gain tuning by gradient through the closed loop, under requirements, over perturbed runs,
+validated on fresh ones.
 
-    best = ij.tune(scenario, ["controller.k1", "controller.K2", "observer.kf"],
-                   ij.objectives.tracking() + 0.5 * ij.objectives.effort() +
-                   ij.objectives.margin_above(0.05), duration=5.0)
+    best = ij.tune(
+        scenario,
+        ["controller.k1", "controller.K2", "observer.kf"],
+        ij.objectives.tracking() + 0.5 * ij.objectives.effort() + ij.objectives.margin_above(0.05),
+        duration=5.0,
+        solver=ij.tuning.SQP(starts=4),
+        report=ij.tuning.Report(runs=2000),
+    )
     best.scenario, best.report, best.plot()
 
-`parameters`  which leaves, within which limits, in which coordinates      `quantities`,
-`objectives`  what for `robust`      one number from many perturbed runs
-`problem`      the compiled loss and its derivatives `newton`, `quadratic`, `first_order`  how to
-step                          `optimise`     the loop: best so far, resume `report`      the
-  verdict, on fresh runs if perturbed                      `_pareto`, `_falsify`  fronts, and
-  attacks on a result
+| Module | Purpose |
+|---|---|
+| `objectives`, `quantities` | what is minimised and required |
+| `parameters`, `ranges` | which leaves vary, in which coordinates and within which limits |
+| `robust` | one number from many perturbed runs |
+| `problem` | `TuningProblem`: all of the above in one object |
+| `evaluation`, `runs` | its value and derivatives; the calls of the engine |
+| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam` |
+| `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
+| `options`, `_tune` | options of `tune`, and `tune` |
+| `result`, `report` | what `tune` returns, and its validation on fresh runs |
+| `_pareto`, `_falsify` | fronts of two objectives, and attacks on a result |
 """
 
 from iblf_jax.tuning import objectives as objectives
@@ -20,7 +31,14 @@ from iblf_jax.tuning._falsify import falsify as falsify
 from iblf_jax.tuning._pareto import Front as Front
 from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
+from iblf_jax.tuning.options import Report as Report
 from iblf_jax.tuning.parameters import tunable as tunable
-from iblf_jax.tuning.report import Report as Report
+from iblf_jax.tuning.problem import TuningProblem as TuningProblem
+from iblf_jax.tuning.report import TuningReport as TuningReport
 from iblf_jax.tuning.result import TuneResult as TuneResult
 from iblf_jax.tuning.robust import cvar as cvar
+from iblf_jax.tuning.solvers import LBFGS as LBFGS
+from iblf_jax.tuning.solvers import SOLVERS as SOLVERS
+from iblf_jax.tuning.solvers import SQP as SQP
+from iblf_jax.tuning.solvers import Adam as Adam
+from iblf_jax.tuning.solvers import Solver as Solver

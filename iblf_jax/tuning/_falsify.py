@@ -1,25 +1,22 @@
-"""`falsify`: attack a scenario before it is believed, by its derivatives, over start, disturbance
-and plant within stated ends.
+"""`falsify`: searches for a run that violates its bounds, by derivatives over start, disturbance and
+plant within stated ranges.
 
-Random runs seldom meet the worst case: in d dimensions its corner of the set is small.  Here the
-  uniform number u in [0, 1]^d behind
-each perturbation is the unknown, and every one of S attacks, started at random, solves
+Random runs seldom contain the worst case: in d dimensions its corner of the set is small.  Here the
+uniform number u in [0, 1]^d behind each perturbation is the unknown, and each of S attacks, which
+start at random points, solves
 
-    minimise  margin(u) = min over time and joints of min(q - lower, upper - q)     subject to     0
-    <= u <= 1
+    minimise  margin(u) = min over time and joints of min(q - lower, upper - q)
+    subject to     0 <= u <= 1
 
-(or the margin of the velocities, or of the regions),
+(or the margin of the velocities, or of the regions) by `solvers.sqp`: with the exact margin and its
+gradient, which are those of the joint, side and instant that come nearest, a Hessian estimated from
+changes of the gradient, and a trust region.  An attack that has converged starts anew at another
+point.  All attacks run in one batch, derivatives by forward mode.  The result is the run with the
+smallest margin of all, so it is never better than the starting points.
 
-by the method of `newton`: the exact margin and its slope, which are those of the joint, side and
-  instant that come nearest, a
-curvature learnt from their changes, and a trust region.  An attack that has arrived starts anew
-somewhere else.  All run in one batch, derivatives by forward mode.  What comes back is the run with
-the smallest margin that was seen, so it is never better news than its own starting points.
-
-What cannot be run is no answer: a start outside its bounds, a mass matrix that is not positive
-  definite, a reference that leaves the
-bounds.  Attacks start at admissible points, and one that steps out goes back towards where it came
-from.
+Runs that say nothing about the law are no result: a start outside its bounds, a mass matrix that is
+not positive definite, a reference that leaves the bounds.  Attacks start at admissible points, and
+a step to a point that is not admissible is halved.
 """
 
 from __future__ import annotations
@@ -27,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,10 +34,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
-from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.plan import BACKENDS
-from iblf_jax.engine.simulate import simulate
-from iblf_jax.engine.step import Run
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
@@ -49,24 +42,21 @@ from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.newton import Newton
+from iblf_jax.tuning.evaluation import NUMBERS_A_RUN, Derivatives, Value
 from iblf_jax.tuning.parameters import Box
-from iblf_jax.tuning.problem import NUMBERS_A_RUN, Slope, Value
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.tangents import by_coordinates
+from iblf_jax.tuning.runs import BACKENDS, Run, known_of, simulate, tangents_of_runs
+from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
 """What may be attacked -> the deficit that is minus its margin."""
-FIRST_RADIUS = 0.5
-"""Of the first step, in u."""
-TOLERANCE = 1e-4
-"""An attack has arrived where its model promises less, relative to the margin."""
+SOLVER = SQP(tolerance=1e-4, radius=0.5)
 HALVINGS = 8
-"""How often a step that leads out of what is admissible is halved before the attack stays where it
+"""How often a step to a point that is not admissible is halved before the attack stays where it
 is."""
 NO_ANSWER = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
-"""Flags of runs that say nothing about the law: no law could keep the bounds, or the integrator is
-to blame."""
+"""Flags of runs that say nothing about the law: no law could keep the bounds, or the time step is
+too large."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,10 +74,10 @@ class Attack:
     status: int
     """Flags of `Status` of that run."""
     history: np.ndarray
-    """Margin of every attack's trial at every step, (iterations + 1, starts); NaN for runs that are
-    no answer (`NO_ANSWER`)."""
+    """Margin of every attack's trial at every step, (iterations + 1, starts); NaN for runs that say
+    nothing about the law (`NO_ANSWER`)."""
     runs: int
-    """Rollouts with derivatives that were made."""
+    """Number of rollouts with derivatives."""
     timing: dict[str, Any]
     unit: str = dataclasses.field(default="rad", kw_only=True)
     """Of the margins."""
@@ -133,138 +123,173 @@ def falsify(
     margin: str = "positions",
     progress: bool | None = None,
 ) -> Attack:
-    """Looks for the run with the smallest margin within stated sets.
+    """Searches for the run with the smallest margin within stated sets.
 
-        minimise over u in [0, 1]^d:   min over t and joints of min(q - lower, upper - q)     (or of
-        velocities or regions, `margin`)
+        minimise over u in [0, 1]^d:   min over t and joints of min(q - lower, upper - q)
+
+    or the margin of velocities or regions, by `margin`.
 
     Args:
-      scenario: what to attack, with its tuned gains say.
-      perturbations: path -> `factor`, `offset` or `value` of a distribution, as in `monte_carlo`,
-        that has two ends: the set.
-      duration: length of a run [s], a whole number of steps.
+      scenario: what to attack, with its tuned gains for example.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution with two finite ends,
+        as in `monte_carlo`: the set.
+      duration: length of a run [s], a multiple of the step.
       dt: time step [s].
       method: integrator.
       backend: as `tune`.
-      starts: attacks, each from its own random point, in one batch; one that has arrived starts
-        anew from another point.
+      starts: number of attacks, each from its own random point, in one batch; one that has
+        converged starts anew from another point.
       iterations: steps of each of them.
-      seed: fixes the starting points.
-      margin: which one is looked at: of the "positions", the "velocities" or the "regions".
-      progress: a progress bar; shown where somebody watches if not given.
+      seed: of the starting points.
+      margin: which one is minimised: of the "positions", the "velocities" or the "regions".
+      progress: whether to show a progress bar; on a terminal or in a notebook, if not given.
 
     Returns:
-      An `Attack`: the worst run found, and whether it left its bounds.  Not to have found one
-        proves nothing.
+      An `Attack`: the worst run found, and whether it left its bounds.  That no such run is found
+      proves nothing.
 
     Raises:
       ValueError: a perturbation without ends (a normal distribution), no such margin, perturbations
-        in which nothing admissible was found, or bad arguments.
+        without an admissible run, or another argument that is not valid.
 
     Source: head of this module.
     """
     tableau(method)
     checks.one_of("backend", backend, BACKENDS)
-    steps, scenario = checks.whole_steps(duration, dt), canonical(scenario)
+    steps = checks.whole_steps(duration, dt)
+    scenario = canonical(scenario)
     check_step(scenario, dt)
     starts = checks.positive_integer("starts", starts)
     checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
     seed = checks.seed(seed)
     checks.fits("iterations", iterations, 8 * starts)
-    cube, dtype = bounded(scenario, perturbations), scenario.initial.q.dtype
+    cube = bounded(scenario, perturbations)
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     checks.one_of("margin", margin, MARGINS)
     one: Any = 1.0
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
-    run, unit = Run(steps, method, mechanism=known_of(scenario)), DEFICITS[peak.signal]
-    push = partial(
-        _push, cube, astype(peak, dtype), jnp.asarray(dt, dtype), run=run, backend=backend
-    )
-    searcher = Newton(
-        Box(np.full(cube.size, 0.5), np.zeros(cube.size), np.ones(cube.size)),
-        TOLERANCE,
-        FIRST_RADIUS,
-    )
-    state, best, history = searcher.init(cube.admissible_points(starts, [seed, 3])), None, []
-
-    def attack(u: np.ndarray) -> Slope:
-        nonlocal best
-        margins, slope, status = (np.asarray(x) for x in push(jnp.asarray(u, dtype)))
-        fine = np.isfinite(margins) & (status & int(NO_ANSWER) == 0)
-        history.append(np.where(fine, margins, np.nan))
-        s = int(np.argmin(np.where(fine, margins, np.inf)))
-        if fine[s] and (best is None or margins[s] < best[0]):
-            best = (float(margins[s]), u[s].copy(), int(status[s]))
-        return Slope(
-            Value(np.where(fine, margins, np.inf)), slope, np.zeros((starts, cube.size, cube.size))
-        )
-
+    run = Run(steps, method, mechanism=known_of(scenario))
+    evaluate = MarginEvaluator(cube, peak, dt, run, backend, starts)
+    unit = DEFICITS[peak.signal]
     with bar(progress, iterations + 1, unit="steps") as shown:
-        for step in range(iterations + 1):
-            state["trial"] = np.stack(
-                [
-                    _back(cube.refused, *pair)
-                    for pair in zip(state["z"], state["trial"], strict=True)
-                ]
-            )
-            searcher.step(attack, state)
-            arrived = np.flatnonzero(state["done"])
-            anew = cube.admissible_points(starts, [seed, 3, step + 1]) if len(arrived) else ()
-            for s in arrived.tolist():
-                searcher.begin(state, s, anew[s])
-            shown.update(1)
-            shown.set_postfix_str("" if best is None else f"margin {best[0]:.4g} {unit}")
-    if best is None:
+        _attack(cube, evaluate, seed, iterations, shown, unit)
+    worst = evaluate.worst
+    if worst is None:
         remedy = (
             "In every run that was tried the reference leaves the bounds (Assumption 2) or the step"
             " is too large: narrow the perturbations, widen the bounds, or take a smaller dt."
         )
         raise cube.nothing(remedy)
-    values = {path: np.asarray(x) for path, x in cube.values(jnp.asarray(best[1], dtype)).items()}
-    timing = {"duration": duration, "dt": dt, "method": method}
-    worst = with_parameters(scenario, values)
-    first = next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row)))
+    point = cube.values(jnp.asarray(worst.u, scenario.initial.q.dtype))
+    values = {path: np.asarray(x) for path, x in point.items()}
+    history = np.stack(evaluate.history)
     return Attack(
-        worst,
-        values,
-        best[0],
-        first,
-        best[2],
-        np.stack(history),
-        starts * (iterations + 1),
-        timing,
+        scenario=with_parameters(scenario, values),
+        values=values,
+        margin=worst.margin,
+        first_margin=next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row))),
+        status=worst.status,
+        history=history,
+        runs=starts * (iterations + 1),
+        timing={"duration": duration, "dt": dt, "method": method},
         unit=unit,
     )
 
 
-def _back(
-    refused: Callable[[np.ndarray], str], last_valid: np.ndarray, ahead: np.ndarray
+def _attack(
+    cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, shown: Any, unit: str
+) -> None:
+    """All steps of all attacks; the results are in `evaluate`."""
+    starts = len(evaluate.active)
+    state = SOLVER.init(evaluate.space, cube.admissible_points(starts, [seed, 3]))
+    for step in range(iterations + 1):
+        for attack in state:
+            attack.trial = _admissible(cube.refused, attack.z, attack.trial)
+        SOLVER.step(evaluate, state, SOLVER.tolerance)
+        converged = np.flatnonzero(SOLVER.converged(state)).tolist()
+        if converged:
+            points = cube.admissible_points(starts, [seed, 3, step + 1])
+            for s in converged:
+                SOLVER.restart(evaluate.space, state, s, points[s])
+        shown.update(1)
+        if evaluate.worst is not None:
+            shown.set_postfix_str(f"margin {evaluate.worst.margin:.4g} {unit}")
+
+
+class Worst(NamedTuple):
+    """The run with the smallest margin so far."""
+
+    margin: float
+    u: np.ndarray
+    status: int
+
+
+class MarginEvaluator:
+    """Margins and their gradients at u, (S, d), for the solver; stores the worst run.
+
+    Args:
+      cube: the set.
+      peak: of the deficit that is minus the margin.
+      dt: time step [s].
+      run, backend: steps and integrator, and on what they are executed.
+      starts: number S of attacks.
+    """
+
+    def __init__(self, cube: Cube, peak: Peak, dt: float, run: Run, backend: str, starts: int):
+        self.dtype = cube.cases.scenario.initial.q.dtype
+        step = jnp.asarray(dt, self.dtype)
+        self.margins = partial(
+            _margins, cube, astype(peak, self.dtype), step, run=run, backend=backend
+        )
+        size = cube.size
+        self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
+        self.active = np.ones(starts, bool)
+        self.worst: Worst | None = None
+        self.history: list[np.ndarray] = []
+
+    def __call__(self, u: np.ndarray) -> Derivatives:
+        """Value and derivatives; infinite where a run says nothing about the law."""
+        found = self.margins(jnp.asarray(u, self.dtype))
+        margins, gradients, status = (np.asarray(x) for x in found)
+        fine = np.isfinite(margins) & (status & int(NO_ANSWER) == 0)
+        self.history.append(np.where(fine, margins, np.nan))
+        losses = np.where(fine, margins, np.inf)
+        s = int(np.argmin(losses))
+        if fine[s] and (self.worst is None or margins[s] < self.worst.margin):
+            self.worst = Worst(float(margins[s]), u[s].copy(), int(status[s]))
+        starts, size = u.shape
+        return Derivatives(Value(losses), gradients, np.zeros((starts, size, size)))
+
+
+def _admissible(
+    refused: Callable[[np.ndarray], str], accepted: np.ndarray, trial: np.ndarray
 ) -> np.ndarray:
-    """`ahead`, or the first of the points halfway back to `last_valid` that is admissible."""
+    """The trial, or the first of the points halfway back to the accepted one that is admissible."""
     for _ in range(HALVINGS):
-        if not refused(ahead):
-            return ahead
-        ahead = 0.5 * (last_valid + ahead)
-    return last_valid
+        if not refused(trial):
+            return trial
+        trial = 0.5 * (accepted + trial)
+    return accepted.copy()
 
 
 @partial(jax.jit, static_argnames=("run", "backend"))
-def _push(cube: Cube, peak: Peak, dt, u, *, run, backend):
-    """Smallest margin (S,), minus the peak of a deficit, its slope by u (S, d) and the status of
+def _margins(
+    cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, run: Run, backend: str
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Smallest margin (S,), minus the peak of a deficit, its gradient by u (S, d) and the status of
     each attack.
     """
     varied = jax.vmap(cube.values)(u)
-    slopes = jax.vmap(jax.jacfwd(cube.values))(u)
-    found = by_coordinates(
-        cube.cases.scenario, varied, slopes, (Quantities((peak,)),), dt, run, backend=backend
+    jacobians = jax.vmap(jax.jacfwd(cube.values))(u)
+    folds = (Quantities((peak,)),)
+    found = tangents_of_runs(
+        cube.cases.scenario, varied, jacobians, folds, dt, run, backend=backend
     )
-    deficits, moved = found.outcome.metrics["tuning_pieces"], found.tangents["tuning_pieces"]
+    deficits = found.outcome.metrics["tuning_pieces"]
+    slopes = found.tangents["tuning_pieces"]
     worst = jnp.argmax(deficits, axis=1)
     margin = -jnp.take_along_axis(deficits, worst[:, None], axis=1)[:, 0]
-    return (
-        margin,
-        -jnp.take_along_axis(moved, worst[:, None, None], axis=2)[:, :, 0],
-        found.outcome.status,
-    )
+    gradient = -jnp.take_along_axis(slopes, worst[:, None, None], axis=2)[:, :, 0]
+    return margin, gradient, found.outcome.status

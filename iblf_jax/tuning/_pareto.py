@@ -1,26 +1,27 @@
-"""`pareto`: the front of two objectives, tracking against effort say: its ends first, then points
-where it has the largest gaps.
+"""`pareto`: the front of two objectives, for example tracking and effort: first its ends, then points
+in its largest gaps.
 
-With A = log risk_b[a_b], B = log risk_b[b_b], an end minimises one of them alone,
+With A = log risk_b[a_b], B = log risk_b[b_b], an end minimises one of them only,
 
-    minimise A,      and then     minimise B   subject to   A <= A_end + GIVEN,
+    minimise A,      and then     minimise B   subject to   A <= A_end + TRADE,
 
-so that it is not bought with a B that A hardly feels; the other end likewise.  They are looked for
-from the scenario's gains and from the best of some that are spread over the ranges, as an objective
-alone often has several valleys.  Of two neighbours on the front with the largest gap |A_1 - A_2| or
-|B_1 - B_2|, the objective that has the gap gets a level in its middle, and the other one is minimised:
+so that the end does not have a large B for an A that hardly depends on it; the other end likewise.
+Searches for the ends begin at the scenario's gains and at the best of some points that are spread
+over the ranges, as a single objective often has several minima.  Of two neighbours on the front
+with the largest gap |A_1 - A_2| or |B_1 - B_2|, the objective with the gap gets a level in its
+middle, and the other one is minimised,
 
     minimise B   subject to   A <= (A_1 + A_2) / 2,
 
-by the method of `newton`, from the middle of their coordinates z, several gaps in one batch;
-requirements hold throughout.  A gap that this does not fill is one of the front.  The gains on the
-front are a smooth curve in z nearly everywhere: values on the straight lines between neighbours,
-  without derivatives, are of the front but for the fourth power of the distance.  Every trial that
-  kept its
-bounds and requirements is a candidate: the front is what no other one beats in both.
+by `solvers.sqp`, from the middle of their coordinates z, several gaps in one batch; requirements
+hold throughout.  A gap that this does not fill is a gap of the front.  The gains on the front are a
+smooth curve in z nearly everywhere: points on the straight lines between neighbours are on the
+front up to the fourth power of the distance, so their values are computed, without derivatives.
+Every trial that satisfies bounds and requirements is a candidate: the front is the set of
+candidates that are not dominated.
 
 Source: Y. Y. Haimes, L. S. Lasdon, D. A. Wismer, IEEE Trans. Syst. Man Cybern. 1 (1971) 296-297
-  (levels).
+(levels).
 """
 
 from __future__ import annotations
@@ -29,38 +30,41 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import bar
-from iblf_jax.engine.plan import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning._tune import Problem, build, look_around, make_method
+from iblf_jax.tuning.evaluation import NO_LEVEL, NUMBERS_A_RUN, Value
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.optimise import CountedProblem, Loop
 from iblf_jax.tuning.parameters import Block, Tunable, in_units, names_of, values_at
-from iblf_jax.tuning.problem import NO_LEVEL, NUMBERS_A_RUN, Value
+from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.robust import Risk
+from iblf_jax.tuning.runs import FORWARD_MOST, differentiates_forward
+from iblf_jax.tuning.search import Evaluator, Search
+from iblf_jax.tuning.solvers import SQP
+from iblf_jax.tuning.starts import screened
 
-GIVEN = 1e-3
+TRADE = 1e-3
 """By how much an end may be above the least value of its objective, relative to it."""
 CLOSE = 0.05
 """Neighbours whose objectives differ by less, relatively, have no gap between them."""
-TOGETHER = 8
-"""Points that are looked for in one batch at most."""
+BATCH = 8
+"""Number of points that are searched for in one batch at most."""
 BETWEEN = 8
-"""Values on the lines between neighbours, for each point."""
+"""Number of values on the lines between neighbours, for each point."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Front:
-    """Gains of which none is beaten by another one in both objectives, from low a to low b."""
+    """Gains of which none is dominated by another in both objectives, from low a to low b."""
 
     labels: tuple[str, str]
     objectives: np.ndarray
@@ -78,9 +82,9 @@ class Front:
     z: np.ndarray
     seconds: float
     evaluations: int = 0
-    """Values with derivatives that were computed, each of as many rollouts as there are runs."""
+    """Number of evaluations with derivatives, each of as many rollouts as there are runs."""
     values: int = 0
-    """Values without derivatives."""
+    """Number of evaluations without derivatives."""
 
     def __len__(self) -> int:
         return len(self.x)
@@ -99,9 +103,7 @@ class Front:
 
     def plot(self, **options):
         """Figure of the front.  Options as `plotting.pareto`."""
-        from iblf_jax import plotting
-
-        return plotting.pareto(self, **options)
+        return present("front figure", self, **options)
 
     def __repr__(self) -> str:
         ends = ", ".join(
@@ -112,7 +114,7 @@ class Front:
 
 
 def non_dominated(points: np.ndarray) -> np.ndarray:
-    """Indices of the points (N, 2) that no other one beats, by growing first coordinate."""
+    """Indices of the points (N, 2) that no other one dominates, by increasing first coordinate."""
     order = np.lexsort((points[:, 1], points[:, 0]))
     best = np.minimum.accumulate(np.concatenate([[np.inf], points[order, 1][:-1]]))
     return order[points[order, 1] < best]
@@ -139,17 +141,19 @@ def pareto(
 ) -> Front:
     """The front of two objectives over some leaves of a scenario.
 
-        the ends:  minimise a,  minimise b          a point between:  minimise b subject to a <=
-          level, or a subject to b <= level
+        an end:            minimise a                        or  minimise b
+        a point between:   minimise b subject to a <= level  or  minimise a subject to b <= level
 
     Args:
-      scenario, parameters, duration, dt, perturbations, runs, seed, risk, method, backend,
-      tolerance: as `tune`. objectives: two of `iblf_jax.objectives`, of one plain term each;
-        requirements of either hold for all points.
-      points: how many points are optimised, the two ends among them; what lies on the lines between
-        them, and every other trial, is on the front too where nothing beats it.
+      scenario, parameters, duration, dt, perturbations, runs, seed, risk, method, backend: as
+        `tune`.
+      objectives: two of `iblf_jax.objectives`, of one term each that has no limit; requirements of
+        either hold for all points.
+      points: number of points that are optimised, the two ends among them; every other trial that
+        is not dominated is on the front too.
       iterations: steps for each at most; an end may take three times as many.
-      progress: a progress bar; shown where somebody watches if not given.
+      tolerance: relative change of the loss below which a point has converged.
+      progress: whether to show a progress bar; on a terminal or in a notebook, if not given.
 
     Returns:
       A `Front`.
@@ -161,71 +165,93 @@ def pareto(
     """
     began = time.perf_counter()
     points = checks.positive_integer("points", points, least=2, most=MOST_RUNS)
-    seed = checks.seed(seed)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
     tolerance = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1")
-    pair = _pair(objectives)
-    timing = {"duration": duration, "dt": dt, "method": method, "backend": backend}
-    problem = build(
-        scenario, parameters, pair, perturbations, runs, seed, risk, timing, levels=True
+    problem = TuningProblem.build(
+        scenario,
+        parameters,
+        _pair(objectives),
+        duration=duration,
+        dt=dt,
+        method=method,
+        backend=backend,
+        perturbations=perturbations,
+        runs=runs,
+        seed=seed,
+        risk=risk,
+        on_front=True,
     )
-    if not differentiates_forward(len(problem.box.z)):
-        raise checks.fail(
-            "parameters",
-            f"{len(problem.box.z)} numbers",
-            f"at most {FORWARD_MOST} for a front",
-            "Tie or leave out some.",
-        )
+    if not differentiates_forward(problem.size):
+        came = f"{problem.size} numbers"
+        expected = f"at most {FORWARD_MOST} for a front"
+        raise checks.fail("parameters", came, expected, "Tie or leave out some.")
     checks.fits("points", points, 8.0 * BETWEEN * problem.runs * NUMBERS_A_RUN)
-    search = Search(problem, min(points, TOGETHER), iterations, tolerance)
+    search = FrontSearch(problem, min(points, BATCH), iterations, tolerance)
     with bar(progress, points, unit="points") as shown:
         search.ends(seed)
         shown.update(2)
-        while len(search.nodes) < points and (
-            asked := search.largest_gaps(points - len(search.nodes))
-        ):
-            search.minimise(*asked)
-            shown.update(len(asked[0]))
+        while len(search.nodes) < points:
+            gaps = search.largest_gaps(points - len(search.nodes))
+            if not gaps:
+                break
+            search.minimise(
+                np.stack([gap.z for gap in gaps]),
+                np.array([gap.objective for gap in gaps]),
+                np.array([gap.level for gap in gaps]),
+            )
+            shown.update(len(gaps))
         search.fill(BETWEEN * points)
     return search.front(time.perf_counter() - began)
 
 
-class Search:
-    """The trials of a front so far, and how more of them are made.
+class Gap(NamedTuple):
+    """A gap between two neighbours on the front, and the search that may fill it."""
+
+    size: float
+    z: np.ndarray
+    """Where the search begins, (p,)."""
+    objective: int
+    """Which objective is minimised, 0 or 1."""
+    level: float
+    """Of the logarithm of the other."""
+
+
+class FrontSearch:
+    """The trials of a front so far, and the searches that make more of them.
 
     Args:
-      problem: with levels.
-      lanes: of a batch; always the same number, so that all batches are of one compiled shape.
-      iterations, tolerance: of a batch.
+      problem: with two terms, on a front.
+      batch: number of searches in a batch; always the same, so that all batches are of one compiled
+        shape.
+      iterations, tolerance: of a search.
     """
 
-    def __init__(self, problem: Problem, lanes: int, iterations: int, tolerance: float):
-        self.problem, self.lanes, self.iterations, self.tolerance = (
-            problem,
-            lanes,
-            iterations,
-            tolerance,
-        )
-        self.z, self.terms = np.zeros((0, len(problem.box.z))), np.zeros((0, 2))
-        """Of each trial that kept its bounds and requirements."""
+    def __init__(self, problem: TuningProblem, batch: int, iterations: int, tolerance: float):
+        self.problem = problem
+        self.batch = batch
+        self.iterations = iterations
+        self.solver = SQP(tolerance, sharpenings=0, patience=iterations, radius=1.0)
+        self.z = np.zeros((0, len(problem.box.z)))
+        """Of each trial that satisfies its bounds and requirements."""
+        self.terms = np.zeros((0, 2))
         self.nodes: list[int] = []
         """The trials that are ends, or best under a level."""
-        self.asked: list[tuple[int, float]] = []
+        self.levels: list[tuple[int, float]] = []
         """Which objective has been under which level."""
-        self.evaluations, self.values = 0, 0
+        self.evaluations = 0
+        self.values = 0
 
     def ends(self, seed: int) -> None:
-        """Both ends, each objective alone and then the other one while it gives next to nothing
-        away.
+        """Both ends: each objective alone, and then the other one at nearly no cost to it.
 
-        Alone, each is minimised from the scenario's gains and from the best of some that are spread
-        over their ranges.
+        The first searches begin at the scenario's gains, and at the best of some points that are
+        spread over their ranges.
         """
-        points, seen, broken = look_around(self.problem, seed, self.problem.box.z[None])
-        self.first = seen.terms[0]
-        self._values(points, seen)
-        best = [1 + np.lexsort((seen.terms[1:, k], broken[1:], ~seen.valid[1:]))[0] for k in (0, 1)]
-        self._trials(points[[0, 0, *best]], np.array([0, 1, 0, 1]), np.full((4, 2), NO_LEVEL))
+        points, found, violation = screened(self.problem, seed, self.problem.box.z[None])
+        self.first = found.terms[0]
+        self._keep_values(points, found)
+        best = [_best_of(found, violation, k) for k in (0, 1)]
+        self._search(points[[0, 0, *best]], np.array([0, 1, 0, 1]), np.full((4, 2), NO_LEVEL))
         if not len(self.z):
             raise checks.fail(
                 "objectives",
@@ -234,57 +260,47 @@ class Search:
                 "Loosen them, or tune to them first.",
             )
         least = np.argmin(self.terms, axis=0)
-        self.minimise(self.z[least], np.array([1, 0]), np.log(np.min(self.terms, axis=0)) + GIVEN)
+        levels = np.log(np.min(self.terms, axis=0)) + TRADE
+        self.minimise(self.z[least], np.array([1, 0]), levels)
 
-    def minimise(self, z: np.ndarray, aims: np.ndarray, levels: np.ndarray) -> None:
-        """From each z (S, p) one of the objectives, 0 or 1 of `aims` (S,), under a level of the
-        logarithm of the other, (S,).
+    def minimise(self, z: np.ndarray, objectives: np.ndarray, levels: np.ndarray) -> None:
+        """Minimises one objective from each z, (S, p), under a level of the other.
+
+        Args:
+          z: starting points, (S, p).
+          objectives: which one is minimised, 0 or 1, (S,).
+          levels: of the logarithm of the other, (S,).
         """
-        level = np.full((len(z), 2), NO_LEVEL)
-        level[np.arange(len(z)), 1 - aims] = levels
-        self._trials(z, aims, level)
-        for aim, most in zip(aims.tolist(), levels.tolist(), strict=True):
-            kept = np.log(self.terms[:, 1 - aim]) <= most
-            self.nodes.append(int(np.argmin(np.where(kept, self.terms[:, aim], np.inf))))
-            self.asked.append((1 - aim, most))
+        both = np.full((len(z), 2), NO_LEVEL)
+        both[np.arange(len(z)), 1 - objectives] = levels
+        self._search(z, objectives, both)
+        for objective, level in zip(objectives.tolist(), levels.tolist(), strict=True):
+            satisfied = np.log(self.terms[:, 1 - objective]) <= level
+            candidates = np.where(satisfied, self.terms[:, objective], np.inf)
+            self.nodes.append(int(np.argmin(candidates)))
+            self.levels.append((1 - objective, level))
 
-    def _trials(self, z: np.ndarray, aims: np.ndarray, level: np.ndarray) -> None:
-        problem, wanted = self.problem, len(z)
-        rows = np.arange(max(self.lanes, wanted)) % wanted
-        lanes = problem.lanes(z[rows])._replace(
-            weights=np.eye(2)[aims[rows]].astype(problem.shared.dt.dtype),
-            level=level[rows].astype(problem.shared.dt.dtype),
+    def _search(self, z: np.ndarray, objectives: np.ndarray, levels: np.ndarray) -> None:
+        """Searches from each z; starts that fill up the batch are retired at once."""
+        problem = self.problem
+        dtype = problem.dt.dtype
+        rows = np.arange(max(self.batch, len(z))) % len(z)
+        candidates = problem.candidates(z[rows])._replace(
+            weights=np.eye(2)[objectives[rows]].astype(dtype), levels=levels[rows].astype(dtype)
         )
-        method = make_method(
-            "newton",
-            problem.box,
-            self.iterations,
-            self.tolerance,
-            0.1,
-            problem.limits,
-            problem.runs,
-        )
-        loop = Loop(
-            CountedProblem(problem.formulation, problem.shared, lanes, "forward"), method, z[rows]
-        )
-        loop.state["finished"][wanted:] = loop.state["retired"][wanted:] = True
-        for s in range(wanted, len(rows)):
-            method.retire(loop.state["method"], s)
-        loop.run(
-            self.iterations,
-            tolerance=self.tolerance,
-            patience=self.iterations,
-            on_step=lambda _: None,
-        )
-        history = {name: np.stack(x) for name, x in loop.history.items()}
+        space = problem.search_space(self.iterations)
+        search = Search(Evaluator(problem, candidates, "forward", space), self.solver, z[rows])
+        search.retire(slice(len(z), None))
+        search.run(self.iterations)
+        history = {name: np.stack(x) for name, x in search.history.items()}
         self.evaluations += int(history["evaluations"][-1])
         self._keep(
             history["z"], history["terms"], history["valid"], history["margin"], history["excess"]
         )
 
-    def _values(self, z: np.ndarray, seen: Value) -> None:
+    def _keep_values(self, z: np.ndarray, found: Value) -> None:
         self.values += len(z)
-        self._keep(z, seen.terms, seen.valid, seen.margin, seen.exact_excess)
+        self._keep(z, found.terms, found.valid, found.margin, found.exact_excess)
 
     def _keep(
         self,
@@ -294,42 +310,40 @@ class Search:
         margin: np.ndarray,
         excess: np.ndarray,
     ) -> None:
-        kept = valid & (margin > 0) & (np.max(excess, axis=-1, initial=-np.inf) <= 0)
-        self.z, self.terms = (
-            np.concatenate([self.z, z[kept]]),
-            np.concatenate([self.terms, terms[kept]]),
-        )
+        """Stores the trials that satisfy bounds and requirements."""
+        feasible = valid & (margin > 0) & (np.max(excess, axis=-1, initial=-np.inf) <= 0)
+        self.z = np.concatenate([self.z, z[feasible]])
+        self.terms = np.concatenate([self.terms, terms[feasible]])
 
     def _curve(self, *further: int) -> np.ndarray:
-        """The nodes, and further trials, that no other one beats, by growing first objective."""
+        """The nodes, and further trials, that are not dominated, by increasing first objective."""
         nodes = np.unique([*self.nodes, *further])
         return nodes[non_dominated(self.terms[nodes])]
 
-    def largest_gaps(self, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """What to ask `minimise` in the largest gaps, those of at least half of the largest, or
-        None where there is none.
+    def largest_gaps(self, most: int) -> list[Gap]:
+        """The largest gaps, those of at least half of the largest size; none where all are filled
+        or have had their level.
         """
-        curve, found = self._curve(), []
-        for one, other in itertools.pairwise(curve):
-            ends = np.log(self.terms[[one, other]])
-            size = np.abs(ends[1] - ends[0])
-            for k in np.argsort(-size).tolist():
-                low, high = np.sort(ends[:, k])
-                if size[k] > CLOSE and not any(
-                    j == k and low + 2 * GIVEN < level < high for j, level in self.asked
-                ):
-                    found.append(
-                        (size[k], 0.5 * (self.z[one] + self.z[other]), 1 - k, 0.5 * (low + high))
-                    )
-                    break
-        found = sorted(
-            (x for x in found if x[0] >= 0.5 * max(y[0] for y in found)), key=lambda x: -x[0]
-        )
-        z, aims, levels = ([x[i] for x in found[: min(most, self.lanes)]] for i in (1, 2, 3))
-        return (np.stack(z), np.array(aims), np.array(levels)) if z else None
+        gaps = [self._gap(one, other) for one, other in itertools.pairwise(self._curve())]
+        found = [gap for gap in gaps if gap is not None]
+        largest = max((gap.size for gap in found), default=0.0)
+        found = [gap for gap in found if gap.size >= 0.5 * largest]
+        return sorted(found, key=lambda gap: -gap.size)[: min(most, self.batch)]
+
+    def _gap(self, one: int, other: int) -> Gap | None:
+        """The larger gap between two neighbours that has not had a level."""
+        ends = np.log(self.terms[[one, other]])
+        size = np.abs(ends[1] - ends[0])
+        for k in np.argsort(-size).tolist():
+            low, high = np.sort(ends[:, k])
+            had_level = any(j == k and low + 2 * TRADE < x < high for j, x in self.levels)
+            if size[k] > CLOSE and not had_level:
+                middle = 0.5 * (self.z[one] + self.z[other])
+                return Gap(float(size[k]), middle, 1 - k, 0.5 * (low + high))
+        return None
 
     def fill(self, count: int) -> None:
-        """Values, without derivatives, at `count` places on the lines between neighbours: most
+        """Values, without derivatives, at `count` points on the lines between neighbours: most
         where the gaps are largest.
         """
         curve = self._curve(*np.argmin(self.terms, axis=0).tolist())
@@ -339,42 +353,50 @@ class Search:
         along = np.concatenate([[0.0], np.cumsum(size)])
         at = (np.arange(count) + 0.5) / count * along[-1]
         z = np.stack([np.interp(at, along, x) for x in self.z[curve].T], axis=1)
-        self._values(z, self.problem.values(z))
+        self._keep_values(z, self.problem.values(z))
 
     def front(self, seconds: float) -> Front:
-        """What no other trial beats."""
-        problem, front = self.problem, non_dominated(self.terms)
-        blocks, start = problem.formulation.blocks, problem.shared.cases.scenario
-        tried, z = self.terms, self.z[front]
-        first, second = problem.shared.objective.terms
-        labels, names = (first.name, second.name), tuple(names_of(blocks))
+        """The trials that are not dominated."""
+        problem = self.problem
+        front = non_dominated(self.terms)
+        z = self.z[front]
+        first, second = problem.objective.terms
         return Front(
-            labels,
-            tried[front],
-            in_units(blocks, z),
-            names,
-            tried,
-            self.first,
-            start,
-            blocks,
-            z,
-            seconds,
-            self.evaluations,
-            self.values,
+            labels=(first.name, second.name),
+            objectives=self.terms[front],
+            x=in_units(problem.blocks, z),
+            names=tuple(names_of(problem.blocks)),
+            tried=self.terms,
+            first=self.first,
+            start=problem.scenario,
+            blocks=problem.blocks,
+            z=z,
+            seconds=seconds,
+            evaluations=self.evaluations,
+            values=self.values,
         )
+
+
+def _best_of(found: Value, violation: np.ndarray, term: int) -> int:
+    """Index of the best point by one term, the first point excluded."""
+    order = np.lexsort((found.terms[1:, term], violation[1:], ~found.valid[1:]))
+    return 1 + int(order[0])
 
 
 def _pair(objectives: Any) -> Objective:
-    fine = (
-        isinstance(objectives, tuple | list)
-        and len(objectives) == 2
-        and all(isinstance(o, Objective) for o in objectives)
+    """The two objectives as one."""
+    is_pair = isinstance(objectives, tuple | list) and len(objectives) == 2
+    if is_pair and all(_is_single_term(x) for x in objectives):
+        return objectives[0] + objectives[1]
+    raise checks.fail(
+        "objectives",
+        objectives,
+        "two objectives of one term each, without a limit",
+        "Such as (ij.objectives.tracking(), ij.objectives.effort()).",
     )
-    if not fine or any(len(o.terms) != 1 or o.terms[0].shape != "plain" for o in objectives):
-        raise checks.fail(
-            "objectives",
-            objectives,
-            "two objectives of one plain term each",
-            "Such as (ij.objectives.tracking(), ij.objectives.effort()).",
-        )
-    return objectives[0] + objectives[1]
+
+
+def _is_single_term(objective: Any) -> bool:
+    if not isinstance(objective, Objective) or len(objective.terms) != 1:
+        return False
+    return objective.terms[0].shape == "plain"

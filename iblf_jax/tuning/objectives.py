@@ -39,11 +39,11 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import Selection, holds_weights, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
-from iblf_jax.engine.derivatives import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, TimeIntegral
 from iblf_jax.tuning.quantities import Quantity as Quantity
+from iblf_jax.tuning.runs import Outer as Outer
 from iblf_jax.world.robots import joint_names
 
 

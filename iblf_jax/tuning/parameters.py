@@ -13,6 +13,9 @@ Default limits are those of `ranges`.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -49,7 +52,11 @@ class Block(NamedTuple):
     log: bool
 
 
-class Box(NamedTuple):
+@partial(
+    jax.tree_util.register_dataclass, data_fields=("z", "low", "high"), meta_fields=("reasons",)
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Box:
     """Where tuning starts and how far it may go, in the coordinates z, (p,) each."""
 
     z: np.ndarray
@@ -248,6 +255,12 @@ def squash(w: jax.Array, box: Box) -> jax.Array:
         below, low_ + jax.nn.softplus(w), jnp.where(above, high_ - jax.nn.softplus(w), w)
     )
     return jnp.where(below & above, both, one)
+
+
+def squashed(box: Box, w: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Coordinates z of rows w, (S, p), and the function from gradients by z to gradients by w."""
+    z, pull = jax.vjp(jax.vmap(partial(squash, box=box)), jnp.asarray(w))
+    return np.asarray(z), lambda g: np.asarray(pull(jnp.asarray(g, z.dtype))[0])
 
 
 def unsquash(z: np.ndarray, box: Box) -> np.ndarray:

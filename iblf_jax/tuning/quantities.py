@@ -33,9 +33,9 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
-from iblf_jax.engine.derivatives import Outer
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
+from iblf_jax.tuning.runs import Outer
 
 FAR = 1e6
 """Where a peak starts, below everything; in units of its scale."""

@@ -30,12 +30,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.period import radius_at
-from iblf_jax.engine.step_size import fastest_along, start_and_along
-from iblf_jax.simulation.closed_loop import LoopState, sampled
+from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.tuning.runs import fastest_along, radius_at, start_and_along
 
 CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
@@ -179,7 +178,7 @@ def _asked(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
     )
 
     def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:
-        return sampled(smooth, t, state._replace(q=q), normal).held.commands[0]
+        return run_sampled_law(smooth, t, state._replace(q=q), normal).sampled.commands[0]
 
     def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
         normal = jnp.zeros((sensor.draws, scenario.n), times.dtype)

@@ -27,19 +27,17 @@ import numpy as np
 
 from iblf_jax.core import checks, devices
 from iblf_jax.core.status import Status
-from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.plan import fresh_together
-from iblf_jax.engine.step import Run
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
 from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
+from iblf_jax.tuning.evaluation import Rollouts, drawn, rollouts
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.problem import Rollouts, drawn, rollouts
 from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
+from iblf_jax.tuning.runs import Run, fresh_together, known_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +143,7 @@ WORST_FIRST = ("fail", "undecided", "pass")
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class TuningReport:
     """Changes and verdicts, on fresh runs or on the nominal one; prints as text."""
 
     runs: int
@@ -384,7 +382,7 @@ def make_report(
     at_limits: tuple[str, ...] | None = None,
     prices: tuple[float, ...] = (),
     notes: tuple[str, ...] = (),
-) -> Report:
+) -> TuningReport:
     """Runs both scenarios on the same fresh draws and compares them.
 
     Args:
@@ -484,7 +482,7 @@ def make_report(
     torques = tuple(tuple(s.torque[s.made].max(axis=0).tolist()) for s in samples)
     full = samples[1] if not perturbations else made((after,), 0, timing["dt"])[0]
     half = made((after,), 0, 0.5 * timing["dt"])[0]
-    return Report(
+    return TuningReport(
         len(both),
         seed if perturbations else None,
         confidence,

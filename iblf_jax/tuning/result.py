@@ -12,22 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.presentation import present
 from iblf_jax.core.status import UNTRUSTED
-from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.plan import values_together
-from iblf_jax.engine.simulate import simulate_unchecked
-from iblf_jax.engine.step import Run
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.tuning.evaluation import NUMBERS_A_RUN
 from iblf_jax.tuning.objectives import Objective, has_price_on_torque
-from iblf_jax.tuning.problem import NUMBERS_A_RUN
 from iblf_jax.tuning.quantities import Quantities
-from iblf_jax.tuning.report import Report, make_report
+from iblf_jax.tuning.report import TuningReport, make_report
 from iblf_jax.tuning.robust import Risk
+from iblf_jax.tuning.runs import Run, known_of, run_batch, simulate_unchecked, values_together
 
 FAR = 100.0
 """A gain that ended so many times above or below its start is worth a warning."""
@@ -243,14 +240,14 @@ class TuneResult:
         return run(canonical(self.start)), run(canonical(self.scenario))
 
     @cached_property
-    def report(self) -> Report:
+    def report(self) -> TuningReport:
         """Before and after, requirement by requirement: on fresh draws where something is
         perturbed, else on the one nominal run.
         """
         return self.check()
 
     @notices.each_warning_once
-    def check(self, runs: int | None = None, seed: int | None = None) -> Report:
+    def check(self, runs: int | None = None, seed: int | None = None) -> TuningReport:
         """The report with another number of fresh runs, or another seed.
 
         Args:
@@ -258,7 +255,7 @@ class TuneResult:
           seed: of their draws; never the one that was tuned on.
 
         Returns:
-          A `Report`, which prints as text; without perturbations it is on the one nominal run,
+          A `TuningReport`, which prints as text; without perturbations it is on the one nominal run,
           whatever `runs` and `seed` say.
 
         Raises:
@@ -363,9 +360,7 @@ class TuneResult:
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as
         `plotting.tuning`.
         """
-        from iblf_jax import plotting
-
-        return plotting.tuning(self, **options)
+        return present("tuning figure", self, **options)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes everything to one file, from which `load_tuning` gives the result back with the
@@ -376,9 +371,7 @@ class TuneResult:
             name.
           OSError: the file cannot be written.
         """
-        from iblf_jax.files.tuning import save_tuning
-
-        save_tuning(self, path)
+        present("tuning file", self, path)
 
     def __repr__(self) -> str:
         probes = f", {self.probes} probes" if self.probes else ""
@@ -396,6 +389,4 @@ class TuneResult:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        from iblf_jax import reports
-
-        return reports.card(self)
+        return present("card", self)

@@ -15,10 +15,10 @@ from certificate_states import loop, random_loops, terms_of
 from conftest import PAPER, SHORT
 
 import iblf_jax as ij
-from iblf_jax.certificates import Certificate, certify, claims, counterexample, trajectory, weighted
+from iblf_jax.certificates import Certificate, certify, claims, counterexample, run_summary
 from iblf_jax.certificates.eigenvalues import eigenvalues_over
 from iblf_jax.certificates.proof_terms import rounding, terms_at
-from iblf_jax.certificates.trajectory import look, starts_of
+from iblf_jax.certificates.run_summary import restarts, summarise
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
@@ -64,13 +64,13 @@ def proven_rate(scenario, t, state, proof):
 
 def left_side(batch, proof):
     """V2' + rho V2 - |f'|^2/2 with lambda_max of each position."""
-    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.claim(scenario), largest, 2))(
+    rho = jax.vmap(lambda scenario, largest: claims.rho(claims.constants_of(scenario), largest, 2))(
         batch, proof.lambda_max
     )
     return np.asarray(proof.dV + rho * proof.V - 0.5 * jnp.sum(proof.df**2, axis=-1))
 
 
-# ---------------------------------------------------------------------------------------------------- states
+# --- states ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, 
     batch, t, state = random_loops(ij.astype(loop(reading, observer), dtype), nearest=0.998)
     proof = terms_of(batch, t, state)
     assert proof.dV.dtype == dtype
-    assert not np.any(proof.held)
+    assert not np.any(proof.excluded)
     error = np.abs(np.asarray(jax.jit(jax.vmap(proven_rate))(batch, t, state, proof) - proof.dV))
     allowed = rounding(dtype) * np.asarray(proof.terms)
     assert np.all(error <= allowed)
@@ -96,7 +96,7 @@ def test_corrected_keeps_the_inequality_at_every_state(barrier):
     for seed in range(4):
         batch, t, state = random_loops(scenario, seed, speed=30.0)
         proof = terms_of(batch, t, state)
-        free = ~np.asarray(proof.held)
+        free = ~np.asarray(proof.excluded)
         assert np.mean(free) > 0.9
         left, allowed = left_side(batch, proof), rounding("float64") * np.asarray(proof.terms)
         assert np.all(np.isfinite(left[free]))
@@ -125,7 +125,7 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     scenario = canonical(ij.with_parameters(scenario, {"observer.eta0": -0.8}))
     seen = jax.jit(terms_at)(scenario, jnp.zeros(()), initial_state(scenario))
     np.testing.assert_allclose([seen.e2[0], seen.f_tilde[0], seen.df[0]], 0.8, rtol=1e-12)
-    rho = claims.rho(claims.claim(scenario), seen.lambda_max, 2)
+    rho = claims.rho(claims.constants_of(scenario), seen.lambda_max, 2)
     assert float(rho) == pytest.approx(rate, rel=1e-12)
     left = float(seen.dV + rho * seen.V - 0.5 * seen.df @ seen.df)
     assert abs(left) <= rounding("float64") * float(seen.terms) < 1e-11
@@ -148,14 +148,16 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
     least = 0.25 / (a[:, None] * K2 * (kf - b[:, None] / 2.0))
     w_f = least.max(axis=1) * 10 ** rng.uniform(0.0, 2.0, t.size)
     numbers = zip(decay, K2, kf, proof.slowest, a, b, w_f, strict=True)
-    terms = np.array([weighted.rate_terms(claims.Claim(*each[:3]), *each[3:]) for each in numbers])
+    terms = np.array(
+        [claims.weighted_rate_terms(claims.Claim(*each[:3]), *each[3:]) for each in numbers]
+    )
     assert np.all(terms > -1e-9 * (1.0 + kf.max(axis=1))[:, None])
     rho, half_square = terms.min(axis=1), 0.5 * np.sum(proof.f_tilde**2, axis=1)
     V = proof.V + (w_f - 1.0) * half_square
     rate = proof.dV + (w_f - 1.0) * np.sum(proof.f_tilde * proof.df_tilde, axis=1)
     left = rate + rho * V - w_f / (2.0 * b) * np.sum(proof.df**2, axis=1)
     allowed = rounding("float64") * np.maximum(1.0, w_f) * proof.terms
-    free = ~proof.held
+    free = ~proof.excluded
     assert np.mean(free) > 0.9
     assert np.all(left[free] <= allowed[free])
     # V_w holds all that it says: what is left of it without e2 and f_tilde is the barriers' with
@@ -182,9 +184,9 @@ def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
         fading = (1.0 - np.exp(-rho * 10.0)) / (rho * 10.0)
         return (given["V_rest"] + w_f * given["half_square"]) * fading + rho2 / rho
 
-    found = weighted.best(constants, *given.values(), 2)
+    found = claims.best_weights(constants, *given.values(), 2)
     assert np.min(
-        weighted.rate_terms(constants, 0.9, found.a, found.b, found.w_f)
+        claims.weighted_rate_terms(constants, 0.9, found.a, found.b, found.w_f)
     ) == pytest.approx(found.rho)
     rng, others = np.random.default_rng(0), []
     for a, b, w_f in zip(
@@ -193,13 +195,13 @@ def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
         10 ** rng.uniform(0, 4, 20000),
         strict=True,
     ):
-        rho = np.min(weighted.rate_terms(constants, 0.9, a, b, w_f))
+        rho = np.min(claims.weighted_rate_terms(constants, 0.9, a, b, w_f))
         others.append(mean(rho, w_f, w_f * given["F_d"] ** 2 / (2 * b)) if rho > 0 else np.inf)
     assert mean(found.rho, found.w_f, found.rho2) < 1.01 * min(others)
-    assert weighted.best(constants, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
+    assert claims.best_weights(constants, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
 
 
-# ---------------------------------------------------------------------------------------------------- runs
+# --- runs -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +221,7 @@ def corrected_certificate(corrected_run) -> Certificate:
 
 @pytest.mark.slow
 def test_rate_along_the_run_is_its_difference_quotient(paper_run):
-    _, stretches = look(jax.tree.map(np.asarray, paper_run))
+    _, stretches = summarise(jax.tree.map(np.asarray, paper_run))
     seen = [
         jax.tree.map(lambda x, trajectory=trajectory: x[trajectory.recorded], trajectory.proof)
         for trajectory in stretches
@@ -379,10 +381,10 @@ def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_obser
 
 def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     """With a rate that is too large the inequality fails where the right one holds."""
-    best = weighted.best
+    best = claims.best_weights
     monkeypatch.setattr(
-        weighted,
-        "best",
+        claims,
+        "best_weights",
         lambda *given: (found := best(*given)) and found._replace(rho=1e3 * found.rho),
     )
     scenario = ij.with_parameters(corrected_run.scenario, LIGHT)
@@ -408,11 +410,11 @@ def test_the_papers_claim_scales_with_the_weights(corrected_run, weight):
     np.testing.assert_allclose(certificate.traces.xi_bound[0], bound, rtol=1e-9)
 
 
-def test_envelope_starts_anew_at_jumps_and_after_held_samples():
+def test_envelope_starts_anew_at_jumps_and_after_excluded_samples():
     t = np.arange(6.0)
-    held = np.array([False, False, True, False, False, False])
+    excluded = np.array([False, False, True, False, False, False])
     np.testing.assert_array_equal(
-        starts_of(t, held, np.array([3.5, 5.0])), [True, False, False, True, True, True]
+        restarts(t, excluded, np.array([3.5, 5.0])), [True, False, False, True, True, True]
     )
 
 
@@ -431,7 +433,7 @@ def test_jump_of_the_disturbance_restarts_the_envelope(corrected_run):
     assert certificate.traces.V[at] > 1e6 * certificate.traces.envelope[at - 1]
 
 
-# ---------------------------------------------------------------------------------------------------- every step
+# --- every step -----------------------------------------------------------------------------------
 
 
 def decimated(run, every: int, **changes):
@@ -485,7 +487,7 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert_alike(sparse, whole)
     # The steps after the last sample count too; and a long run, which is not kept in memory, gives
     # the same.
-    monkeypatch.setattr(trajectory, "CERTIFY_KEPT", 0)
+    monkeypatch.setattr(run_summary, "KEPT_STEPS", 0)
     assert_alike(certify(run.scenario, decimated(shaken, 300)), whole)
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
 
@@ -512,7 +514,7 @@ def test_certificate_never_contradicts_the_status(corrected_run):
     assert certify(run.scenario, lost).verdict == "fails"
 
 
-def test_batch_with_a_run_that_is_not_believed_does_not_hold(corrected_run):
+def test_batch_with_an_invalid_run_does_not_hold(corrected_run):
     lost = dataclasses.replace(corrected_run, status=jnp.int32(int(ij.Status.NOT_FINITE)))
     certificate = certify(
         corrected_run.scenario, jax.tree.map(lambda *x: jnp.stack(x), corrected_run, lost)
@@ -541,7 +543,7 @@ def test_run_that_its_scenario_does_not_reproduce_is_refused(shaken):
             certify(other.scenario, other)
 
 
-# ---------------------------------------------------------------------------------------------------- f' = 0
+# --- f' = 0 ---------------------------------------------------------------------------------------
 
 
 @ij.component
@@ -634,7 +636,7 @@ def test_one_arm_with_friction_or_a_load_is_case_2(changes):
     assert bare.holds
 
 
-# ---------------------------------------------------------------------------------------------------- no claim
+# --- no claim -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["PDGravity", pytest.param("NoObserver", marks=pytest.mark.slow)])
@@ -652,7 +654,7 @@ def test_no_claim_is_not_applicable(paper, name):
     json.dumps(certificate.to_dict(), allow_nan=False)
 
 
-# ---------------------------------------------------------------------------------------------------- a law's own claim
+# --- a law's own claim ----------------------------------------------------------------------------
 
 
 @ij.component
@@ -770,7 +772,7 @@ def test_a_claim_that_is_too_strong_fails_and_says_when_first(own):
 @pytest.mark.slow
 def test_the_rate_of_an_own_V_is_its_difference_quotient(own):
     run = jax.tree.map(np.asarray, ij.simulate(own, duration=0.02, dt=1e-4, record_every=1))
-    _, stretches = look(run)
+    _, stretches = summarise(run)
     terms = next(stretches).proof.own
     slope = (terms.V[2:] - terms.V[:-2]) / 2e-4
     np.testing.assert_allclose(terms.dV[1:-1], slope, rtol=1e-4)
@@ -898,7 +900,7 @@ def test_saturated_samples_are_left_out(corrected_run):
     assert 0 < left_out < 1000
     assert certificate["inequality, case 2"].verdict == "holds"
     assert f"{left_out} of 2001 samples are left out" in certificate["inequality, case 2"].note
-    assert np.all(np.isnan(certificate.traces.envelope[certificate.traces.held]))
+    assert np.all(np.isnan(certificate.traces.envelope[certificate.traces.excluded]))
 
 
 def test_a_run_that_failed_is_not_judged(corrected_run):
@@ -927,7 +929,7 @@ def test_wrong_arguments_are_named(paper, corrected_run):
         counterexample(paper, {"initial.q": ij.offset(ij.normal(0.0, 0.1))})
 
 
-# ---------------------------------------------------------------------------------------------------- many runs
+# --- many runs ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -980,7 +982,7 @@ def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
     assert certify(corrected_run.scenario, Study(batch), worst=None).runs == (0, 1, 2)
 
 
-# ---------------------------------------------------------------------------------------------------- the gap
+# --- the gap --------------------------------------------------------------------------------------
 
 
 def gap_certificate(reading):
@@ -1036,7 +1038,7 @@ def test_search_finds_the_gap_of_the_printed_law_only():
 def test_search_returns_what_can_be_run(perturbations):
     found = counterexample(ij.presets.printed_gap(), perturbations, starts=3)
     assert np.isfinite(found.growth)
-    assert not certify(found.scenario, ij.simulate(found.scenario, **SHORT)).traces.held[0]
+    assert not certify(found.scenario, ij.simulate(found.scenario, **SHORT)).traces.excluded[0]
 
 
 def test_search_refuses_perturbations_without_a_start(paper):
@@ -1082,7 +1084,7 @@ def test_old_names_and_tuples_are_told_the_new_ones(paper, search, old):
         search(paper, {"initial.q": (0.4, np.array([0.7, 0.8]))}, **timing)
 
 
-# ---------------------------------------------------------------------------------------------------- what a user sees
+# --- what a user sees -----------------------------------------------------------------------------
 
 
 def test_certificate_shows_itself(paper_certificate):

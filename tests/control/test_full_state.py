@@ -218,7 +218,7 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
-    assert not np.any(proof.held)
+    assert not np.any(proof.excluded)
     allowed = rounding("float64") * np.asarray(proof.terms)
     assert np.all(proof.full.left <= allowed)
     assert np.median(allowed / np.abs(proof.dV)) < 1e-10  # small beside what it judges
@@ -238,7 +238,7 @@ def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, 
     scenario = dataclasses.replace(ij.presets.zhang_yan_2024_full_state(kf=20.0), controller=law)
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
-    assert not np.any(proof.held)
+    assert not np.any(proof.excluded)
     assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.terms))
     V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.context.tube(t), q))(t, states.q)
     phi = jax.vmap(

@@ -245,7 +245,7 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
     calls = []
     monkeypatch.setattr(
         transformable,
-        "_plain",
+        "_run_by_scan",
         lambda *args: calls.append(1) or (_ for _ in ()).throw(AssertionError("the scan")),
     )
     run, _ = everything(paper)
@@ -278,7 +278,9 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
 @needs_compiler
 def test_second_derivatives_are_the_kernels(paper, monkeypatch):
     monkeypatch.setattr(
-        transformable, "_run_by_scan", lambda *args: (_ for _ in ()).throw(AssertionError("the scan"))
+        transformable,
+        "_run_by_scan",
+        lambda *args: (_ for _ in ()).throw(AssertionError("the scan")),
     )
 
     def ise(values):
@@ -306,14 +308,16 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
     def last(K2, dt):
         scenario = canonical(ij.with_parameters(paper, {"controller.K2": K2}))
         return jnp.sum(
-            transformable.run_transformable(scenario, (), dt, step.RunRequest(30, "euler", 1)).records[0][
-                "q"
-            ][-1]
+            transformable.run_transformable(
+                scenario, (), dt, step.RunRequest(30, "euler", 1)
+            ).records[0]["q"][-1]
         )
 
     K2, dt, calls = jnp.asarray([20.0, 15.0]), jnp.asarray(1e-3), []
     expected, original = jax.grad(last)(K2, dt), transformable._run_by_scan
-    monkeypatch.setattr(transformable, "_run_by_scan", lambda *args: calls.append(1) or original(*args))
+    monkeypatch.setattr(
+        transformable, "_run_by_scan", lambda *args: calls.append(1) or original(*args)
+    )
     np.testing.assert_array_equal(jax.grad(last)(K2, dt), expected)
     assert calls == []
     slope = jax.grad(last, 1)(K2, dt)
@@ -369,7 +373,7 @@ def test_a_new_structure_does_recompile(paper, monkeypatch):
     monkeypatch.setattr(
         single_run,
         "initialize",
-        lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt)
+        lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt),
     )
     with pytest.raises(KeyboardInterrupt):
         ij.simulate(paper, **SHORT, metrics=(ij.metrics.Torque(),))

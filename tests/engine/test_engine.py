@@ -15,7 +15,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
-from iblf_jax.engine import compile, machine_function, plan, registry, single_run
+from iblf_jax.engine import compile, machine_function, plan, registry
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
 from iblf_jax.engine.request import RunRequest
@@ -130,7 +130,9 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
     assert_same(written_out, rolled)
     assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
     off = np.max(
-        np.abs(written_out.records[0]["q"] - outcome(inputs, RunRequest(50, "rk4", 10)).records[0]["q"])
+        np.abs(
+            written_out.records[0]["q"] - outcome(inputs, RunRequest(50, "rk4", 10)).records[0]["q"]
+        )
     )
     assert 0 < off < 1e-6
 
@@ -141,7 +143,8 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
     fast = inputs_of(ij.with_parameters(paper, {"controller.K2": 1e4}), steps=1)
     assert not outcome(fast, RunRequest(1, "euler")).status & Status.NOT_FINITE
     assert (
-        outcome(fast._replace(steps=jnp.asarray(40.0)), RunRequest(40, "euler")).status & Status.NOT_FINITE
+        outcome(fast._replace(steps=jnp.asarray(40.0)), RunRequest(40, "euler")).status
+        & Status.NOT_FINITE
     )
 
 

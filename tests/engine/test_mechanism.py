@@ -18,7 +18,7 @@ from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep
+from iblf_jax.engine.step import Carry, Inputs, Run, StepOptions, TimeStep
 from iblf_jax.kernels.passes import written_out
 from iblf_jax.kernels.program import LANE, TIME
 from iblf_jax.simulation.paths import get, with_parameters
@@ -71,7 +71,7 @@ def lowered(*case):
 
 @jax.jit
 def by_jax(inputs, carry, index):
-    return jax.tree.leaves(STEP(inputs, carry, index, Form())[0])
+    return jax.tree.leaves(STEP(inputs, carry, index, StepOptions())[0])
 
 
 def both(scenario, varied=()):

@@ -114,7 +114,7 @@ def carry_of(inputs, varied, method):
     programs of their own."""
 
     def one(inputs):
-        size = accuracy.places(initial_state(inputs.scenario)).size
+        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         jacobian = 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + size * size, dtype=inputs.dt.dtype)).reshape(
             size, size
         )
@@ -164,7 +164,9 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
     inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.per_run])
     p, _ = program_of(step, run, carries)
     expected = numbers(
-        jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, StepOptions(rolled=True))[0])(carry))
+        jax.tree.leaves(
+            jax.jit(lambda c: step(inputs, c, index, StepOptions(rolled=True))[0])(carry)
+        )
     )
     monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
     called, _ = program_of(step, run, carries)

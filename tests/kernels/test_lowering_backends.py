@@ -14,16 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fallback import with_fallback
 from made_up_runs import ALWAYS
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
-from iblf_jax.core.cache import directory
-from iblf_jax.engine import compile, execute, executors, native, plan, registry
+from iblf_jax.engine import compile, execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
-from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
-from iblf_jax.kernels import packed, toolchain
+from iblf_jax.kernels import directory, packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
@@ -367,13 +366,6 @@ def test_forward_sensitivities(monkeypatch, written_out):
         assert tangents["rmse"].shape == (3, 3, 2)
         assert_same(products, exact, 1e-10)
         assert [x.shape for x in products] == [(3, 3, 3)] * 2
-
-
-def with_fallback(backend, run_on, by_scan):
-    """`run_on(name)` with the first executor of the plan of a batch that works."""
-    request, sizes = RunRequest(1, backend=backend), plan.Sizes(700, 3)
-    execution = plan.choose_plan(request, sizes, registry.machine())
-    return compile.first_that_works(execution, lambda executor: run_on(executor.name), by_scan)
 
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):

@@ -18,8 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fallback import with_fallback
 from test_lowering import DT, MEMBERS, STANDARD, carry_of, evaluate, with_member
-from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler, with_fallback
+from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
 from iblf_jax.engine import compile, execute, gpu, plan, registry
@@ -342,9 +343,7 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
         match="gpu backend is not available .there is no NVRTC.: running on xla",
     ):
         assert (
-            with_fallback(
-                "auto", lambda name: missing() if name == "gpu" else name, lambda: None
-            )
+            with_fallback("auto", lambda name: missing() if name == "gpu" else name, lambda: None)
             == "xla"
         )
     monkeypatch.setattr(nvrtc, "library", lambda: None)

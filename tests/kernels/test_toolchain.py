@@ -20,14 +20,14 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
+from fallback import with_fallback
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
-from test_lowering_backends import with_fallback
 
 from iblf_jax import cli
-from iblf_jax.core import drafts
-from iblf_jax.core.cache import _reloads_badly, directory, keep_programs, processor
+from iblf_jax.core import devices
+from iblf_jax.core.cache import _reloads_badly, keep_programs
 from iblf_jax.engine import compile, native
-from iblf_jax.kernels import nvrtc, toolchain
+from iblf_jax.kernels import directory, drafts, nvrtc, processor, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 
 SOURCE = 'extern "C" __attribute__((visibility("default"))) int value(void) { return 41; }'
@@ -274,7 +274,7 @@ def test_programs_of_another_processor_are_apart(cache, monkeypatch):
     folders = set()
     for flags in ("sse avx", "sse avx avx512f"):
         monkeypatch.setattr(
-            "iblf_jax.core.cache._cpuinfo",
+            "iblf_jax.kernels.folder.cpuinfo",
             lambda flags=flags: ["model name : Same 9000", f"flags : {flags}"],
         )
         processor.cache_clear()
@@ -282,7 +282,7 @@ def test_programs_of_another_processor_are_apart(cache, monkeypatch):
     processor.cache_clear()
     assert len(folders - {None}) == 2
     monkeypatch.setattr(
-        "iblf_jax.core.cache._cpuinfo",
+        "iblf_jax.core.cache.cpuinfo",
         lambda: ["model name : Same 9000", "bugs : spectre_v2 gds mds"],
     )
     assert chosen_cache(monkeypatch, badly=_reloads_badly()) == (None, [])
@@ -821,12 +821,12 @@ def test_drafts_of_other_machines_go_by_age(tmp_path, monkeypatch):
 )
 def test_a_number_of_threads_that_is_none_is_one_line(monkeypatch, wanted):
     monkeypatch.delenv("IBLF_JAX_THREADS", raising=False)
-    usual = toolchain.threads()
+    usual = devices.threads()
     monkeypatch.setenv("IBLF_JAX_THREADS", wanted)
     with pytest.warns(
         UserWarning, match="IBLF_JAX_THREADS: got .*, expected a whole number from 1 to 256"
     ) as said:
-        assert toolchain.threads() == (256 if wanted[0] in "92" else usual)
+        assert devices.threads() == (256 if wanted[0] in "92" else usual)
     assert len(said) == 1
     assert len(str(said[0].message)) < 200
 
@@ -836,4 +836,4 @@ def test_a_number_of_threads(monkeypatch, wanted, threads):
     monkeypatch.setenv("IBLF_JAX_THREADS", wanted)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert toolchain.threads() == threads
+        assert devices.threads() == threads

@@ -758,7 +758,7 @@ def test_every_function_gives_a_warning_once_at_the_callers_line(name, monkeypat
 
     monkeypatch.setattr(controllers.Backstepping, "advice", lambda *_: [ADVICE], raising=False)
     monkeypatch.setattr(
-        _certify, "_one", lambda run: run
+        _certify, "_certificate_of", lambda run: run
     )  # what comes after the run warns of nothing, and takes long
     monkeypatch.setattr(
         live, "_loop", lambda scenario, *_: {"rows": ij.simulate(scenario, **SHORT).t.size}

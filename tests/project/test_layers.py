@@ -21,18 +21,9 @@ LAYER_OF = {
 }
 """Module or folder at the root of the package -> its layer."""
 
-UPWARD = {
-    "certificates/result.py": {"plotting", "reports"},
-    "identification/result.py": {"plotting", "reports"},
-    "simulation/results.py": {"files", "plotting", "reports"},
-    "simulation/scenario.py": {"reports"},
-    "studies/comparison.py": {"plotting", "reports"},
-    "studies/study.py": {"plotting", "reports"},
-    "tuning/_pareto.py": {"plotting"},
-    "tuning/result.py": {"files", "plotting", "reports"},
-}
-"""File -> the higher modules that it imports inside a method: `.plot()`, `.save()`, `.to_xarray()`,
-`_repr_html_()`.  No others do."""
+UPWARD: dict[str, set[str]] = {}
+"""File -> the higher modules that it imports inside a function: none. Results reach figures, reports
+and files through `core/presentation.py`."""
 
 ONLY_IN = {
     "matplotlib": ("plotting",),
@@ -112,7 +103,7 @@ def test_imports_go_down_only(path):
     )
 
 
-def test_results_alone_go_up_when_asked():
+def test_no_function_imports_from_above():
     found = {
         str(path.relative_to(PACKAGE)): upward(module_of(path), text, at_the_top=False)
         for path, text in SOURCES.items()

@@ -12,7 +12,8 @@ import pytest
 import iblf_jax as ij
 from iblf_jax import reports
 from iblf_jax.studies.statistics import probability
-from iblf_jax.tuning.report import Change, Report, Verdict
+from iblf_jax.tuning.report import Change, Verdict
+from iblf_jax.tuning.report import TuningReport as Report
 
 SHORT = {"duration": 0.2, "dt": 2e-3}
 

@@ -21,7 +21,7 @@ from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import start_and_along
-from iblf_jax.simulation.closed_loop import sampled
+from iblf_jax.simulation.closed_loop import run_sampled_law
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.sampling import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
@@ -593,7 +593,7 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
         for i, t in enumerate([0.0, *TIMES]):
             state = jax.tree.map(lambda x, i=i: x[i], states)
             commands = [
-                sampled(changed, t, state._replace(q=q), jnp.zeros((0, 2))).held.commands[0]
+                run_sampled_law(changed, t, state._replace(q=q), jnp.zeros((0, 2))).sampled.commands[0]
                 for q in state.q + count * MOVED
             ]
             rates.append(600.0 * np.max(np.abs(np.stack(commands[1:]) - commands[0])))

@@ -24,15 +24,19 @@ from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning import _tune, newton, problem, quadratic
-from iblf_jax.tuning.newton import Newton, Pieces, planned
-from iblf_jax.tuning.optimise import CountedProblem, Loop, load_checkpoint, save_checkpoint
+from iblf_jax.tuning import LBFGS, SQP, Adam, evaluation, quadratic
+from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
+from iblf_jax.tuning.evaluation import Candidate, Derivatives, Value
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
-from iblf_jax.tuning.probes import APART, REACH, Probes
+from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 from iblf_jax.tuning.ranges import SHARE, STEP, THEOREM, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
+from iblf_jax.tuning.search import Evaluator, Search
+from iblf_jax.tuning.solvers import Constraints, SearchSpace, sqp
+from iblf_jax.tuning.solvers.sqp import solve_subproblem
+from iblf_jax.tuning.starts import DISTANCE, REACH, NearbyStarts, screened
 
 jax.config.update("jax_enable_x64", True)
 
@@ -56,7 +60,7 @@ def paper():
 
 @pytest.fixture(scope="module")
 def nominal(paper):
-    return _tune.build(paper, GAINS, objective(), None, 1, 0, "mean", SHORT)
+    return TuningProblem.build(paper, GAINS, objective(), **SHORT)
 
 
 def central(f, z, h=1e-5):
@@ -69,16 +73,12 @@ def central(f, z, h=1e-5):
 @pytest.mark.slow
 def test_forward_and_reverse_equal_finite_differences(nominal):
     z = nominal.box.z
-    lanes = nominal.lanes(z[None])
-    forward = problem.slope(nominal.shared, lanes, formulation=nominal.formulation)
-    reverse = problem.gradient(nominal.shared, lanes, formulation=nominal.formulation)
+    candidates = nominal.candidates(z[None])
+    forward = evaluation.forward_derivatives(nominal, candidates)
+    reverse = evaluation.reverse_derivatives(nominal, candidates)
 
     def loss(z):
-        return np.asarray(
-            problem.value(
-                nominal.shared, nominal.lanes(z[None]), formulation=nominal.formulation
-            ).loss[0]
-        )
+        return np.asarray(evaluation.value(nominal, nominal.candidates(z[None])).loss[0])
 
     expected = central(loss, z)
     scale = np.max(np.abs(expected))
@@ -92,21 +92,22 @@ def test_forward_and_reverse_equal_finite_differences(nominal):
 def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
     """The matrix of int |e1|^2 is 2 sum dt e1_u . e1_v (trapezoidal rule), with e1_u by finite
     differences of recorded runs."""
-    lanes = nominal.lanes(nominal.box.z[None])
-    found = problem.slope(nominal.shared, lanes, formulation=nominal.formulation)
+    candidates = nominal.candidates(nominal.box.z[None])
+    found = evaluation.forward_derivatives(nominal, candidates)
 
     def errors(z):
-        values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.formulation.blocks}
+        values = {p.path: np.exp(z[p.start : p.start + p.size]) for p in nominal.blocks}
         return np.asarray(ij.simulate(ij.with_parameters(paper, values), **SHORT).e1)
 
     J = central(errors, nominal.box.z)
     weights = np.full(J.shape[1], SHORT["dt"])
     weights[[0, -1]] /= 2
     expected = 2 * np.einsum("utn,t,vtn->uv", J, weights, J)
-    only = ij.objectives.Objective((nominal.shared.objective.terms[0],))
-    shared = nominal.shared._replace(objective=only)
-    formulation = nominal.formulation._replace(pieces=(1, nominal.formulation.pieces[-1]))
-    one = problem.slope(shared, lanes._replace(weights=np.ones((1, 1))), formulation=formulation)
+    only = ij.objectives.Objective((nominal.objective.terms[0],))
+    single = dataclasses.replace(
+        nominal, objective=only, piece_counts=(1, nominal.piece_counts[-1])
+    )
+    one = evaluation.forward_derivatives(single, candidates._replace(weights=np.ones((1, 1))))
     np.testing.assert_allclose(
         one.hessian[0] * only.terms[0].scale, expected, rtol=1e-5, atol=1e-9 * np.max(expected)
     )
@@ -119,15 +120,15 @@ def test_reverse_mode_remembers_few_states(paper):
     below 2 sqrt(T) states."""
     sizes = {}
     for steps in (500, 4000):
-        built = _tune.build(
-            paper, GAINS, objective(), None, 1, 0, "mean", {**SHORT, "duration": steps * 1e-3}
+        built = TuningProblem.build(
+            paper, GAINS, objective(), **{**SHORT, "duration": steps * 1e-3}
         )
-        compiled = problem.gradient.lower(
-            built.shared, built.lanes(built.box.z[None]), formulation=built.formulation
+        compiled = evaluation.reverse_derivatives.lower(
+            built, built.candidates(built.box.z[None])
         ).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
-    folds = problem.fold_of(built.shared.objective, jnp.float64)
-    inputs = Inputs(canonical(paper), folds, built.shared.dt, built.shared.dt)
+    folds = evaluation.fold_of(built.objective, jnp.float64)
+    inputs = Inputs(canonical(paper), folds, built.dt, built.dt)
     state = sum(
         x.size * x.dtype.itemsize
         for x in jax.tree.leaves(carry_shapes(Batch.of(inputs, None), "rk4"))
@@ -269,6 +270,32 @@ def test_a_quadratic_programme_is_solved_with_its_multipliers():
         assert np.all(slack > -1e-9) and np.all(y >= 0) and np.max(y * slack) < 1e-8
 
 
+SQUARE = Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0))
+
+
+class Evaluated:
+    """What a solver needs of an evaluator, around a function of z."""
+
+    def __init__(self, function, space, starts=1):
+        self.function, self.space = function, space
+        self.active = np.ones(starts, bool)
+
+    def __call__(self, z):
+        return self.function(z)
+
+
+def steps_of_sqp(function, space, start, steps, tolerance):
+    """The state of one start after some steps; one that has converged goes no further."""
+    solver, evaluate = SQP(tolerance=tolerance), Evaluated(function, space)
+    state = solver.init(space, np.array([start]))
+    for _ in range(steps):
+        solver.step(evaluate, state, tolerance)
+        evaluate.active = ~solver.converged(state)
+        if not evaluate.active.any():
+            break
+    return state[0]
+
+
 class TwoPieces:
     """An evaluator of (z0 - 2)^2 + (z1 - 2)^2 with g = the larger of z0^2 + z1^2 - 1 and z0 -
     `most`, in each of two runs, the second of which is further from its limit."""
@@ -280,9 +307,9 @@ class TwoPieces:
         loss, slope, none = np.sum((z - 2) ** 2, axis=1), 2 * (z - 2), z[:, :0]
         g = np.stack([np.sum(z**2, axis=1) - 1, z[:, 0] - self.most], axis=1)
         a = np.stack([2 * z, np.stack([np.ones(len(z)), np.zeros(len(z))], axis=1)], axis=2)
-        value = problem.Value(loss, loss, loss[:, None], none, none, loss, loss < np.inf, none)
+        value = Value(loss, loss, loss[:, None], none, none, loss, loss < np.inf, none)
         two = np.stack([g, g - 0.5], axis=1), np.stack([a, a], axis=1)
-        return problem.Slope(value, slope, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), *two)
+        return Derivatives(value, slope, np.broadcast_to(2 * np.eye(2), (len(z), 2, 2)), *two)
 
 
 @pytest.mark.parametrize(
@@ -293,41 +320,32 @@ def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
     """The optimum on a circle, and at the corner of a circle and a line; moved outwards where the
     mean of two runs counts."""
     box = Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0))
-    method = Newton(box, 1e-10, limits=Pieces.of((2,), (share,), 2), runs=2)
-    state = method.init(np.array([[3.0, -1.0]]))
-    for _ in range(12):
-        method.step(TwoPieces(most), state)
+    space = SearchSpace(box, Constraints.of((2,), (share,), 2))
+    state = steps_of_sqp(TwoPieces(most), space, [3.0, -1.0], 12, 1e-10)
     radius, x = np.sqrt(1 + shift), most + shift
     point = (
         np.array([x, np.sqrt(radius**2 - x**2)])
         if x < radius / np.sqrt(2)
         else np.full(2, radius / np.sqrt(2))
     )
-    np.testing.assert_allclose(state["z"][0], point, atol=2e-5)
+    np.testing.assert_allclose(state.z, point, atol=2e-5)
     gradients = np.array([2 * point, [1.0, 0.0]]).T
     y = np.linalg.lstsq(
         gradients if x < radius / np.sqrt(2) else gradients[:, :1], 2 * (2 - point), rcond=None
     )[0]
-    assert state["prices"][0, 0] == pytest.approx(y.sum(), rel=1e-3)
-    assert state["done"][0] and np.all(state["residuals"][0] < 1e-3)
+    assert state.multipliers[0] == pytest.approx(y.sum(), rel=1e-3)
+    assert state.done and np.all(state.residuals < 1e-3)
 
 
 def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
     """With room for one piece a requirement the one that leaves is forgotten, and the optimum is
     found all the same."""
-    monkeypatch.setattr(newton, "MOST_BENT", 1)
-    method = Newton(
-        Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)),
-        1e-10,
-        limits=Pieces.of((2,), (0.0,), 2),
-        runs=2,
-    )
-    state = method.init(np.array([[3.0, -1.0]]))
-    for _ in range(20):
-        method.step(TwoPieces(5.0), state)
-    assert state["bends"].shape == (1, 1, 2, 2)
-    np.testing.assert_allclose(state["z"][0], np.full(2, 0.5**0.5), atol=2e-5)
-    np.testing.assert_array_equal(state["places"][0], np.argmax(state["excess"][0]))
+    monkeypatch.setattr(sqp, "MOST_CURVATURES", 1)
+    space = SearchSpace(SQUARE, Constraints.of((2,), (0.0,), 2))
+    state = steps_of_sqp(TwoPieces(5.0), space, [3.0, -1.0], 20, 1e-10)
+    assert state.curvatures.shape == (1, 2, 2)
+    np.testing.assert_allclose(state.z, np.full(2, 0.5**0.5), atol=2e-5)
+    np.testing.assert_array_equal(state.curved, np.argmax(state.pieces))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])
@@ -336,16 +354,13 @@ def test_a_region_that_has_collapsed_is_no_optimum(sign):
     the step."""
 
     def evaluate(z):
-        value = problem.Value(np.sum(z**2, axis=1))
-        return problem.Slope(value, 2 * sign * z, np.zeros((len(z), 2, 2)))
+        value = Value(np.sum(z**2, axis=1))
+        return Derivatives(value, 2 * sign * z, np.zeros((len(z), 2, 2)))
 
-    method = Newton(Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)), 1e-6)
-    state = method.init(np.array([[3.0, -1.0]]))
-    for _ in range(40):
-        method.step(evaluate, state)
-    assert state["done"][0] and state["stuck"][0] == (sign < 0)
+    state = steps_of_sqp(evaluate, SearchSpace(SQUARE), [3.0, -1.0], 40, 1e-6)
+    assert state.done and state.stuck == (sign < 0)
     if sign > 0:
-        np.testing.assert_allclose(state["z"][0], 0.0, atol=1e-3)
+        np.testing.assert_allclose(state.z, 0.0, atol=1e-3)
 
 
 def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
@@ -355,21 +370,15 @@ def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
     class Both(TwoPieces):
         def __call__(self, z):
             found = super().__call__(z)
-            found.excess[:, :, 1], found.slopes[:, :, :, 1] = 1.5 - z[:, :1], np.array([-1.0, 0.0])
+            found.pieces[:, :, 1] = 1.5 - z[:, :1]
+            found.piece_gradients[:, :, :, 1] = np.array([-1.0, 0.0])
             return found
 
-    method = Newton(
-        Box(np.zeros(2), np.full(2, -4.0), np.full(2, 4.0)),
-        1e-8,
-        limits=Pieces.of((1, 1), (0.0, 0.0), 2),
-        runs=2,
-    )
-    state = method.init(np.array([[0.3, -0.7]]))
-    for _ in range(40):
-        method.step(Both(5.0), state)
-    assert state["done"][0]
-    np.testing.assert_allclose(state["z"][0], [1.0, 0.0], atol=1e-4)
-    assert state["residuals"][0, 1] == pytest.approx(0.5, abs=1e-4)
+    space = SearchSpace(SQUARE, Constraints.of((1, 1), (0.0, 0.0), 2))
+    state = steps_of_sqp(Both(5.0), space, [0.3, -0.7], 40, 1e-8)
+    assert state.done
+    np.testing.assert_allclose(state.z, [1.0, 0.0], atol=1e-4)
+    assert state.residuals[1] == pytest.approx(0.5, abs=1e-4)
 
 
 class Valleys:
@@ -382,7 +391,7 @@ class Valleys:
         a, b = self.LOW + np.sum((z + 1) ** 2, axis=1), self.DEEP + 3 * np.sum((z - 1) ** 2, axis=1)
         f, eye = np.minimum(a, b), np.eye(z.shape[1])
         gradient = np.where((a < b)[:, None], 2 * (z + 1), 6 * (z - 1))
-        value = problem.Value(
+        value = Value(
             f,
             f,
             f[:, None],
@@ -392,47 +401,55 @@ class Valleys:
             np.ones(len(z), bool),
         )
         hessian = np.where((a < b)[:, None, None], 2 * eye, 6 * eye)
-        return problem.Slope(
+        return Derivatives(
             value, gradient, hessian, -np.ones((len(z), 1, 1)), np.zeros((len(z), 1, z.shape[1], 1))
         )
 
 
 class Turns(Valleys):
-    """As a `CountedProblem`: only what is needed is counted."""
+    """As an `Evaluator`: only active starts are counted."""
 
-    def __init__(self):
-        self.evaluations, self.needed = 0, np.ones(2, bool)
-        self.lanes = SimpleNamespace(index=np.zeros((2, 1)), _replace=lambda **changes: self.lanes)
-        self.formulation = SimpleNamespace(shares=(0.0,))
-        self.shared = SimpleNamespace(
-            objective=objectives.tracking(), _replace=lambda **changes: self.shared
+    def __init__(self, space):
+        self.space = space
+        self.evaluations, self.active = 0, np.ones(2, bool)
+        self.candidates = SimpleNamespace(
+            index=np.zeros((2, 1)), _replace=lambda **changes: self.candidates
+        )
+        self.problem = SimpleNamespace(
+            allowed=(0.0,),
+            objective=objectives.tracking(),
+            with_objective=lambda objective: self.problem,
         )
 
     def __call__(self, z):
-        self.evaluations += int(self.needed.sum())
+        self.evaluations += int(self.active.sum())
         return super().__call__(z)
 
 
 def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 4.0))
     valleys = Valleys()
-    probes = Probes(lambda z: valleys(z).value, box, 0, lambda z: False)
-    assert probes.count == len(probes.points) == 14 * 7 and np.all(
-        np.abs(probes.points - box.z) <= REACH
+    nearby = NearbyStarts(lambda z: valleys(z).value, box, 0, lambda z: False)
+    assert nearby.count == len(nearby.points) == 14 * 7 and np.all(
+        np.abs(nearby.points - box.z) <= REACH
     )
-    first = probes.points[0]
-    assert np.sum((first + 1) ** 2) < np.sum((probes.points[-1] + 1) ** 2)
-    assert np.max(np.abs(probes.best(first[None]) - first)) > APART
-    # Told where to go on, it finds the deeper valley, and comes to its bottom.
-    problem_, method = Turns(), Newton(box, limits=Pieces.of((1,), (0.0,), 1))
-    loop = Loop(problem_, method, np.stack([first] * 2))
-    asked = []
-    loop.take_turns(lambda used: asked.append(used) or np.full(7, 0.5))
-    assert loop.run(60, tolerance=1e-5, patience=15, on_step=lambda loop: None) == "converged"
-    assert loop.best == 1 and loop.state["best_key"][1][1] == pytest.approx(Valleys.DEEP)
-    np.testing.assert_allclose(asked[0], [first, -np.ones(7)], atol=1e-2)
+    first = nearby.points[0]
+    assert np.sum((first + 1) ** 2) < np.sum((nearby.points[-1] + 1) ** 2)
+    assert np.max(np.abs(nearby.away_from(first[None]) - first)) > DISTANCE
+    # From a second start that is given to it, it finds the deeper valley, and its minimum.
+    evaluate = Turns(SearchSpace(box, Constraints.of((1,), (0.0,), 1)))
+    calls = []
+    search = Search(
+        evaluate,
+        SQP(),
+        np.stack([first] * 2),
+        second_start=lambda used: calls.append(used) or np.full(7, 0.5),
+    )
+    assert search.run(60) == "converged"
+    assert search.best == 1 and search.state["best_key"][1][1] == pytest.approx(Valleys.DEEP)
+    np.testing.assert_allclose(calls[0], [first, -np.ones(7)], atol=1e-2)
     # One at a time: as many values as steps.
-    assert problem_.evaluations == len(loop.history["z"]) <= 40
+    assert evaluate.evaluations == len(search.history["z"]) <= 40
 
 
 # ---------------------------------------------------------------------------------------------------------------- the loop
@@ -500,7 +517,7 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
         wanted = (
             objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(limit)
         )
-        return ij.tune(paper, gains, wanted, tolerance=1e-7, **SHORT)
+        return ij.tune(paper, gains, wanted, solver=SQP(1e-7), **SHORT)
 
     tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
     price = (tight.objective - loose.objective) / 0.18
@@ -560,7 +577,7 @@ class Cliff:
     def __call__(self, z):
         loss = np.where(z[:, 0] > 1, np.nan, -z[:, 0])
         valid = np.isfinite(loss)
-        value = problem.Value(
+        value = Value(
             np.where(valid, loss, np.inf),
             loss,
             loss[:, None],
@@ -570,18 +587,21 @@ class Cliff:
             valid,
             loss,
         )
-        return problem.Slope(
+        return Derivatives(
             value, np.where(valid[:, None], -np.ones_like(z), np.nan), np.zeros((len(z), 1, 1))
         )
 
 
-@pytest.mark.parametrize("name", ["newton", "adam"])
-def test_steps_that_are_not_finite_are_rejected(name):
-    box = Box(np.zeros(1), np.array([-1.0]), np.array([3.0]))
-    method = _tune.make_method(name, box, 60, 1e-6, 0.5)
-    state, reached = method.init(np.zeros((1, 1))), -np.inf
+@pytest.mark.parametrize(
+    "solver", [SQP(1e-6), Adam(learning_rate=0.5)], ids=lambda solver: solver.name
+)
+def test_steps_that_are_not_finite_are_rejected(solver):
+    space = SearchSpace(Box(np.zeros(1), np.array([-1.0]), np.array([3.0])), iterations=60)
+    evaluate = Evaluated(Cliff(), space)
+    state, reached = solver.init(space, np.zeros((1, 1))), -np.inf
     for _ in range(60):
-        z, found = method.step(Cliff(), state)
+        z, found = solver.step(evaluate, state, solver.tolerance)
+        evaluate.active = ~solver.converged(state)
         assert np.all(np.isfinite(z))
         reached = max(reached, z[0, 0]) if found.value.valid[0] else reached
     assert 0.9 < reached <= 1.0
@@ -591,97 +611,100 @@ class Bowl:
     """An evaluator of a narrow bent valley with its bottom at `BOTTOM`, not finite where z0 > 1."""
 
     evaluations = 0
+    active = np.ones(1, bool)
     bottom = np.array([0.4, -0.3])
 
     @staticmethod
-    def derive(shared, lanes):
+    def derivatives(problem, candidates):
         def loss(z):
             x = z - Bowl.bottom
             return jnp.where(z[0] > 1, jnp.nan, x[0] ** 2 + 30 * (x[1] - x[0] ** 2) ** 2)
 
-        value, gradient = jax.vmap(jax.value_and_grad(loss))(lanes.z)
+        value, gradient = jax.vmap(jax.value_and_grad(loss))(candidates.z)
         valid = jnp.isfinite(value)
-        empty = lanes.z[:, :0]
-        found = problem.Value(
+        empty = candidates.z[:, :0]
+        found = Value(
             jnp.where(valid, value, jnp.inf), value, empty, empty, empty, value, valid, empty
         )
-        return problem.Slope(found, gradient, jnp.zeros((len(value), 2, 2)))
+        return Derivatives(found, gradient, jnp.zeros((len(value), 2, 2)))
 
     def row(self, s):
-        return None, problem.Lane(
+        return None, Candidate(
             jnp.zeros((1, 2)), jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.zeros((1, 0)), jnp.ones(1)
         )
 
     def __call__(self, z):
-        return jax.tree.map(
-            np.asarray, self.derive(None, self.row(0)[1]._replace(z=jnp.asarray(z)))
-        )
+        candidates = self.row(0)[1]._replace(z=jnp.asarray(z))
+        return jax.tree.map(np.asarray, self.derivatives(None, candidates))
 
 
 @pytest.mark.slow
 def test_lbfgs_finds_the_bottom_of_a_valley_beside_a_wall():
     box = Box(np.array([-1.0, 2.0]), np.array([-3.0, -3.0]), np.array([3.0, 3.0]))
-    method, bowl = _tune.make_method("lbfgs", box, 60, 1e-12, 0.1), Bowl()
-    state = method.init(box.z[None])
+    solver, bowl = LBFGS(tolerance=1e-12), Bowl()
+    bowl.space = SearchSpace(box)
+    state = solver.init(bowl.space, box.z[None])
     for _ in range(40):
-        z, found = method.step(bowl, state)
+        z, found = solver.step(bowl, state, solver.tolerance)
+        bowl.active = ~solver.converged(state)
         assert found.value.valid[0]
     np.testing.assert_allclose(z[0], Bowl.bottom, atol=1e-6)
-    assert state["done"][0] and 10 < bowl.evaluations < 400
+    assert solver.converged(state)[0] and 10 < bowl.evaluations < 400
 
 
 class Corner:
     """An evaluator of max(x, -2 x), x = z - 0.3, smoothed as its objective says: the smooth maximum
     has its bottom elsewhere."""
 
-    def __init__(self, starts):
-        goal = jax.tree.map(jnp.asarray, objectives.peak_torque(1.0, smoothing=0.2))
-        self.shared = problem.ProblemInputs(None, goal, jnp.asarray(1e-3))
-        self.formulation = problem.Formulation((), (), 1, "euler", Risk("mean"), ())
-        self.lanes = problem.Lane(
+    def __init__(self, space, starts):
+        self.space = space
+        self.problem = self
+        self.objective = jax.tree.map(jnp.asarray, objectives.peak_torque(1.0, smoothing=0.2))
+        self.allowed = ()
+        self.candidates = Candidate(
             np.zeros((starts, 1)),
             np.zeros((starts, 1), np.uint32),
             np.ones((starts, 1)),
             np.zeros((starts, 0)),
             1.0,
         )
-        self.needed, self.evaluations = np.ones(starts, bool), 0
+        self.active, self.evaluations = np.ones(starts, bool), 0
+
+    def with_objective(self, objective):
+        self.objective = objective
+        return self
 
     def __call__(self, z):
-        T = float(self.shared.objective.terms[0].quantity.smoothing)
+        T = float(self.objective.terms[0].quantity.smoothing)
         y, slope = np.concatenate([z - 0.3, -2 * (z - 0.3)], axis=1), np.array([1.0, -2.0])
         exact, weight = y.max(axis=1), np.exp((y - y.max(axis=1, keepdims=True)) / T)
         loss = exact + T * np.log(weight.sum(axis=1))
         weight /= weight.sum(axis=1, keepdims=True)
         mean = weight @ slope
         curved = (weight @ slope**2 - mean**2) / T
-        self.evaluations += int(self.needed.sum())
+        self.evaluations += int(self.active.sum())
         none = np.zeros((len(z), 0))
-        value = problem.Value(
+        value = Value(
             loss,
             exact,
             exact[:, None],
             none,
             none,
             np.ones(len(z)),
-            self.needed.copy(),
+            self.active.copy(),
             exact[:, None],
         )
-        return problem.Slope(value, mean[:, None], curved[:, None, None])
+        return Derivatives(value, mean[:, None], curved[:, None, None])
 
 
 def followed(starts, sharpenings, steps=60, resumed=None, stop=None):
-    box = Box(np.zeros(1), np.full(1, -3.0), np.full(1, 3.0))
-    loop = Loop(
-        Corner(len(starts)),
-        _tune.make_method("newton", box, 60, 1e-6, 0.1),
-        np.asarray(starts)[:, None],
-        sharpenings=sharpenings,
-    )
+    space = SearchSpace(Box(np.zeros(1), np.full(1, -3.0), np.full(1, 3.0)))
+    solver = SQP(1e-6, sharpenings=sharpenings, patience=60)
+    search = Search(Corner(space, len(starts)), solver, np.asarray(starts)[:, None])
     if resumed:
-        load_checkpoint(resumed, loop, "mark")
-    loop.run(stop or steps, tolerance=1e-6, patience=60, on_step=lambda _: None)
-    return loop
+        load_checkpoint(resumed, search, "mark")
+    search.run(stop or steps)
+    return search
 
 
 def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path):
@@ -690,7 +713,7 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
     assert abs(blurred.state["best_z"][0, 0] - 0.3) > 0.02
     assert abs(sharp.state["best_z"][np.argmin(sharp.state["best_key"][:, 1]), 0] - 0.3) < 2e-3
     assert sharp.state["retired"].sum() == 3 and sharp.state["stage"] == 4
-    assert sharp.evaluator.evaluations < 0.6 * len(starts) * len(sharp.history["loss"])
+    assert sharp.evaluate.evaluations < 0.6 * len(starts) * len(sharp.history["loss"])
     half = followed(starts, 4, stop=len(sharp.history["loss"]) // 2)
     assert 0 < half.state["stage"] < 4
     save_checkpoint(half, tmp_path / "half.npz", "mark")
@@ -700,39 +723,40 @@ def test_a_smoothed_peak_is_followed_to_where_the_peak_itself_is_lowest(tmp_path
 
 
 @pytest.mark.slow
-def test_only_needed_starts_are_evaluated_in_groups_of_one_shape(nominal):
-    lanes = nominal.lanes(np.arange(20.0)[:, None] * np.ones(6))
-    evaluator, shapes = CountedProblem(nominal.formulation, nominal.shared, lanes, "forward"), set()
+def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal):
+    candidates = nominal.candidates(np.arange(20.0)[:, None] * np.ones(6))
+    evaluator = Evaluator(nominal, candidates, "forward", nominal.search_space(60))
+    shapes = set()
 
-    def derive(shared, lanes):
-        shapes.add(lanes.z.shape)
-        z, valid = np.asarray(lanes.z), np.ones(len(lanes.z), bool)
-        return problem.Slope(problem.Value(*[z[:, 0]] * 6, valid, z), z, z[:, :, None])
+    def derivatives(problem, candidates):
+        shapes.add(candidates.z.shape)
+        z, valid = np.asarray(candidates.z), np.ones(len(candidates.z), bool)
+        return Derivatives(Value(*[z[:, 0]] * 6, valid, z), z, z[:, :, None])
 
-    evaluator.derive = derive
-    evaluator.needed[[3, 7]] = False
-    found = evaluator(lanes.z)
+    evaluator.derivatives = derivatives
+    evaluator.active[[3, 7]] = False
+    found = evaluator(candidates.z)
     assert shapes == {(16, 6)} and evaluator.evaluations == 18
     np.testing.assert_array_equal(
-        found.value.loss, np.where(evaluator.needed, np.arange(20.0), np.inf)
+        found.value.loss, np.where(evaluator.active, np.arange(20.0), np.inf)
     )
-    np.testing.assert_array_equal(found.value.valid, evaluator.needed)
+    np.testing.assert_array_equal(found.value.valid, evaluator.active)
 
 
 @pytest.mark.slow
-def test_lbfgs_tunes_the_paper_as_well_as_newton(paper):
-    best = ij.tune(paper, GAINS, objective(), optimiser="lbfgs", iterations=40, **SHORT)
-    newton = ij.tune(paper, GAINS, objective(), iterations=30, **SHORT)
+def test_lbfgs_tunes_the_paper_as_well_as_sqp(paper):
+    best = ij.tune(paper, GAINS, objective(), solver=LBFGS(), iterations=40, **SHORT)
+    by_sqp = ij.tune(paper, GAINS, objective(), iterations=30, **SHORT)
     assert best.optimiser == "lbfgs"
-    assert best.objective < 1.01 * newton.objective
+    assert best.objective < 1.01 * by_sqp.objective
 
 
 @pytest.mark.slow
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypatch):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
     assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["valid"].all()
-    # Who is refused does not wait for derivatives: values tell.
-    monkeypatch.setattr(problem, "slope", None)
+    # An error does not wait for derivatives: it follows from values.
+    monkeypatch.setitem(evaluation.DERIVATIVES, "forward", None)
     with pytest.raises(ValueError, match=r"Take dt=\S+, not 0.001 s"):
         ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
 
@@ -740,20 +764,20 @@ def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypa
 def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeypatch):
     """The nominal run may be fine where some perturbed ones are not: dry friction of a narrow width
     is what no gain makes slower."""
-    lane = jax.tree.map(lambda x: x[0], nominal.lanes(nominal.box.z[None]))
+    candidate = jax.tree.map(lambda x: x[0], nominal.candidates(nominal.box.z[None]))
     status = np.array([0, int(ij.Status.STEP_TOO_LARGE), 0, int(ij.Status.BOUND_VIOLATED)])
-    smooth = np.ones((4, len(nominal.shared.objective.quantities) + 1))
+    smooth = np.ones((4, len(nominal.objective.quantities) + 1))
     smooth[2, 0] = np.nan
-    found = problem._value(nominal.formulation, nominal.shared, lane, smooth, smooth, status)
+    found = evaluation.value_of_start(nominal, candidate, smooth, smooth, status)
     assert not found.valid and float(found.trusted) == 0.5
-    monkeypatch.setattr(nominal, "runs", 4)
-    monkeypatch.setattr(nominal, "step", lambda: 2e-4)
+    perturbed = dataclasses.replace(nominal, runs=4)
     seen = jax.tree.map(lambda x: np.asarray(x)[None], found)
-    monkeypatch.setattr(nominal, "values", lambda z: seen)
+    monkeypatch.setattr(TuningProblem, "suggested_dt", lambda self: 2e-4)
+    monkeypatch.setattr(TuningProblem, "values", lambda self, z: seen)
     with pytest.raises(
         ValueError, match=r"only 2 of 4 runs can be integrated.*Take dt=0.0002, not 0.001 s"
     ):
-        _tune.look_around(nominal, 0, nominal.box.z[None])
+        screened(perturbed, 0, nominal.box.z[None])
 
 
 # ---------------------------------------------------------------------------------------------------------------- robust
@@ -769,7 +793,7 @@ def robust(paper):
         runs=8,
         risk=ij.cvar(0.75),
         iterations=8,
-        report_runs=256,
+        report=ij.tuning.Report(runs=256),
         **SHORT,
     )
 
@@ -810,14 +834,16 @@ def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
         objectives.tracking(),
         perturbations=DRAWS,
         runs=4,
-        starts=2,
-        resample=True,
+        solver=Adam(starts=2, resample=True),
         iterations=3,
         **SHORT,
     )
     assert best.optimiser == "adam"
     assert best.history["loss"].shape == (3, 2)
-    with pytest.raises(ValueError, match="adam"):
+    with (
+        pytest.warns(DeprecationWarning, match="optimiser"),
+        pytest.raises(ValueError, match="Adam"),
+    ):
         ij.tune(
             paper,
             GAINS,
@@ -834,13 +860,20 @@ def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
 def test_common_random_numbers(paper):
     """The same draws for every start and every step; other seeds give others."""
     built = [
-        _tune.build(paper, GAINS, objectives.tracking(scale=1.0), DRAWS, 4, seed, "mean", SHORT)
+        TuningProblem.build(
+            paper,
+            GAINS,
+            objectives.tracking(scale=1.0),
+            perturbations=DRAWS,
+            runs=4,
+            seed=seed,
+            **SHORT,
+        )
         for seed in (0, 0, 1)
     ]
     z = np.stack([built[0].box.z] * 2)
     losses = [
-        np.asarray(CountedProblem(p.formulation, p.shared, p.lanes(z), "forward")(z).value.loss)
-        for p in built
+        Evaluator(p, p.candidates(z), "forward", p.search_space(60))(z).value.loss for p in built
     ]
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
 
@@ -852,9 +885,9 @@ import sys, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np, iblf_jax as ij
 o = ij.objectives
-slow = (lambda loop: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
+slow = (lambda search: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
 best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11),
-               duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], callback=slow)
+               duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], progress=slow)
 np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best.values.items()})
 """
 
@@ -913,12 +946,17 @@ def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
 def test_a_share_of_many_runs_is_in_the_programme(runs, share):
     """All runs break g = z + 0.2 < 0, and the objective pulls z up: the step has to go down,
     whatever the number of the worst."""
-    pieces = Pieces.of((1,), (share,), runs)
-    excess, slopes = np.full((runs, 1), 0.2), np.ones((runs, 1, 1))
-    found = planned(
-        np.array([-1.0]), np.eye(1), np.array([-1.0]), np.array([1.0]), pieces, excess, slopes, 10.0
+    found = solve_subproblem(
+        np.array([-1.0]),
+        np.eye(1),
+        np.array([-1.0]),
+        np.array([1.0]),
+        Constraints.of((1,), (share,), runs),
+        pieces=np.full((runs, 1), 0.2),
+        piece_gradients=np.ones((runs, 1, 1)),
+        penalty=10.0,
     )
     np.testing.assert_allclose(found.step, -0.2, atol=1e-4)
     np.testing.assert_allclose(
-        found.prices, 1.2, rtol=1e-3
+        found.multipliers, 1.2, rtol=1e-3
     )  # 1 - z, what the objective's slope is there

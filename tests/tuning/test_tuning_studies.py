@@ -11,8 +11,9 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.simulation.paths import get
-from iblf_jax.tuning import _pareto, _tune, problem
+from iblf_jax.tuning import _pareto, evaluation
 from iblf_jax.tuning._pareto import Front, non_dominated
+from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.result import TuneResult
 
 jax.config.update("jax_enable_x64", True)
@@ -107,7 +108,7 @@ def test_pareto_is_a_front(paper, front):
         / ij.simulate(paper, **SHORT).metrics.ise.sum()
     )
     assert float(again) == pytest.approx(a[0], rel=1e-9)
-    with pytest.raises(ValueError, match="one plain term"):
+    with pytest.raises(ValueError, match="one term each"):
         ij.pareto(
             paper,
             ["controller.k1"],
@@ -136,12 +137,12 @@ def test_a_front_has_its_ends_and_no_gaps(paper):
     )
     pair = (ij.objectives.tracking(), ij.objectives.effort() + limit)
     front = ij.pareto(paper, gains, pair, iterations=12, progress=False, **SHORT)
-    built = _tune.build(paper, gains, pair[0] + pair[1], None, 1, 0, "mean", SHORT)
+    built = TuningProblem.build(paper, gains, pair[0] + pair[1], **SHORT)
     axes = (
         np.linspace(low, high, 40) for low, high in zip(built.box.low, built.box.high, strict=True)
     )
     z = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    seen = problem.value(built.shared, built.lanes(z), formulation=built.formulation)
+    seen = evaluation.value(built, built.candidates(z))
     kept = np.asarray(seen.valid & (seen.margin > 0) & (seen.exact_excess[:, 0] <= 0))
     assert 0 < np.sum(kept) < len(z)
     grid = np.asarray(seen.terms)[kept]
@@ -157,19 +158,22 @@ def test_a_front_has_its_ends_and_no_gaps(paper):
 
 def test_a_front_asks_for_the_middle_of_its_largest_gap_once():
     """What no level fills is a gap of the front, and is not asked for again."""
-    search = _pareto.Search(SimpleNamespace(box=SimpleNamespace(z=np.zeros(1))), 8, 1, 0.0)
+    search = _pareto.FrontSearch(SimpleNamespace(box=SimpleNamespace(z=np.zeros(1))), 8, 1, 0.0)
     search.z, search.terms, search.nodes = (
         np.array([[0.0], [1.0], [3.0]]),
         np.exp([[0.0, 9.0], [1.0, 5.0], [1.5, 0.0]]),
         [0, 1, 2],
     )
-    z, aims, levels = search.largest_gaps(8)
-    np.testing.assert_array_equal((z[:, 0], aims, levels), ([2.0, 0.5], [0, 0], [2.5, 7.0]))
-    search.asked = [(1, 2.5), (1, 7.0)]
-    z, aims, levels = search.largest_gaps(8)
-    np.testing.assert_array_equal((z[:, 0], aims, levels), ([0.5, 2.0], [1, 1], [0.5, 1.25]))
-    search.asked += [(0, 0.5), (0, 1.25)]
-    assert search.largest_gaps(8) is None
+
+    def gaps():
+        found = search.largest_gaps(8)
+        return [[gap.z[0], gap.objective, gap.level] for gap in found]
+
+    np.testing.assert_array_equal(gaps(), [[2.0, 0, 2.5], [0.5, 0, 7.0]])
+    search.levels = [(1, 2.5), (1, 7.0)]
+    np.testing.assert_array_equal(gaps(), [[0.5, 1, 0.5], [2.0, 1, 1.25]])
+    search.levels += [(0, 0.5), (0, 1.25)]
+    assert gaps() == []
 
 
 def test_non_dominated():
@@ -186,9 +190,10 @@ method = "euler"
 parameters = ["controller.k1", { path = "controller.K2", low = 0.6, high = 30.0, tied = true }]
 iterations = 4
 runs = 4
-report_runs = 64
 risk = "cvar"
 level = 0.75
+[tune.report]
+runs = 64
 [[objective]]
 kind = "tracking"
 [[objective]]
@@ -357,7 +362,12 @@ def tuned(paper, tmp_path_factory):
     return folder
 
 
-BRIEF = {"duration": 0.01, "iterations": 1, "report_runs": 2, "progress": False}
+BRIEF = {
+    "duration": 0.01,
+    "iterations": 1,
+    "report": ij.tuning.Report(runs=2),
+    "progress": False,
+}
 
 
 @pytest.mark.slow

@@ -1,0 +1,387 @@
+"""Reconstruction of every step of a run from its recorded samples, with the proof terms of each.
+
+A recorded sample holds the complete state of the loop. The steps between two samples are therefore
+integrated again from the first, and must arrive at the second; and the recorded signals must be
+those that the scenario gives there. If not, the run is refused, because a certificate would be
+about another loop. Rounding differences (another backend, another machine) are tolerated; the
+restart at every sample keeps them small.
+
+A run whose status makes its numbers meaningless is not reconstructed: its recorded samples are used
+as they are.
+
+This is the only module of the package that runs the engine step by step. It works in blocks of
+`BLOCK_STEPS` steps, so that one compiled program serves runs of every length.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
+from iblf_jax.core import checks
+from iblf_jax.core.status import UNTRUSTED, Status, describe
+from iblf_jax.engine import run_from
+from iblf_jax.simulation import jumps
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation.scenario import Scenario
+
+BLOCK_STEPS = 1024
+"""Steps in a block: memory does not grow with the length of a run, and one program serves every
+length."""
+POSITIONS, SPEEDS = ("q", "q_d", "lower", "upper"), ("dq", "alpha")
+TORQUES = ("tau", "disturbance", "disturbance_estimate")
+STATES = (
+    ("q", "q", "position"),
+    ("dq", "dq", "speed"),
+    ("controller", "controller_state", "torque"),
+    ("observer", "observer_state", "torque"),
+)
+"""Field of `LoopState`, name of the recorded signal, and kind of its tolerance."""
+
+
+class TimeGrid(NamedTuple):
+    """The steps of a run."""
+
+    every: int
+    """Steps from one recorded sample to the next."""
+    last: int
+    """Number of the last step."""
+    duration: float
+    """[s]."""
+
+
+class Steps(NamedTuple):
+    """Consecutive steps of a run, on the host; time axis first."""
+
+    t: np.ndarray
+    sample: Any
+    """`Sample` at each step."""
+    proof: Any
+    """`ProofTerms` at each step."""
+    recorded: np.ndarray
+    """Whether the run recorded the step, bool."""
+    defect: np.ndarray
+    """Error of the integrator in V2 over one step from each."""
+    defect_f: np.ndarray
+    """Error of the integrator in |f_tilde|^2/2 over one step from each."""
+
+
+def is_valid(run: Any) -> bool:
+    """Whether the status of a run leaves its numbers meaningful."""
+    return not int(run.status) & int(UNTRUSTED)
+
+
+def time_grid(run: Any) -> TimeGrid:
+    """The steps of a run; ValueError if its samples do not determine them."""
+    t, dt = np.asarray(run.t, float), float(run.dt)
+    every = int(np.rint((t[1] - t[0]) / dt)) if t.size > 1 else (run.steps or 0) + 1
+    tolerance = 16 * np.finfo(np.asarray(run.t).dtype).eps * max(abs(t[-1]), dt)
+    if every < 1 or not np.all(np.abs(t - np.arange(t.size) * every * dt) <= tolerance):
+        raise checks.fail(
+            "run.t",
+            run.t,
+            f"0 and whole multiples of run.dt, {dt:g} s, at equal distances",
+            "Simulate it again.",
+        )
+    last_recorded = (t.size - 1) * every
+    last = last_recorded if run.steps is None else run.steps
+    if not last > 0 or not 0 <= last - last_recorded < every:
+        raise checks.fail(
+            "run",
+            f"{t.size} recorded samples of {run.steps} steps",
+            "samples that cover the run",
+            "Simulate it again with record_every so small that there are two.",
+        )
+    return TimeGrid(every, last, last * dt)
+
+
+def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
+    """All steps of one run, its arrays on the host, in order, in blocks.
+
+    Raises:
+      ValueError: the scenario of the run does not give what the run recorded.
+    """
+    valid, sizes = is_valid(run), tolerances(run)
+    blocks = _integrated_again(run, grid) if valid else _as_recorded(run, grid)
+    for index, states in blocks:
+        steps = _with_proof(run, index, states, grid)
+        if valid:
+            _check_signals(run, steps, index[steps.recorded] // grid.every, sizes)
+        yield steps
+
+
+# --- the states of all steps ---------------------------------------------------------------------
+
+
+def _recorded_states(run: Any) -> LoopState:
+    """The states at the recorded samples."""
+    return LoopState(run.q, run.dq, run.controller_state, run.observer_state, run.actuator_state)
+
+
+def _rows(tree: Any, rows: Any) -> Any:
+    """Some rows of every array of a pytree."""
+    return jax.tree.map(lambda x: x[rows], tree)
+
+
+def _as_recorded(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
+    """Numbers and states of the recorded steps only."""
+    states = _recorded_states(run)
+    for first in range(0, run.t.size, BLOCK_STEPS):
+        rows = np.arange(first, min(first + BLOCK_STEPS, run.t.size))
+        yield rows * grid.every, _rows(states, rows)
+
+
+def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
+    """Numbers and states of all steps, integrated again from each recorded sample to the next.
+
+    A block holds the intervals of several samples where these are short, and a part of one interval
+    where it is long.
+    """
+    recorded, count, every = _recorded_states(run), run.t.size, grid.every
+    intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)
+    start = jax.tree.map(lambda x: np.asarray(x)[None], initial_state(run.scenario))
+    _check_arrival(run, _rows(recorded, slice(0, 1)), start, np.zeros(1, int))
+    for first_row in range(0, count, intervals):
+        numbers = np.arange(first_row, first_row + intervals)
+        rows = np.minimum(numbers, count - 1)  # the last block repeats the last sample
+        states = _rows(recorded, rows)
+        for offset in range(0, every, length):
+            first = rows * every + offset
+            states, path = _advance(run, first, states, length)
+            index = first[:, None] + np.arange(length)
+            in_interval = np.arange(offset, offset + length) < every
+            keep = (numbers < count)[:, None] & in_interval & (index <= grid.last)
+            if not keep.any():
+                return
+            path = jax.tree.map(np.asarray, path)
+            yield index[keep], _rows(path, keep)
+        # The last part of an interval may be shorter than `length`: its end lies on the path.
+        arrived, rest = jax.tree.map(np.asarray, states), every - offset
+        if rest < length:
+            arrived = _rows(path, (slice(None), rest))
+        has_next = numbers < count - 1
+        following = rows[has_next] + 1
+        _check_arrival(run, _rows(recorded, following), _rows(arrived, has_next), following)
+
+
+# --- steps of the engine -------------------------------------------------------------------------
+
+
+class Position(NamedTuple):
+    """A state of a run and its time, as a number of steps of a size."""
+
+    steps: jax.Array
+    """(), a float."""
+    size: jax.Array
+    """() [s]."""
+    state: LoopState
+
+
+@dataclasses.dataclass(frozen=True)
+class ObserveStep:
+    """A step of the engine that keeps its position and records the proof terms there."""
+
+    is_derivative: ClassVar[bool] = True
+
+    def __call__(self, inputs, at: Position, index: jax.Array, form):
+        """The position, and its `terms_and_sample`."""
+        return at, terms_and_sample(inputs.scenario, at.steps * at.size, at.state)
+
+
+@dataclasses.dataclass(frozen=True)
+class AdvanceStep:
+    """A step of the engine that makes the run's own step, of any size, and records the state, V2
+    and |f_tilde|^2/2 before it.
+    """
+
+    method: str
+
+    def __call__(self, inputs, at: Position, index: jax.Array, form):
+        """The position after the step; the state, V2 and |f_tilde|^2/2 before it."""
+        number = at.steps + index.astype(at.steps.dtype)
+        span = jumps.Span(number * at.size, (number + 1.0) * at.size, at.size)
+        division = jumps.divided(inputs.scenario.jump_times(), span)
+        result = jumps.integrated(
+            self.method,
+            partial(evaluate, inputs.scenario),
+            division,
+            at.state,
+            rolled=form.rolled,
+        )
+        f_tilde = result.first.disturbance - result.first.disturbance_estimate
+        levels = (result.first.V, 0.5 * jnp.sum(f_tilde**2))
+        return at._replace(state=result.state), (at.state, levels)
+
+
+def _positions(index: np.ndarray, states: LoopState, dt: Any, parts: int = 1) -> Position:
+    """Positions of some steps, in time steps of dt divided by `parts`."""
+    dtype = np.asarray(dt).dtype
+    steps = (parts * index).astype(dtype)
+    size = np.full(index.shape, float(dt) / parts, dtype)
+    return Position(jax.device_put(steps), jax.device_put(size), states)
+
+
+def _advance(
+    run: Any, first: np.ndarray, states: LoopState, length: int
+) -> tuple[LoopState, LoopState]:
+    """States after `length` steps from each of some states, and along the way."""
+    at = _positions(first, states, run.dt)
+    end, (path, _) = run_from(run.scenario, run.dt, at, step=AdvanceStep(run.method), steps=length)
+    return end.state, path
+
+
+def padded_index(size: int) -> np.ndarray:
+    """Indices of an array of this size, the last one repeated up to the size of a block, so that
+    one compiled program serves blocks of every size.
+    """
+    return np.minimum(np.arange(BLOCK_STEPS), size - 1)
+
+
+def _with_proof(run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid) -> Steps:
+    """The steps with their proof terms."""
+    size, padded = index.size, padded_index(index.size)
+    t = index.astype(run.t.dtype) * run.dt
+    padded_states = _rows(jax.tree.map(np.asarray, states), padded)
+    found = proof_along(run.scenario, index[padded], padded_states, run.dt, method=run.method)
+    proof, sample, defect, defect_f = _rows(found, slice(0, size))
+    return Steps(t, sample, proof, index % grid.every == 0, defect, defect_f)
+
+
+def proof_along(
+    scenario: Scenario, index: np.ndarray, states: LoopState, dt: jax.Array, *, method: str
+):
+    """Proof terms, samples and integration errors at some steps of a run.
+
+    Args:
+      scenario: canonical.
+      index: numbers of the steps, (T,).
+      states: the states before them, (T, ...).
+      dt, method: of the run.
+
+    Returns:
+      `ProofTerms`, `Sample`, and the errors of the integrator in V2 and in |f_tilde|^2/2 over one
+      step, on the host; (T, ...) each.
+    """
+    full, halves = (_positions(index, states, dt, parts) for parts in (1, 2))
+    found = run_from(scenario, dt, full, step=ObserveStep())[1]
+    # One step is compared with two half steps, because the envelopes are compared with a run in
+    # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
+    # they are one call of one program.
+    both = jax.tree.map(lambda *xs: np.concatenate(xs), full, halves)
+    levels = run_from(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
+    terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
+    eigenvalues = _eigenvalues(M0)
+    proof = ProofTerms(
+        **terms,
+        lambda_min=eigenvalues[:, 0],
+        lambda_max=eigenvalues[:, -1],
+        slowest=1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1],
+    )
+    return proof, sample, *map(_defect, levels)
+
+
+def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
+    """Eigenvalues of symmetric matrices, ascending, (T, n); NaN where a matrix is not finite, for
+    which NumPy would raise.
+    """
+    finite = np.all(np.isfinite(matrices), axis=(1, 2), keepdims=True)
+    unit = np.eye(matrices.shape[-1])
+    return np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, matrices, unit)), np.nan)
+
+
+def _defect(level: jax.Array) -> np.ndarray:
+    """Difference of a level after one step and after two half steps, (T,), from its values along
+    both, (2 T, 3); twice, for safety.
+    """
+    full, halves = np.split(np.asarray(level), 2)
+    return 2.0 * np.abs(full[:, 1] - halves[:, 2])
+
+
+# --- comparison with what the run recorded -------------------------------------------------------
+
+
+def tolerances(run: Any) -> dict[str, float]:
+    """Admissible differences between recorded and reconstructed signals, by kind [rad, rad/s,
+    N m].
+    """
+
+    def largest(names):
+        return max(float(np.max(np.abs(getattr(run, name)), initial=0.0)) for name in names)
+
+    relative = np.sqrt(np.finfo(run.q.dtype).eps)
+    position, torque = largest(POSITIONS), largest(TORQUES)
+    # The speeds of a loop at rest are rounding errors, so positions set their scale, too.
+    return {
+        "position": relative * position,
+        "speed": relative * max(largest(SPEEDS), position),
+        "torque": relative * torque,
+    }
+
+
+def _check_arrival(run: Any, recorded: LoopState, made: LoopState, rows: np.ndarray) -> None:
+    """Raises ValueError if the reconstructed states are not those that the run recorded."""
+    sizes = tolerances(run)
+    expected, reached = recorded._asdict(), made._asdict()
+    for field, label, kind in STATES:
+        leaves = (jax.tree.leaves(expected[field]), jax.tree.leaves(reached[field]))
+        for kept, again in zip(*leaves, strict=True):
+            tolerance = sizes[kind]
+            if label.endswith("state"):
+                # A state of law or observer has its own unit, hence its own scale if larger.
+                own = np.max(np.abs(kept), initial=0.0)
+                tolerance = max(tolerance, np.sqrt(np.finfo(kept.dtype).eps) * own)
+            _compare(run, label, kept, again, rows, tolerance)
+
+
+def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, float]) -> None:
+    """Raises ValueError if the signals of the scenario at recorded states are not those that the
+    run recorded.
+    """
+    for names, kind in ((POSITIONS, "position"), (SPEEDS, "speed"), (TORQUES, "torque")):
+        for name in names:
+            kept = getattr(run, name)[rows]
+            again = getattr(steps.sample, name)[steps.recorded]
+            _compare(run, name, kept, again, rows, sizes[kind])
+
+
+def _compare(
+    run: Any, name: str, kept: np.ndarray, made: np.ndarray, rows: np.ndarray, tolerance: float
+) -> None:
+    """Raises ValueError if a reconstructed signal differs from the recorded one."""
+    far = np.any(~(np.abs(made - kept) <= tolerance), axis=tuple(range(1, np.ndim(kept))))
+    if not far.any():
+        return
+    k = int(np.argmax(far))
+    where = f"{name} of sample {int(rows[k])} (t = {float(run.t[rows[k]]):.6g} s)"
+    remedy = (
+        f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, and {made[k]}"
+        " when integrated again. Simulate it again; a loop that amplifies rounding that much needs"
+        " record_every=1."
+    )
+    raise checks.fail(
+        "run", "samples that its scenario does not give", "the run of run.scenario", remedy
+    )
+
+
+def check_status(run: Any, margin: float) -> None:
+    """Raises ValueError if the status of a run and the smallest margin of all steps [rad]
+    contradict each other beyond rounding.
+    """
+    flagged = bool(int(run.status) & int(Status.BOUND_VIOLATED))
+    # Without the number of steps, the run may have left its bounds after its last sample.
+    after_last_sample = flagged and margin > 0 and run.steps is None
+    agrees = flagged == (not margin > 0)
+    if agrees or after_last_sample or abs(margin) <= tolerances(run)["position"]:
+        return
+    remedy = (
+        f"All its steps, integrated again, have a smallest margin of {margin:.3g} rad. Simulate it"
+        " again."
+    )
+    raise checks.fail("run.status", describe(int(run.status)), "the status of run.scenario", remedy)

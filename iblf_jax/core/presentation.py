@@ -1,0 +1,41 @@
+"""Reaches figures, reports and files from results without importing them.
+
+Results lie below `plotting`, `reports` and `files` in the layers of the package. Their methods
+`plot`, `save`, `to_xarray` and `_repr_html_` call the functions of this table by name, and Python
+imports the module at the first call. A new presentation is one entry of the table.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+PRESENTATIONS = {
+    "certificate figure": ("iblf_jax.plotting.certificates", "certificate"),
+    "comparison figure": ("iblf_jax.plotting", "comparison"),
+    "front figure": ("iblf_jax.plotting", "pareto"),
+    "identification figure": ("iblf_jax.plotting", "identification"),
+    "rollout figure": ("iblf_jax.plotting", "overview"),
+    "study figure": ("iblf_jax.plotting", "study_overview"),
+    "tuning figure": ("iblf_jax.plotting", "tuning"),
+    "card": ("iblf_jax.reports", "card"),
+    "report": ("iblf_jax.reports", "report"),
+    "rollout dataset": ("iblf_jax.files.rollouts", "rollout_to_xarray"),
+    "tuning file": ("iblf_jax.files.tuning", "save_tuning"),
+}
+"""Name of a presentation -> the module and the function that makes it."""
+
+
+def present(name: str, result: Any, *args: Any, **options: Any) -> Any:
+    """Make one presentation of a result.
+
+    Args:
+      name: key of `PRESENTATIONS`.
+      result: what is presented.
+      args, options: further arguments of the function.
+
+    Returns:
+      What the function returns.
+    """
+    module, function = PRESENTATIONS[name]
+    return getattr(importlib.import_module(module), function)(result, *args, **options)

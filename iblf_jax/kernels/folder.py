@@ -1,0 +1,51 @@
+"""The folder in which compiled programs are kept between processes, and the processor that they need."""
+
+from __future__ import annotations
+
+import os
+import platform
+import stat
+from functools import cache
+from pathlib import Path
+
+
+def directory() -> Path:
+    """The folder, mode 0700; OSError, whose text is one line for the user, if it cannot be made or
+    is not this user's.
+    """
+    path = None
+    try:
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iblf_jax"
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.is_symlink():
+            raise OSError("it is a link and not a directory of this user")
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            status = os.fstat(folder)
+            if status.st_uid != os.getuid():
+                raise OSError("it is not a directory of this user")
+            if stat.S_IMODE(status.st_mode) & 0o077:
+                os.fchmod(folder, 0o700)
+        finally:
+            os.close(folder)
+    except (OSError, RuntimeError) as error:
+        raise OSError(f"the cache {path or '~/.cache/iblf_jax'} cannot be made: {error}") from None
+    return path
+
+
+@cache
+def processor() -> str:
+    """What a compiled program is tied to: the processor's model and features."""
+    names = ("model name", "flags", "Features", "CPU part")
+    return (
+        "\n".join(sorted({line for line in cpuinfo() if line.startswith(names)}))
+        or platform.processor() + platform.machine()
+    )
+
+
+def cpuinfo() -> list[str]:
+    """Lines of /proc/cpuinfo; empty where there is none."""
+    try:
+        return Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return []

@@ -1,0 +1,106 @@
+"""Checkpoints of a search: its state and history after each step, in one file.
+
+The file is written under another name and then renamed, so that it is complete or not there.  A
+search that was killed continues from it and gives the same numbers, bit by bit, as one that was
+not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.tuning.search import Search
+from iblf_jax.tuning.solvers import Solver
+
+NOT_PART_OF_THE_PROBLEM = ("patience",)
+"""Options with which a search may be continued that began with others."""
+
+
+def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: int) -> str:
+    """A hash of everything that a checkpoint must agree with."""
+    options = {}
+    if dataclasses.is_dataclass(solver):
+        fields = [x.name for x in dataclasses.fields(solver)]
+        options = {x: getattr(solver, x) for x in fields if x not in NOT_PART_OF_THE_PROBLEM}
+    if "schedule" in options:
+        options["iterations"] = iterations  # a schedule ends with the last step
+    leaves, structure = jax.tree.flatten(problem)
+    digest = hashlib.sha256(repr((structure, solver.name, mode, options)).encode())
+    for x in leaves:
+        digest.update(np.asarray(x).tobytes() + str(np.shape(x)).encode())
+    return digest.hexdigest()
+
+
+def _named_leaves(state: Any) -> dict[str, np.ndarray]:
+    """Name -> array of every leaf of a state."""
+    pairs = jax.tree_util.tree_leaves_with_path(state)
+    return {f"state{jax.tree_util.keystr(path)}": np.asarray(x) for path, x in pairs}
+
+
+def save_checkpoint(search: Search, path: str | os.PathLike, mark: str) -> None:
+    """Writes state and history of a search.
+
+    Args:
+      search: after a step.
+      path: of the file.
+      mark: `fingerprint` of the problem.
+    """
+    arrays = _named_leaves(search.state)
+    arrays |= {f"history_{name}": np.stack(x) for name, x in search.history.items()}
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    with open(temporary, "wb") as file:
+        np.savez(file, allow_pickle=False, fingerprint=np.asarray(mark), **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, target)
+
+
+def load_checkpoint(path: str | os.PathLike, search: Search, mark: str) -> None:
+    """Sets state and history of a search to those of its checkpoint.
+
+    Raises:
+      ValueError: the file is not a checkpoint, or one of another problem.
+    """
+    place = checks.file_to_read("checkpoint", path)
+    try:
+        with np.load(place) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # incomplete, another kind of file, or one that begins like a zip
+        remedy = (
+            f"It cannot be read ({type(error).__name__}: {error}): delete it or name another file."
+        )
+        raise checks.fail("checkpoint", str(path), "a checkpoint of tune", remedy) from error
+    if str(arrays.get("fingerprint")) != mark:
+        raise checks.fail(
+            "checkpoint",
+            str(path),
+            "a checkpoint of this very problem",
+            "Scenario, objective, options or the package's version differ: delete it or name"
+            " another file.",
+        )
+    expected = {name: (x.shape, x.dtype) for name, x in _named_leaves(search.state).items()}
+    found = {name: np.array(x) for name, x in arrays.items() if name.startswith("state[")}
+    if {name: (x.shape, x.dtype) for name, x in found.items()} != expected:
+        raise checks.fail(
+            "checkpoint",
+            str(path),
+            "a complete checkpoint",
+            "An array is missing in it: delete it or name another file.",
+        )
+    structure = jax.tree.structure(search.state)
+    search.state = jax.tree.unflatten(structure, [found[name] for name in expected])
+    search.history = {
+        name.removeprefix("history_"): list(x)
+        for name, x in arrays.items()
+        if name.startswith("history_")
+    }

@@ -1,0 +1,475 @@
+"""Objective and requirements of a tuning problem as compiled functions of the coordinates z, with
+their derivatives.
+
+For each start s and run b one rollout gives the quantities m_bk of the objective.  The objective is
+
+    f(z) = risk_b [ sum_k w_k term_k(m_bk) ],
+
+and its derivatives follow from the rollout's tangents dm/dz by the chain rule,
+
+    df/dz = sum df/dm dm/dz,      d2f/dz2 ~ sum df/dm N + (dm/dz)^T d2f/dm2 dm/dz,
+
+with the matrices N of `quantities`.
+
+A requirement r is violated by G_r, the mean of g_r over the worst `allowed` share of the runs.
+Within a run g_r is the largest of the pieces of its quantity, g_rj = (p_j - limit) / scale.  The
+pieces and their exact gradients are returned for solvers that treat requirements as constraints.
+For solvers that accept one loss only, the augmented Lagrangian
+
+    L(z) = f(z) + sum_r psi(G_r; y_r, mu),     psi(G; y, mu) = (max(0, y + mu G)^2 - y^2) / (2 mu)
+
+contains the requirements, with multipliers y and penalty parameter mu.
+
+On a Pareto front every term k is an objective of its own, F_k = log risk_b[term_kb].  A start
+minimises sum_k w_k F_k subject to levels of its own, F_k <= level_k, which are requirements of one
+piece each.
+
+Forward mode gives all of this in one pass; reverse mode, for many parameters, gives the gradient
+of L only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core.status import UNTRUSTED
+from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.metrics import Torque
+from iblf_jax.simulation.paths import get, with_parameters
+from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
+from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.parameters import values_at
+from iblf_jax.tuning.quantities import Peak, Quantities
+from iblf_jax.tuning.robust import Risk, combine, worst_share
+from iblf_jax.tuning.runs import Run, run_batch, run_for_reverse, tangents_of_runs
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.problem import TuningProblem
+
+NO_LEVEL = 1e6
+"""A level of a front that no objective reaches."""
+
+NUMBERS_A_RUN = 100
+"""Approximate count of numbers that one run of a batch holds while it is computed: its state, its
+stages, its folds."""
+
+WINDOWS = 8
+"""Time windows of a peak: within one of them a signal seldom has two peaks of one height.  With 8,
+a peak of `presets.ur5` takes 1,400 choices of a step with 14 tangents, of some 200,000
+operations."""
+
+
+class Candidate(NamedTuple):
+    """Where one start is evaluated, and with which weights; batches have the starts first."""
+
+    z: Any
+    """Coordinates, (p,)."""
+    index: Any
+    """Run numbers, (B,)."""
+    weights: Any
+    """Of the terms, (n_terms,)."""
+    multipliers: Any
+    """Of the requirements in the augmented Lagrangian, (n_requirements,)."""
+    penalty: Any
+    """Penalty parameter mu of the augmented Lagrangian, ()."""
+    levels: Any = ()
+    """Of the terms on a front, (n_terms,); NO_LEVEL where there is none."""
+
+
+class Value(NamedTuple):
+    """A problem at one z."""
+
+    loss: Any
+    """L, infinite where a run was invalid."""
+    objective: Any = ()
+    """f without smoothing: what results are compared by."""
+    terms: Any = ()
+    """Each unweighted term without smoothing, averaged over the runs, on a front combined by the
+    risk, (n_terms,)."""
+    smooth_excess: Any = ()
+    """G_r from the smooth quantities, (n_requirements,)."""
+    exact_excess: Any = ()
+    """G_r from the exact quantities, (n_requirements,)."""
+    margin: Any = ()
+    """The smallest margin of all runs [rad]."""
+    valid: Any = ()
+    exact: Any = ()
+    """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the
+    margin."""
+    trusted: Any = ()
+    """Share of the runs that were integrated to their end, and stably; 1 where valid."""
+
+
+class Derivatives(NamedTuple):
+    """A problem at one z, with derivatives."""
+
+    value: Value
+    gradient: Any
+    hessian: Any
+    """Gauss-Newton approximation, (p, p)."""
+    pieces: Any = ()
+    """g of each piece of each requirement in each run, (B, M), one requirement after the other;
+    levels last, and in the first run only."""
+    piece_gradients: Any = ()
+    """Their gradients, (B, p, M)."""
+
+
+# ------------------------------------------------------------------------------------ quantities
+
+
+def fold_of(objective: Objective, dtype: Any, duration: Any = None) -> tuple[Quantities, ...]:
+    """The fold of a problem: its quantities and the margin last.
+
+    Args:
+      objective: with scales and limits.
+      dtype: of the runs.
+      duration: of a run [s]; peaks are split into windows of it, if given.
+    """
+    parts = objective.quantities
+    if duration is not None:
+        edges = jnp.asarray(duration, dtype) * jnp.asarray(np.arange(1, WINDOWS) / WINDOWS, dtype)
+        parts = tuple(
+            dataclasses.replace(x, windows=edges) if isinstance(x, Peak) else x for x in parts
+        )
+    one: Any = 1.0
+    fold = Quantities((*parts, Peak(one, "deficit")))
+    return (jax.tree.map(lambda x: jnp.asarray(x, dtype), fold),)
+
+
+def piece_counts(objective: Objective, scenario: Scenario, duration: float) -> tuple[int, ...]:
+    """The number of pieces of each quantity, the margin's last."""
+
+    def first_sample(s: Scenario) -> Any:
+        return evaluate(s, jnp.zeros_like(s.initial.q[0]), initial_state(s))[1]
+
+    sample = jax.eval_shape(first_sample, scenario)
+    return fold_of(objective, scenario.initial.q.dtype, duration)[0].counts(sample)
+
+
+def _fold(problem: TuningProblem) -> tuple[Quantities, ...]:
+    return fold_of(problem.objective, problem.dt.dtype, problem.steps * problem.dt)
+
+
+# ------------------------------------------------------------------------------------------ runs
+
+
+def _drawn(
+    cases: Cases,
+    targets: tuple[Target, ...],
+    point: dict[str, jax.Array],
+    index: jax.Array,
+    nominal: bool = False,
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """Path -> value for one run with the leaves of a point, and whether its draws were
+    admissible.
+    """
+    noise = noise_of(cases.scenario, cases.key, index)
+    if not targets:
+        return point | noise, jnp.asarray(True)
+    made, _, admissible = draw(cases, targets, index, point, {})
+    if nominal:
+        scenario = with_parameters(cases.scenario, point)
+        made = {path: jnp.asarray(get(scenario, path)) for path in made}
+        admissible = jnp.asarray(True)
+    return merge(cases.scenario, point, made) | noise, admissible
+
+
+def _varied(problem: TuningProblem, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
+    """Path -> value for one run."""
+    dtype = problem.dt.dtype
+    point = {path: x.astype(dtype) for path, x in values_at(problem.blocks, z).items()}
+    return _drawn(problem.cases, problem.targets, point, index)[0]
+
+
+def _varied_of_all(problem: TuningProblem, candidates: Candidate) -> dict[str, jax.Array]:
+    """Path -> values (S * B, ...)."""
+    one = partial(_varied, problem)
+    return _flat(jax.vmap(jax.vmap(one, in_axes=(None, 0)))(candidates.z, candidates.index))
+
+
+def _flat(tree: Any) -> Any:
+    """Arrays (S, B, ...) as (S * B, ...)."""
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), tree)
+
+
+def _by_start(tree: Any, candidates: Candidate) -> Any:
+    """Arrays (S * B, ...) as (S, B, ...)."""
+    return jax.tree.map(lambda x: x.reshape(*candidates.index.shape, *x.shape[1:]), tree)
+
+
+class Rollouts(NamedTuple):
+    """What runs give, (R, ...)."""
+
+    smooth: Any
+    exact: Any
+    """Each quantity, the last minus the margin, (R, K + 1)."""
+    peak_torque: Any
+    """Of each joint, (R, n)."""
+    relative_error: Any
+    """Estimated error of each run by the time step, relative to its tube."""
+    status: Any
+    fastest_mode: Any
+
+
+@partial(jax.jit, static_argnames=("run", "backend"))
+def rollouts(
+    scenario: Scenario,
+    varied: dict[str, jax.Array],
+    objective: Objective,
+    dt: jax.Array,
+    *,
+    run: Run,
+    backend: str,
+) -> Rollouts:
+    """Runs without derivatives, for a search and for the report on its result.
+
+    Args:
+      scenario, varied, dt, run, backend: as `runs.run_batch`.
+      objective: complete.
+    """
+    folds = (*fold_of(objective, dt.dtype, run.steps * dt), Torque())
+    outcome = run_batch(scenario, varied, folds, dt, run, backend=backend)
+    smooth, exact, peak_torque, error = (
+        outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque", RELATIVE)
+    )
+    return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode)
+
+
+@partial(jax.jit, static_argnames=("targets", "nominal"))
+def drawn(
+    cases: Cases,
+    points: dict[str, jax.Array],
+    index: jax.Array,
+    *,
+    targets: tuple[Target, ...],
+    nominal: bool,
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """Path -> values of runs by their points (R, ...) and numbers (R,), drawn or `nominal`, and
+    whether their draws were admissible.
+    """
+    return jax.vmap(lambda point, i: _drawn(cases, targets, point, i, nominal))(points, index)
+
+
+# ------------------------------------------------------------- one start, from its B runs' numbers
+
+
+def _terms(risk: Risk, objective: Objective, quantities: jax.Array) -> jax.Array:
+    """Each term, combined over the runs, (n_terms,), from the quantities (B, K)."""
+    terms = jax.vmap(objective.values)(quantities)
+    return jax.vmap(partial(combine, risk), in_axes=1)(terms)
+
+
+def _objective(problem: TuningProblem, candidate: Candidate, quantities: jax.Array) -> jax.Array:
+    """f, from the quantities of the runs, (B, K)."""
+    if problem.on_front:
+        terms = _terms(problem.risk, problem.objective, quantities)
+        return jnp.log(terms) @ candidate.weights
+    losses = jax.vmap(problem.objective.values)(quantities) @ candidate.weights
+    return combine(problem.risk, losses)
+
+
+def _excesses(problem: TuningProblem, quantities: jax.Array) -> jax.Array:
+    """G_r of each requirement, (n_requirements,)."""
+    each = jax.vmap(problem.objective.excesses)(quantities)
+    found = [worst_share(each[:, r], share) for r, share in enumerate(problem.allowed)]
+    return jnp.stack(found) if found else jnp.zeros((0,), quantities.dtype)
+
+
+def _augmentation(excess: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
+    """sum_r psi(G_r; y_r, mu)."""
+    active = jnp.maximum(0.0, multipliers + penalty * excess)
+    return jnp.sum(active**2 - multipliers**2) / (2 * penalty)
+
+
+def _loss(problem: TuningProblem, candidate: Candidate, smooth: jax.Array) -> jax.Array:
+    """L, or f where the requirements are not part of the loss."""
+    objective = _objective(problem, candidate, smooth)
+    if not problem.requirements_in_loss:
+        return objective
+    excess = _excesses(problem, smooth)
+    return objective + _augmentation(excess, candidate.multipliers, candidate.penalty)
+
+
+def value_of_start(
+    problem: TuningProblem, candidate: Candidate, smooth: Any, exact: Any, status: Any
+) -> Value:
+    """The `Value` of one start.
+
+    Args:
+      problem: what is tuned.
+      candidate: where, without a batch axis.
+      smooth, exact: quantities of the runs, (B, K + 1).
+      status: flags of the runs, (B,).
+    """
+    fine = (status & int(UNTRUSTED) == 0) & jnp.all(jnp.isfinite(smooth), axis=-1)
+    valid = jnp.all(fine)
+    risk = problem.risk if problem.on_front else Risk()
+    return Value(
+        loss=jnp.where(valid, _loss(problem, candidate, smooth), jnp.inf),
+        objective=_objective(problem, candidate, exact),
+        terms=_terms(risk, problem.objective, exact),
+        smooth_excess=_excesses(problem, smooth),
+        exact_excess=_excesses(problem, exact),
+        margin=-jnp.max(exact[:, -1]),
+        valid=valid,
+        exact=jnp.mean(exact, axis=0),
+        trusted=jnp.mean(fine.astype(exact.dtype)),
+    )
+
+
+def _derivatives_of_start(
+    problem: TuningProblem, candidate: Candidate, outcome: Any, tangents: Any, products: Any
+) -> Derivatives:
+    """Loss, gradient and Gauss-Newton matrix of one start, and the pieces of its requirements."""
+    smooth, exact, pieces = (outcome.metrics[name] for name in Quantities.units)
+    J = tangents["tuning_smooth"]
+    pull = jax.grad(partial(_loss, problem, candidate))
+    d_loss = pull(smooth)
+    gradient = jnp.einsum("bk,buk->u", d_loss, J)
+    ends = np.cumsum(problem.piece_counts)[:-1].tolist()
+    by_quantity = jnp.split(pieces, ends, axis=1)
+    gradients = jnp.split(tangents["tuning_pieces"], ends, axis=2)
+    N = jax.vmap(_fold(problem)[0].hessians)(products, by_quantity, gradients)
+    second = jax.vmap(lambda tangent: jax.jvp(pull, (smooth,), (tangent,))[1], in_axes=1)(J)
+    hessian = jnp.einsum("bk,bkuv->uv", d_loss, N) + jnp.einsum("ubk,bvk->uv", second, J)
+    value = value_of_start(problem, candidate, smooth, exact, outcome.status)
+    found = Derivatives(value, gradient, hessian)
+
+    requirements = problem.objective.requirements
+    first = len(problem.objective.terms)
+    own = range(first, first + len(requirements))
+    excess = [r.excess(by_quantity[k]) for r, k in zip(requirements, own, strict=True)]
+    slopes = [gradients[k] / r.scale for r, k in zip(requirements, own, strict=True)]
+    if problem.on_front:
+        over_level, its_gradient = _over_levels(problem, candidate, smooth, J)
+        excess.append(over_level)
+        slopes.append(its_gradient)
+    if not excess:
+        return found
+    return found._replace(
+        pieces=jnp.concatenate(excess, axis=1), piece_gradients=jnp.concatenate(slopes, axis=2)
+    )
+
+
+def _over_levels(
+    problem: TuningProblem, candidate: Candidate, smooth: jax.Array, J: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """F_k - level_k in the first of the runs, far below zero in the others, (B, n_terms), and the
+    gradients, (B, p, n_terms).
+    """
+
+    def over(smooth: jax.Array) -> jax.Array:
+        return jnp.log(_terms(problem.risk, problem.objective, smooth)) - candidate.levels
+
+    slopes = jnp.einsum("tbk,buk->ut", jax.jacrev(over)(smooth), J)
+    below = jnp.full((len(smooth), len(candidate.levels)), -NO_LEVEL, smooth.dtype)
+    excess = below.at[0].set(over(smooth))
+    return excess, jnp.zeros((len(smooth), *slopes.shape), smooth.dtype).at[0].set(slopes)
+
+
+# ---------------------------------------------------------------------------------- compiled calls
+
+
+def value(problem: TuningProblem, candidates: Candidate) -> Value:
+    """The problem at the coordinates of each start, (S, ...)."""
+    run = Run(problem.steps, problem.method, mechanism=problem.mechanism)
+    varied = _compiled_varied(problem, candidates)
+    found = rollouts(
+        problem.cases.scenario,
+        varied,
+        problem.objective,
+        problem.dt,
+        run=run,
+        backend=problem.backend,
+    )
+    return _values(problem, candidates, found)
+
+
+_compiled_varied = jax.jit(_varied_of_all)
+
+
+@jax.jit
+def _values(problem: TuningProblem, candidates: Candidate, found: Rollouts) -> Value:
+    by_start = _by_start((found.smooth, found.exact, found.status), candidates)
+    return jax.vmap(partial(value_of_start, problem))(candidates, *by_start)
+
+
+@jax.jit
+def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
+    """The problem with gradient (S, p), Gauss-Newton matrix (S, p, p) and the pieces of the
+    requirements, by forward mode.
+    """
+    run = Run(problem.steps, problem.method, mechanism=problem.mechanism)
+    found = tangents_of_runs(
+        problem.cases.scenario,
+        _varied_of_all(problem, candidates),
+        _jacobians(problem, candidates),
+        _fold(problem),
+        problem.dt,
+        run,
+        backend=problem.backend,
+        nested=problem.nested,
+        uniform=_uniform_paths(problem),
+    )
+    by_start = _by_start((found.outcome, found.tangents, found.products), candidates)
+    return jax.vmap(partial(_derivatives_of_start, problem))(candidates, *by_start)
+
+
+def _jacobians(problem: TuningProblem, candidates: Candidate) -> dict[str, jax.Array]:
+    """Path -> dx/dz, (S * B, ..., p), for the leaves that depend on the coordinates."""
+    one = jax.jacfwd(partial(_varied, problem))
+    every = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(candidates.z, candidates.index)
+    tuned = [block.path for block in problem.blocks]
+    return {
+        path: x
+        for path, x in _flat(every).items()
+        if path != NOISE_NAME and _overlaps(problem, path, tuned)
+    }
+
+
+def _uniform_paths(problem: TuningProblem) -> list[str]:
+    """The tied leaves that no perturbation changes: one number for all of their entries."""
+    perturbed = [target.path for target in problem.targets]
+    tied = [block.path for block in problem.blocks if block.size == 1]
+    return [path for path in tied if not _overlaps(problem, path, perturbed)]
+
+
+def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
+    return any(same_place(problem.cases.scenario, path, other) for other in others)
+
+
+@jax.jit
+def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
+    """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
+
+    def one_run(z: jax.Array, index: jax.Array) -> Any:
+        values = _varied(problem, z, index)
+        noise = values.pop(NOISE_NAME, None)
+        scenario = with_parameters(problem.cases.scenario, values)
+        run = Run(problem.steps, problem.method)
+        outcome = run_for_reverse(scenario, _fold(problem), problem.dt, run, noise)
+        return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
+
+    def loss(z: jax.Array, candidate: Candidate) -> Any:
+        candidate = candidate._replace(z=z)
+        smooth, (exact, status) = jax.vmap(partial(one_run, z))(candidate.index)
+        value = value_of_start(problem, candidate, smooth, exact, status)
+        return _loss(problem, candidate, smooth), value
+
+    with_gradient = jax.vmap(jax.value_and_grad(loss, has_aux=True))
+    (_, found), gradients = with_gradient(candidates.z, candidates)
+    size = gradients.shape[-1]
+    return Derivatives(found, gradients, jnp.zeros((*gradients.shape, size), gradients.dtype))
+
+
+DERIVATIVES = {"forward": forward_derivatives, "reverse": reverse_derivatives}
+"""Mode of differentiation -> function of a problem and candidates."""

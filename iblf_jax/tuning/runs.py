@@ -1,0 +1,102 @@
+"""The runs behind a tuning: the only module of `tuning` that calls the engine.
+
+`run_batch` integrates a batch, `tangents_of_runs` does so with derivatives along the coordinates z
+(forward mode), and `run_for_reverse` is one run to be differentiated in reverse mode.
+
+The leaves of a batch are functions x_b(z) of D coordinates, of another Jacobian in every run.  The
+engine moves leaves along fixed patterns p (one entry of a leaf, or all of them together), so that
+its program does not depend on where it is called.  The chain rule does the rest,
+
+    dx_b/dz_d = sum_p C_bpd pattern_p,      dm_b/dz_d = sum_p C_bpd dm_b/dp,
+    N_b = C_b^T N_b(patterns) C_b.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.engine.derivatives import Outer as Outer
+from iblf_jax.engine.derivatives import Tangents
+from iblf_jax.engine.execute import run_batch as run_batch
+from iblf_jax.engine.execute import run_batch_jvp
+from iblf_jax.engine.execute import run_for_reverse as run_for_reverse
+from iblf_jax.engine.mechanism import Mechanism as Mechanism
+from iblf_jax.engine.mechanism import known_of as known_of
+from iblf_jax.engine.period import radius_at as radius_at
+from iblf_jax.engine.plan import BACKENDS as BACKENDS
+from iblf_jax.engine.plan import FORWARD_MOST as FORWARD_MOST
+from iblf_jax.engine.plan import differentiates_forward as differentiates_forward
+from iblf_jax.engine.plan import fresh_together as fresh_together
+from iblf_jax.engine.plan import starts_together as starts_together
+from iblf_jax.engine.plan import values_together as values_together
+from iblf_jax.engine.simulate import simulate as simulate
+from iblf_jax.engine.simulate import simulate_unchecked as simulate_unchecked
+from iblf_jax.engine.step import Run as Run
+from iblf_jax.engine.step_size import fastest_along as fastest_along
+from iblf_jax.engine.step_size import start_and_along as start_and_along
+from iblf_jax.simulation.scenario import Scenario
+
+
+def tangents_of_runs(
+    scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    jacobians: Mapping[str, jax.Array],
+    folds: Any,
+    dt: jax.Array,
+    run: Run,
+    *,
+    backend: str,
+    nested: bool = False,
+    uniform: Collection[str] = (),
+) -> Tangents:
+    """Runs a batch with its tangents along the coordinates; call it inside `jit`.
+
+    Args:
+      scenario: what all runs share, canonical.
+      varied: path -> values, (B, ...).
+      jacobians: path -> dx/dz, (B, ..., D), for the paths that depend on the coordinates.
+      folds: the metrics.
+      dt: time step, () [s].
+      run, backend: steps and integrator, and on what they are executed; static.
+      nested: whether a loop of JAX surrounds the call.
+      uniform: paths all of whose entries have the same derivative: one pattern for the leaf.
+
+    Returns:
+      `Tangents`, run axis first, along the D coordinates.
+    """
+    patterns = {path: _patterns(x.shape[1:-1], path in uniform) for path, x in jacobians.items()}
+    found = run_batch_jvp(
+        scenario, varied, _directions(patterns), folds, dt, run, backend=backend, nested=nested
+    )
+    by_entry = {path: x.reshape(len(x), -1, x.shape[-1]) for path, x in jacobians.items()}
+    C = jnp.concatenate([x[:, : len(patterns[path])] for path, x in by_entry.items()], axis=1)
+    tangents = jax.tree.map(lambda x: jnp.einsum("bpd,bp...->bd...", C, x), found.tangents)
+    products = tuple(jnp.einsum("bpd,bpq,bqe->bde", C, N, C) for N in found.products)
+    return Tangents(found.outcome, tangents, products)
+
+
+def _patterns(shape: tuple[int, ...], uniform: bool) -> np.ndarray:
+    """The patterns along which a leaf moves: all of it at once, or one entry after the other."""
+    if uniform:
+        return np.ones((1, *shape))
+    return np.eye(int(np.prod(shape))).reshape(-1, *shape)
+
+
+def _directions(patterns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Path -> (P, ...): the patterns of all leaves numbered one after the other, zero where a
+    pattern belongs to another leaf.
+    """
+    total = sum(len(x) for x in patterns.values())
+    directions = {}
+    first = 0
+    for path, pattern in patterns.items():
+        moved = np.zeros((total, *pattern.shape[1:]))
+        moved[first : first + len(pattern)] = pattern
+        directions[path] = moved
+        first += len(pattern)
+    return directions

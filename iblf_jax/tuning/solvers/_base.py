@@ -1,0 +1,169 @@
+"""The contract of a solver, and what a solver knows of the problem that it solves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.tuning.parameters import Box
+from iblf_jax.tuning.robust import worst_count
+
+MODES = ("auto", "forward", "reverse")
+SCHEDULES = ("cosine", "constant")
+MOST_SHARPENINGS = 60
+"""With more, the smoothing is not representable in float32."""
+LEARNING_RATES = (1e-12, 1e3)
+
+
+class Constraints(NamedTuple):
+    """The requirements as constraints of a programme, on the host.
+
+    A requirement consists of pieces: entries of a signal in windows of time.  In a run it is
+    violated by its largest piece; over the runs by the mean G_r of its k worst runs.
+    """
+
+    owner: np.ndarray
+    """Index of the requirement that each piece belongs to, (M,)."""
+    worst: tuple[int, ...]
+    """Number k of worst runs, for each requirement, (R,)."""
+    runs: int
+    """Number B of runs."""
+
+    @staticmethod
+    def of(counts: Sequence[int], shares: Sequence[float], runs: int) -> Constraints:
+        """From the number of pieces of each requirement and the share of the runs that may violate
+        it.
+        """
+        owner = np.repeat(np.arange(len(counts)), counts)
+        return Constraints(owner, tuple(worst_count(runs, share) for share in shares), runs)
+
+    def pieces_of(self, requirement: int) -> np.ndarray:
+        """Indices of the pieces of a requirement."""
+        return np.flatnonzero(self.owner == requirement)
+
+    def excess(self, pieces: np.ndarray) -> np.ndarray:
+        """G_r, (R,), from the pieces' values, (B, M)."""
+        found = np.zeros(len(self.worst))
+        for r, k in enumerate(self.worst):
+            by_run = np.max(pieces[:, self.owner == r], axis=1)
+            found[r] = np.sort(by_run)[-k:].mean()
+        return found
+
+
+class SearchSpace(NamedTuple):
+    """What a solver knows of a problem."""
+
+    box: Box
+    """Start and range of the coordinates z."""
+    constraints: Constraints = Constraints(np.zeros(0, int), (), 1)
+    multimodal: bool = False
+    """Whether several local minima are expected."""
+    iterations: int = 60
+    """Steps of the search at most, for schedules."""
+
+
+class Optimality(NamedTuple):
+    """How far the accepted point of a start is from an optimum."""
+
+    z: np.ndarray
+    """The accepted point, (p,)."""
+    multipliers: np.ndarray
+    """Of each requirement, (R,)."""
+    residuals: np.ndarray
+    """Largest entry of the Lagrangian's gradient that no range blocks, largest excess, and
+    complementarity, (3,)."""
+    stuck: bool
+    """Whether the solver ended without an optimum."""
+
+
+class Solver(Protocol):
+    """An algorithm with its options; a frozen dataclass without state of its own.
+
+    It advances S starts together.  `evaluate` is a function of coordinates z, (S, p), that returns
+    `Derivatives` as NumPy arrays; its attributes `space` (`SearchSpace`) and `active` ((S,), which
+    starts are still to be advanced) belong to the call.  The state is any pytree of NumPy arrays,
+    which `step` and `restart` may change in place.
+    """
+
+    name: ClassVar[str]
+    """In `SOLVERS`, in files and in results."""
+    handles_requirements: ClassVar[bool]
+    """Whether requirements are constraints of the solver.  Otherwise the loss is an augmented
+    Lagrangian, of which the loop updates the multipliers."""
+    traces_evaluation: ClassVar[bool]
+    """Whether a step evaluates inside of a compiled loop, by `evaluate.derivatives(problem,
+    candidate)` with the two of `evaluate.row(start)`."""
+    mode: Any
+    """"forward" or "reverse" differentiation, or "auto": by the number of coordinates."""
+    resample: Any
+    """Whether the runs are drawn anew at every step."""
+    starts: int
+    """Number of starting points."""
+    tolerance: float
+    """Relative change of the loss below which a start has converged."""
+    sharpenings: Any
+    """How often the smoothing of peaks in the objective is divided by 4, each time once the starts
+    have converged."""
+    patience: int
+    """Steps without a better result after which the search ends (or the smoothing is divided)."""
+
+    def init(self, space: SearchSpace, z: np.ndarray) -> Any:
+        """The state of S starts at z, (S, p), before the first evaluation."""
+        ...
+
+    def step(self, evaluate: Any, state: Any, tolerance: float) -> tuple[np.ndarray, Any]:
+        """Advances the active starts by one trial each.
+
+        Args:
+          evaluate: see above.
+          state: of `init`, changed in place.
+          tolerance: of this step; larger than the solver's own while peaks are still smoothed.
+
+        Returns:
+          The trial points (S, p) and their `Derivatives`.
+        """
+        ...
+
+    def converged(self, state: Any) -> np.ndarray:
+        """Which starts have converged in the last step, (S,)."""
+        ...
+
+    def restart(
+        self, space: SearchSpace, state: Any, start: int, z: np.ndarray | None = None
+    ) -> None:
+        """Begins one start anew at z, (p,).  Without z the start goes on where it is, and forgets
+        what no longer holds because the loss has changed.
+        """
+        ...
+
+    def optimality(self, state: Any, start: int) -> Optimality | None:
+        """Multipliers and residuals of one start; None if the solver does not compute them."""
+        ...
+
+
+CHECKS: dict[str, Any] = {
+    "mode": lambda name, x: checks.one_of(name, x, MODES) or x,
+    "resample": checks.flag,
+    "starts": checks.positive_integer,
+    "tolerance": lambda name, x: checks.number_between(name, x, 0.0, 1.0, "1"),
+    "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MOST_SHARPENINGS),
+    "patience": lambda name, x: checks.positive_integer(name, x, most=checks.MOST_STEPS),
+    "learning_rate": lambda name, x: checks.number_between(name, x, *LEARNING_RATES, "1"),
+    "schedule": lambda name, x: checks.one_of(name, x, SCHEDULES) or x,
+    "memory": lambda name, x: checks.positive_integer(name, x, most=1000),
+    "line_steps": lambda name, x: checks.positive_integer(name, x, most=1000),
+    "radius": lambda name, x: None if x is None else checks.positive_number(name, x, "1"),
+}
+"""Option -> function of its name and value that returns the value in its type, or raises
+ValueError."""
+
+
+def check_options(options: Any) -> None:
+    """Checks the fields of a frozen dataclass of options, and converts them to their types."""
+    for field in dataclasses.fields(options):
+        value = CHECKS[field.name](field.name, getattr(options, field.name))
+        object.__setattr__(options, field.name, value)
