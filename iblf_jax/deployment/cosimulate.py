@@ -35,7 +35,7 @@ from iblf_jax.simulation.jumps import APART
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import (
-    NEARLY,
+    DELAY_TOLERANCE,
     Instant,
     Sampling,
     check_step,
@@ -119,7 +119,7 @@ def cosimulate(
     robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
     sampling: Any = scenario.sampling
     own = float(sampling.period) / max(
-        1, math.ceil(float(sampling.period) / robot.timestep - NEARLY)
+        1, math.ceil(float(sampling.period) / robot.timestep - DELAY_TOLERANCE)
     )
     dt = own if dt is None else checks.time_span("dt", dt)
     check_step(scenario, dt)
@@ -316,7 +316,7 @@ def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: in
                 rows.append((t, True, *rows[-1][2:]))
                 continue
             # Where a command arrives or the scenario jumps within the step, MuJoCo makes two of it.
-            now, end, near = t, t + dt, NEARLY * dt
+            now, end, near = t, t + dt, DELAY_TOLERANCE * dt
             due = index % every == 0
             if index > 0 and (due or arrives(now + near) or jumps(now + near)):
                 rows.append(row(now, False))

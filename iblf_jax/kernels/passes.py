@@ -131,7 +131,7 @@ def scheduled(program: Program) -> Program:
                 heapq.heappush(waiting, (at[user], user))
         now += cost[i]
     # What only samples need stays last: a call that only they need must not write over what the
-    # next one has left there (`layout.Calls`).
+    # next one has left there (`layout.FunctionCalls`).
     in_time = set(needed(nodes, [o for _, o in program.carry])) | known
     order.sort(key=lambda i: i not in in_time)
     place = {i: k for k, i in enumerate(order)}

@@ -593,7 +593,9 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
         for i, t in enumerate([0.0, *TIMES]):
             state = jax.tree.map(lambda x, i=i: x[i], states)
             commands = [
-                run_sampled_law(changed, t, state._replace(q=q), jnp.zeros((0, 2))).sampled.commands[0]
+                run_sampled_law(
+                    changed, t, state._replace(q=q), jnp.zeros((0, 2))
+                ).sampled.commands[0]
                 for q in state.q + count * MOVED
             ]
             rates.append(600.0 * np.max(np.abs(np.stack(commands[1:]) - commands[0])))
