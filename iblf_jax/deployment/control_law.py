@@ -19,7 +19,7 @@ import numpy as np
 from iblf_jax.control.sensors import Ideal, Measurement
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.engine.plan import LIMITS
+from iblf_jax.engine import lowering_limits
 from iblf_jax.kernels.packed import Shapes, lowered
 from iblf_jax.kernels.passes import written_out
 from iblf_jax.kernels.program import Program
@@ -237,7 +237,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
 
     shapes = [Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry)]
     return written_out(
-        lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program
+        lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, lowering_limits()).program
     )
 
 
