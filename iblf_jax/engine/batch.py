@@ -18,14 +18,14 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import (
     Carry,
     Inputs,
+    Linearization,
+    LinearizationStep,
     Outcome,
-    Probe,
-    Probed,
     TimeStep,
-    probe_steps,
-    probed,
+    linearization_at,
+    linearization_steps,
+    outcome_of,
     start,
-    verdict,
 )
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
@@ -160,21 +160,23 @@ All arrays have the run axis first, records then the time axis; `every` is None 
 recorded."""
 
 
-def _linearized(loop: Loop, batch: Batch, carry: Probed) -> Probed:
-    """What a `Probe` of every run has found."""
-    batch = _batch_of_probe(batch)
-    return loop(Probe(), batch, carry, probe_steps(batch.leaves.first.scenario), None)[0]
+def _linearized(loop: Loop, batch: Batch, carry: Linearization) -> Linearization:
+    """What a `LinearizationStep` of every run has found."""
+    batch = _linearized_batch(batch)
+    return loop(
+        LinearizationStep(), batch, carry, linearization_steps(batch.leaves.first.scenario), None
+    )[0]
 
 
-def _batch_of_probe(batch: Batch) -> Batch:
-    """The batch as a `Probe` reads it, without derivatives."""
+def _linearized_batch(batch: Batch) -> Batch:
+    """The batch as a `LinearizationStep` reads it, without derivatives."""
     leaves = _without_folds(batch.leaves)
     shared, per_run = jax.lax.stop_gradient((leaves.shared, leaves.per_run))
     return batch._replace(leaves=leaves._replace(shared=shared, per_run=per_run))
 
 
 def _without_folds(leaves: Leaves) -> Leaves:
-    """The leaves of inputs without what a `Probe` does not read: one program of it serves all
+    """The leaves of inputs that a `LinearizationStep` reads, so that one program of it serves all
     metrics and derivatives.
     """
     numbered: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
@@ -184,26 +186,28 @@ def _without_folds(leaves: Leaves) -> Leaves:
     return Leaves.of(treedef, is_per_run, [values[i] for i in kept])
 
 
-def _initial_probe(batch: Batch, method: str) -> Probed:
-    """The carry of a `Probe` at the start of every run."""
+def _initial_linearization(batch: Batch, method: str) -> Linearization:
+    """The carry of a `LinearizationStep` at the start of every run."""
 
     def of_run(inputs):
         estimate = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
         state = initial_state(inputs.scenario)
         watched = accuracy.watched_indices(state).size
-        return probed(jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate)
+        return linearization_at(
+            jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate
+        )
 
     return batch.each(of_run)
 
 
-def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Probed]:
-    """The batch for which the program of a `Probe` is made, and the shapes of its carry."""
-    return _batch_of_probe(batch), jax.eval_shape(lambda: _initial_probe(batch, method))
+def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
+    """The batch of the `LinearizationStep`s of some runs, and the shapes of their carry."""
+    return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
-def initialize(loop: Loop, batch: Batch, method: str) -> tuple[Carry, Probed]:
-    """The carry before the first step, and what a `Probe` has found at the start."""
-    found = _linearized(loop, batch, _initial_probe(batch, method))
+def initialize(loop: Loop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
+    """The carry before the first step, and what a `LinearizationStep` has found at the start."""
+    found = _linearized(loop, batch, _initial_linearization(batch, method))
 
     def of_run(inputs, found):
         is_sampled = inputs.scenario.sampling is not None
@@ -223,25 +227,23 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
 
 
 def finalize(
-    loop: Loop, batch: Batch, request: RunRequest, carry: Carry, at_start: Probed
+    loop: Loop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
 ) -> Outcome:
-    """The outcome after the last step, without records; `at_start` is what a `Probe` has found
-    there.
-    """
+    """The outcome after the last step, without records; `at_start` is the linearization there."""
 
     def critical_instants(inputs, carry):
         watched = at_start.jacobian.shape[-1]
         no_estimate = accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
         nearest, end = carry.nearest, inputs.dt * inputs.steps
         instants = (
-            probed(nearest.t, nearest.state, watched, no_estimate),
-            probed(end, perturbed_state(carry.state), watched, no_estimate),
+            linearization_at(nearest.t, nearest.state, watched, no_estimate),
+            linearization_at(end, perturbed_state(carry.state), watched, no_estimate),
         )
         return jax.tree.map(lambda *xs: jnp.stack(xs), *instants)
 
     def outcome(inputs, carry, at_start, later):
         instants = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later)
-        return verdict(inputs, request.method, carry, at_start.unseen, instants)
+        return outcome_of(inputs, request.method, carry, at_start.unresolved, instants)
 
     # Both instants of a run are linearized as two runs, by the program that linearized the start.
     per_run = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.per_run]

@@ -100,7 +100,9 @@ class TangentStep:
 
     def __call__(self, inputs: Inputs, carry: WithTangent, index: jax.Array, options: StepOptions):
         """The carry after the step, and the derivative of what is recorded."""
-        step = TangentStep(self.step, self.places[:-1]) if len(self.places) > 1 else self.step
+        step: Callable = self.step
+        if len(self.places) > 1:
+            step = TangentStep(self.step, self.places[:-1])
         floats, replaced = _floats(carry.carry)
 
         def of(eps, floats):

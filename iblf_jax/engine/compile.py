@@ -30,7 +30,7 @@ from iblf_jax.engine.machine_function import length, machine_function
 from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Inputs, Probe, TimeStep, probe_steps
+from iblf_jax.engine.step import Inputs, LinearizationStep, TimeStep, linearization_steps
 from iblf_jax.kernels.packed import Shapes
 from iblf_jax.kernels.program import Program, UnsupportedError
 from iblf_jax.kernels.toolchain import ToolchainError, stop_compilers
@@ -163,7 +163,9 @@ def time_step_program(batch: Batch, request: RunRequest) -> StepProgram:
 def _linearization_program(batch: Batch, request: RunRequest) -> StepProgram:
     """The program that linearizes the closed loop at the start and at the end of a run."""
     batch, carry = linearization_batch(batch, request.method)
-    return StepProgram.of(Probe(), batch, carry, probe_steps(batch.leaves.first.scenario))
+    return StepProgram.of(
+        LinearizationStep(), batch, carry, linearization_steps(batch.leaves.first.scenario)
+    )
 
 
 def start_build(executor: Executor, program: StepProgram) -> None:

@@ -128,7 +128,12 @@ def pushed(
       before: carry and tangents, or None where the function takes no carry.
       dtype: of the tangents.
     """
-    floats, replaced = floats_of_carry(before.carry) if before else ([], lambda _: None)
+    floats: list[jax.Array] = []
+    tangents_before: list[jax.Array] = []
+    replaced: Callable = lambda _: None  # noqa: E731
+    if before is not None:
+        floats, replaced = floats_of_carry(before.carry)
+        tangents_before = before.tangents
 
     def of(eps, floats):
         return function(directions.moved(scenario, eps), replaced(floats), eps)
@@ -140,7 +145,7 @@ def pushed(
         return value, tangent, rest
 
     units = np.eye(directions.tangents, dtype=dtype)
-    return jax.vmap(along, out_axes=(None, 0, None))(units, before.tangents if before else [])
+    return jax.vmap(along, out_axes=(None, 0, None))(units, tangents_before)
 
 
 def without_flags(sample: Sample) -> Any:
@@ -160,8 +165,9 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
 
     def loop(moved, t, state, dt=0.0, torque=None):
         # A stage's time moves where a torque arrives within a step, or a jump time does.
-        parts = (() if torque is None else (torque,)), ((t,) if torque is not None or jumps else ())
-        leaves, structure = jax.tree.flatten((state, *parts))
+        torques = tuple(x for x in (torque,) if x is not None)
+        times = tuple(x for x in (t,) if torque is not None or jumps)
+        leaves, structure = jax.tree.flatten((state, torques, times))
         real = [jnp.issubdtype(x.dtype, jnp.floating) for x in leaves]
         here, unravel = ravel_pytree([x for x, yes in zip(leaves, real, strict=True) if yes])
         flags = [x for x, yes in zip(leaves, real, strict=True) if not yes]

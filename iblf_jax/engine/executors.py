@@ -15,7 +15,7 @@ import numpy as np
 from iblf_jax.engine import plan
 from iblf_jax.engine.batch import Batch, Leaves, Loop
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.engine.step import Probe, StepOptions, is_derivative, keep_if
+from iblf_jax.engine.step import LinearizationStep, StepOptions, is_derivative, keep_if
 from iblf_jax.kernels.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
 
 
@@ -76,7 +76,7 @@ def checkpointed(
 
     Only every T^(2/3)-th state is kept; the others are computed again, in three nested loops.
     """
-    if every is not None or isinstance(step, Probe):
+    if every is not None or isinstance(step, LinearizationStep):
         return scan(step, batch, carry, steps, every)
     inner, blocks = plan.checkpoint_edge(steps)
     options = StepOptions(batch.layout.rolled)
@@ -155,7 +155,9 @@ def lowered_on(
         after, arrays = run_program(
             found.program, shared, per_run, pack(flat, shapes, dtype, runs), steps, every
         )
-        records = unpacked_records(found.records, arrays) if every else ()
+        records = ()
+        if every:
+            records = unpacked_records(found.records, arrays)
         return jax.tree.unflatten(treedef, unpack(after, shapes, runs)), records
 
     return executor

@@ -1,4 +1,4 @@
-"""What one step of a scenario costs, counted on its scalar program: the roofline in plain sight."""
+"""`explain`: what one step of a scenario costs, counted on its scalar program."""
 
 from __future__ import annotations
 
@@ -101,10 +101,11 @@ def explain(
         path: jnp.asarray(get(scenario, path))[None]
         for path in {"initial.q", "initial.dq", *varied}
     }
-    noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
+    if has_noise(scenario):
+        leaves[NOISE_NAME] = jnp.zeros((1, 4), jnp.float32)
     one = Batch.of(
         inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
-        leaves | noise,
+        leaves,
         constants=known_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
@@ -112,12 +113,14 @@ def explain(
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = automatic()
-    backend = f"{name}: {reason}" if reason else name
     columns = (
         f"by numbers of the scenario on {name}, one run a number, first and second ones; others by"
         " plain JAX"
     )
-    derivatives = f"by plain JAX: {reason}" if reason else columns
+    backend, derivatives = name, columns
+    if reason:
+        backend = f"{name}: {reason}"
+        derivatives = f"by plain JAX: {reason}"
     return Explanation(
         counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives
     )
@@ -142,7 +145,9 @@ def instructions(program: Program, width: int) -> float:
     total = -len(fused - {None})
     for op, n in counted.items():
         cost = OPERATIONS[op].cost
-        total += n * (LIBRARY_CALL * width if cost is None else cost)
+        if cost is None:
+            cost = LIBRARY_CALL * width
+        total += n * cost
     return total
 
 

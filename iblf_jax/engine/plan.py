@@ -88,7 +88,7 @@ tenth of a second, and two tenths of a per cent of time for the calls.  The pape
 steps."""
 NATIVE_FEW = 80
 """Steps up to which the kernel of a batch also runs a single run: so few steps take less time than
-a build of their own, and the linearization of a run (`Probe`) serves a batch too."""
+a build of their own, and the linearization of a run (`LinearizationStep`) serves a batch too."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to
 wait."""

@@ -35,7 +35,7 @@ from iblf_jax.engine.compile import (
 from iblf_jax.engine.executors import lowered_on, scan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Carry, Outcome, Probed, TimeStep
+from iblf_jax.engine.step import Carry, Linearization, Outcome, TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.kernels.toolchain import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
@@ -135,7 +135,7 @@ def _steps_per_call(executor: Executor, nodes: int, request: RunRequest) -> int:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _initialize(parts: Parts, request: RunRequest, leaves: list) -> tuple[Carry, Probed]:
+def _initialize(parts: Parts, request: RunRequest, leaves: list) -> tuple[Carry, Linearization]:
     return initialize(parts.loop, parts.batch(leaves, request), request.method)
 
 
@@ -186,7 +186,7 @@ def _first_run(records: Any, request: RunRequest) -> Any:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _finalize(
-    parts: Parts, request: RunRequest, leaves: list, carry: Carry, at_start: Probed
+    parts: Parts, request: RunRequest, leaves: list, carry: Carry, at_start: Linearization
 ) -> Outcome:
     outcome = finalize(parts.loop, parts.batch(leaves, request), request, carry, at_start)
     return jax.tree.map(lambda x: x[0], outcome)
