@@ -114,10 +114,10 @@ is filled up from, 0.16 s, 0.13 s and 0.28 s."""
 STUDY_MEMORY = 256 * 2**20
 """Bytes that runs in flight may take, unless the caller says otherwise."""
 STEP_SIZE_CHUNK = 1000
-"""Steps between two looks at the pair of runs that tells a step size."""
+"""Steps after which the pair of runs that decides on a step size is assessed again."""
 STUDY_IN_FLIGHT = 4
-"""Blocks that are made for a device at once, each by a thread: what surrounds a kernel goes beside
-another's."""
+"""Blocks that are computed on a device at the same time, each by a thread, so that draws and results
+of one block are handled while the kernel of another one runs."""
 SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
 """Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that
 a sweep has at least, if it is large."""
@@ -313,12 +313,14 @@ def xla_stretch(steps: int, every: int) -> int:
     if steps <= most:
         return steps
     exact = next((d for d in range(most, 0, -every) if steps % d == 0), 0)
-    return exact if exact > most // 16 else most
+    if exact > most // 16:
+        return exact
+    return most
 
 
 def native_build(nodes: int, narrow: bool) -> tuple[int | None, tuple[str, ...]]:
-    """Nodes of a function of the generated C, None for one function, and how the compiler is told
-    to take it.
+    """Nodes of a function of the generated C, None for one function, and the flags of
+    the compiler.
 
     Args:
       nodes: of the step.

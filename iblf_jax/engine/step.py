@@ -720,8 +720,8 @@ class Linearization(NamedTuple):
 class LinearizationStep:
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where these
-    are the complete state, the modes follow from them; otherwise a power iteration adds more
+    The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where
+    these are the complete state, the modes follow from them; otherwise a power iteration adds more
     directions.
     """
 

@@ -99,8 +99,10 @@ def _advanced(
     """
 
     def chunk(scenario, dt, steps, pair):
+        times = scenario.jump_times()
+
         def one(pair, _):
-            after = _one_step(scenario, dt, pair, method)
+            after = _one_step(scenario, times, dt, pair, method)
             goes_on = pair.going & (pair.step < steps)
             return jax.tree.map(partial(jnp.where, goes_on), after, pair), None
 
@@ -109,9 +111,9 @@ def _advanced(
     return machine_function(chunk)(scenario, dt, steps, pair)
 
 
-def _one_step(scenario: Scenario, dt: jax.Array, pair: Pair, method: str) -> Pair:
-    """Both runs one step later."""
-    n, times = scenario.n, scenario.jump_times()
+def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, method: str) -> Pair:
+    """Both runs one step later; `times` are the jump times."""
+    n = scenario.n
     as_state = ravel_pytree(initial_state(scenario))[1]
     number = pair.step.astype(dt.dtype)
     begin, end = number * dt, (number + 1.0) * dt

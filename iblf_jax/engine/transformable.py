@@ -61,7 +61,7 @@ class Runs(NamedTuple):
 
     @property
     def plan(self) -> ExecutionPlan:
-        """One executor; no warning tells of the scan, which gives the same derivatives."""
+        """One executor; no warning reports the scan, which gives the same derivatives."""
         return ExecutionPlan((self.executor,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
 
 
