@@ -81,7 +81,9 @@ def is_valid(run: Any) -> bool:
 def time_grid(run: Any) -> TimeGrid:
     """The steps of a run; ValueError if its samples do not determine them."""
     t, dt = np.asarray(run.t, float), float(run.dt)
-    every = int(np.rint((t[1] - t[0]) / dt)) if t.size > 1 else (run.steps or 0) + 1
+    every = (run.steps or 0) + 1
+    if t.size > 1:
+        every = int(np.rint((t[1] - t[0]) / dt))
     tolerance = 16 * np.finfo(np.asarray(run.t).dtype).eps * max(abs(t[-1]), dt)
     if every < 1 or not np.all(np.abs(t - np.arange(t.size) * every * dt) <= tolerance):
         raise checks.fail(

@@ -91,8 +91,9 @@ class RunSummary:
         if case == 1 and self.case == 2:
             return self._why_case_2()
         if not self.rho[case, "run"] > 0:
-            condition = "(F.3)" if self.claims.bounds_velocities else CONDITION[case]
-            return f"the gain conditions {condition} are not met"
+            if self.claims.bounds_velocities:
+                return "the gain conditions (F.3) are not met"
+            return f"the gain conditions {CONDITION[case]} are not met"
         return self._why_excluded()
 
     def why_not_weighted(self, case: int) -> str:
@@ -222,8 +223,9 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
     scenario = run.scenario
     claimed = claims.claims_of(scenario)
     over_box = eigenvalues_over(scenario.model, extrema.low, extrema.high)
-    case = 1 if extrema.steady else 2
-    F_d = 0.0 if case == 1 else float(extrema.F_d)
+    case, F_d = 2, float(extrema.F_d)
+    if extrema.steady:
+        case, F_d = 1, 0.0
     jumps = np.sort(np.ravel(np.asarray(scenario.jump_times())))
     return RunSummary(
         run=run,

@@ -19,7 +19,6 @@ from iblf_jax.certificates import claims
 from iblf_jax.certificates.claims import CASES, FullClaim
 from iblf_jax.certificates.lines import (
     FAILS,
-    HOLDS,
     NOT_APPLICABLE,
     OBSERVED_ONLY,
     Line,
@@ -29,6 +28,7 @@ from iblf_jax.certificates.lines import (
     check_smallest,
     join_notes,
     not_applicable,
+    verdict_of,
 )
 from iblf_jax.certificates.reconstruction import padded_index
 from iblf_jax.certificates.run_summary import RunSummary, Segment
@@ -162,7 +162,7 @@ def _assumptions(segment: Segment) -> list[Line]:
 def _finite(statement: Statement, t: np.ndarray, values: np.ndarray, note: str = "") -> Line:
     """The line of a quantity that must be finite at every step, with its largest value."""
     at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
-    verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
+    verdict = verdict_of(bool(np.all(np.isfinite(values))))
     return statement.line(verdict, value=float(values[at]), time=float(t[at]), note=note)
 
 
@@ -181,7 +181,7 @@ def _with_status(summary: RunSummary, line: Line, flag: Status) -> Line:
     """A line about something that the run's status reports, too: the verdict is that of the status,
     which covers every step of the run itself.
     """
-    verdict = FAILS if int(summary.run.status) & int(flag) else HOLDS
+    verdict = verdict_of(not int(summary.run.status) & int(flag))
     if verdict == line.verdict:
         return line
     return dataclasses.replace(
@@ -265,7 +265,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
         reason = summary.why_not_theorem(1)
     if reason or constants is None:
         return not_applicable(statement, reason)
-    source: Any = summary if domain == "run" else summary.over_box
+    source: Any = {"run": summary, "box": summary.over_box}[domain]
     terms = claims.rho_terms(
         constants, jnp.asarray(source.lambda_max), case, jnp.asarray(source.lambda_min)
     )
@@ -274,7 +274,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     if full:
         least = ["the decay rate of V1", "the decay rate of phi", "kf and c"]
         eigenvalue = f"lambda_min(M0) = {source.lambda_min:.4g} kg m^2"
-    searched = f" ({summary.over_box.searched})" if domain == "box" else ""
+    searched = {"run": "", "box": f" ({summary.over_box.searched})"}[domain]
     line = check_positive(
         statement,
         summary.rho[case, domain],
@@ -302,7 +302,9 @@ def left_side(segment: Segment, case: int) -> np.ndarray:
     """The left side of the differential inequality at every step, (T,) [1/s]."""
     proof = segment.proof
     left = proof.dV + segment.summary.rho[case, "run"] * proof.V
-    return left if case == 1 else left - 0.5 * np.sum(proof.df**2, axis=1)
+    if case == 2:
+        left = left - 0.5 * np.sum(proof.df**2, axis=1)
+    return left
 
 
 def _inequality(segment: Segment, case: int) -> Line:
@@ -497,7 +499,7 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
         "1/s",
     )
     unclaimed = summary.claims.no_theorem or summary.invalid
-    why_no_case = "" if case else summary.why_not_theorem(summary.case)
+    why_no_case = summary.why_not_theorem(case or summary.case)
     terms = (
         (by_law, proof.dropped_e2, _why_law_is_exact(summary)),
         (by_observer, proof.dropped_f, _why_observer_is_exact(summary)),

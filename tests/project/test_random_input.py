@@ -460,7 +460,7 @@ def no_runs(monkeypatch):
         "tuning.problem.gradient",
         "tuning._falsify._push",
         "engine.explain.instructions",
-        "certificates._certify._one",
+        "certificates._certify._certificate_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     monkeypatch.setattr(
