@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -23,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import notices
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry
 from iblf_jax.engine.batch import Batch, carry_shapes, linearization_batch
 from iblf_jax.engine.executors import lowered_on, program_of
@@ -44,12 +44,12 @@ class BackendWarning(UserWarning):
     """A batch runs on another backend than the requested one, and why."""
 
 
-_warned: set[str] = set()
+WARNINGS = "backend warnings"
+"""Topic of the marks of the warnings that this process has shown."""
 
 
 def _warn_once(text: str) -> None:
-    if text not in _warned:
-        _warned.add(text)
+    if CACHE.mark(WARNINGS, text):
         notices.warn(text, BackendWarning)
 
 
@@ -225,7 +225,7 @@ def structural_part(request: RunRequest) -> RunRequest:
 # --- batches ---
 
 
-@lru_cache(maxsize=64)
+@CACHE.memoised(64)
 def executor_of_batch(request: RunRequest, machine: Machine, structure: Any, shapes: tuple) -> str:
     """The executor that can run a batch, its kernels built; "vmap" for the scan.
 
@@ -277,7 +277,7 @@ def single_batch(inputs: Inputs, request: RunRequest, layout: plan.BatchLayout) 
     return Batch.of(inputs, start, layout, request.constants)
 
 
-@lru_cache(maxsize=256)
+@CACHE.memoised(256)
 def plan_of_single_run(
     request: RunRequest, machine: Machine, structure: Any, shapes: tuple
 ) -> SingleRunPlan:

@@ -5,13 +5,13 @@ scalar program (`lowered_on`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan
 from iblf_jax.engine.batch import Batch, Leaves, Loop
 from iblf_jax.engine.machine_function import machine_function
@@ -102,7 +102,7 @@ def checkpointed(
     return batch.each(one, carry)
 
 
-@lru_cache(maxsize=64)
+@CACHE.memoised(64)
 def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) -> Callable:
     """A step as a function of lists of leaves, for `lowered`; the same object for the same
     structure.

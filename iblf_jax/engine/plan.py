@@ -116,8 +116,8 @@ STUDY_MEMORY = 256 * 2**20
 STEP_SIZE_CHUNK = 1000
 """Steps after which the pair of runs that decides on a step size is assessed again."""
 STUDY_IN_FLIGHT = 4
-"""Blocks that are computed on a device at the same time, each by a thread, so that draws and results
-of one block are handled while the kernel of another one runs."""
+"""Blocks that are computed on a device at the same time, each by a thread: draws and results of one
+block are handled while the kernel of another one runs."""
 SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
 """Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that
 a sweep has at least, if it is large."""

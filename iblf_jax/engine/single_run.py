@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry
 from iblf_jax.engine.batch import Batch, finalize, initialize, run_all
 from iblf_jax.engine.compile import (
@@ -40,9 +41,9 @@ from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.kernels.toolchain import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
-_failed_builds: set[tuple] = set()
-"""Executor, structure and shapes of the runs whose kernels could not be built; they are not tried
-again in this process."""
+FAILED_BUILDS = "failed builds"
+"""Topic of the marks of executor, structure and shapes of the runs whose kernels could not be built;
+they are not tried again in this process."""
 
 
 def run_one(
@@ -69,7 +70,7 @@ def run_one(
                 return _run_lowered(executor, structure, found, request, leaves)
         except ToolchainError as error:
             if not isinstance(error, StoppedError):
-                _failed_builds.add((executor.name, structure, shapes))
+                CACHE.mark(FAILED_BUILDS, (executor.name, structure, shapes))
             raise
 
     def by_scan() -> Outcome:
@@ -82,12 +83,10 @@ def run_one(
 
 def _without_failed(found: SingleRunPlan, structure: Any, shapes: tuple) -> plan.ExecutionPlan:
     """The plan without executors whose kernels could not be built."""
-    if not _failed_builds:
-        return found.execution
     names = tuple(
         name
         for name in found.execution.executors
-        if (name, structure, shapes) not in _failed_builds
+        if not CACHE.is_marked(FAILED_BUILDS, (name, structure, shapes))
     )
     return found.execution._replace(executors=names)
 

@@ -248,7 +248,7 @@ def _in_pieces(
     ]
     found = (
         done.state,
-        [x + more - less for x, more, less in zip(after[1], done.gained, whole, strict=True)],
+        [x + more - less for x, more, less in zip(after[1], done.gained, full_step, strict=True)],
     )
     return jax.tree.map(lambda new, old: jnp.where(done.usable, new, old), found, after)
 

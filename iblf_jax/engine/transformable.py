@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,6 +24,7 @@ from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
 from iblf_jax.core import checks
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
@@ -94,7 +95,7 @@ def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
     return run_all(scan, Batch.of(inputs, None, layout), runs.request)
 
 
-@lru_cache(maxsize=64)
+@CACHE.memoised(64)
 def _differentiable(runs: Runs, beside_derivative: bool = False) -> Callable:
     """The run, with derivatives by the kernel.
 

@@ -13,6 +13,7 @@ from conftest import PAPER, SHORT
 from made_up_runs import ALWAYS
 
 import iblf_jax as ij
+from iblf_jax.core.caches import CACHE
 from iblf_jax.core.status import Status
 from iblf_jax.engine import compile, native, plan, registry, single_run, step, transformable
 from iblf_jax.kernels.program import UnsupportedError
@@ -408,8 +409,8 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     broken.chmod(0o755)
     short = {"duration": 0.1, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
     expected = ij.simulate(paper, **short)
-    monkeypatch.setattr(compile, "_warned", set())
-    monkeypatch.setattr(single_run, "_failed_builds", set())
+    CACHE.clear(compile.WARNINGS)
+    CACHE.clear(single_run.FAILED_BUILDS)
     for part in (single_run._initialize, single_run._advance):
         part.clear_cache()
     native.kernel.cache_clear()
@@ -425,7 +426,7 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
             warnings.simplefilter("error")
             ij.simulate(paper, **short | {"duration": 0.11}, backend="native")
             np.testing.assert_allclose(ij.simulate(paper, **short).q, expected.q, rtol=1e-12)
-    single_run._failed_builds.clear()
+    CACHE.clear(single_run.FAILED_BUILDS)
     np.testing.assert_array_equal(ij.simulate(paper, **short, backend="native").q, expected.q)
 
 

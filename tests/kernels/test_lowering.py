@@ -14,6 +14,7 @@ import pytest
 from arm_cases import random_arm
 
 import iblf_jax as ij
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import compile, execute, plan
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.executors import program_of
@@ -453,7 +454,7 @@ class _Odd(ij.observers.NoObserver):
 def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
     scenario = canonical(dataclasses.replace(PRESET, observer=_Odd()))
     varied = {"plant.mass[1]": jnp.asarray([0.8, 0.9])}
-    compile._warned.clear()
+    CACHE.clear(compile.WARNINGS)
 
     def run():
         return jax.jit(

@@ -19,6 +19,7 @@ from made_up_runs import ALWAYS
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import compile, execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
@@ -370,7 +371,7 @@ def test_forward_sensitivities(monkeypatch, written_out):
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(compile, "_warned", set())
+    CACHE.clear(compile.WARNINGS)
     native.kernel.cache_clear()
     called = []
     with pytest.warns(compile.BackendWarning, match="no-such-compiler.*xla"):

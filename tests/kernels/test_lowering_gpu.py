@@ -23,6 +23,7 @@ from test_lowering import DT, MEMBERS, STANDARD, carry_of, evaluate, with_member
 from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import compile, execute, gpu, plan, registry
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
@@ -109,7 +110,7 @@ def gpu_for_this_platform(monkeypatch, **changes):
 def runs_here(monkeypatch):
     """The gpu backend runs here, in stretches of 64 steps, on a CPU in blocks of 32 threads."""
     monkeypatch.setattr(plan, "GPU_STRETCH", 64)
-    monkeypatch.setattr(compile, "_warned", set())
+    CACHE.clear(compile.WARNINGS)
     if not ON_A_GPU:
         gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run)
 
@@ -300,7 +301,7 @@ def test_threads_in_a_block(runs, threads):
 
 @needs_a_cpu
 def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
-    monkeypatch.setattr(compile, "_warned", set())
+    CACHE.clear(compile.WARNINGS)
     called = []
     with pytest.warns(
         compile.BackendWarning,
@@ -333,7 +334,7 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     def missing(*_):
         raise ToolchainError("there is no NVRTC")
 
-    monkeypatch.setattr(compile, "_warned", set())
+    CACHE.clear(compile.WARNINGS)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(nvrtc, "library", missing)
