@@ -31,9 +31,7 @@ from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Inputs, LinearizationStep, TimeStep, linearization_steps
-from iblf_jax.kernels.packed import Shapes
-from iblf_jax.kernels.program import Program, UnsupportedError
-from iblf_jax.kernels.toolchain import ToolchainError, stop_compilers
+from iblf_jax.kernels import Program, Shapes, ToolchainError, UnsupportedError, stop_compilers
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 

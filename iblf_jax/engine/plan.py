@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from iblf_jax.kernels.program import LoweringLimits
+from iblf_jax.kernels import LoweringLimits
 
 if TYPE_CHECKING:
     from iblf_jax.engine.registry import Machine

@@ -11,9 +11,7 @@ from typing import NamedTuple
 
 from iblf_jax.core import devices
 from iblf_jax.engine import gpu, native, plan, xla
-from iblf_jax.kernels.packed import pack, unpack
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import Program
+from iblf_jax.kernels import Program, pack, unpack, written_out
 
 
 class Limits(NamedTuple):

@@ -38,7 +38,7 @@ from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Carry, Linearization, Outcome, TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
-from iblf_jax.kernels.toolchain import StoppedError, ToolchainError
+from iblf_jax.kernels import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
 FAILED_BUILDS = "failed builds"

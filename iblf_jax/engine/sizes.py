@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from iblf_jax.core import devices
 from iblf_jax.engine import plan
-from iblf_jax.kernels.program import LoweringLimits
+from iblf_jax.kernels import LoweringLimits
 
 STUDY_MEMORY = plan.STUDY_MEMORY
 """Bytes that runs in flight may take, unless the caller gives another number."""

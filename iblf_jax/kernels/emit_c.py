@@ -21,7 +21,15 @@ import numpy as np
 from iblf_jax.kernels.layout import FunctionCalls, Layout, literal, places, unpacked
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.passes import scheduled
-from iblf_jax.kernels.program import LANE, TIME, Node, Program, UnsupportedError, frontier, needed
+from iblf_jax.kernels.program import (
+    PER_RUN,
+    TIME,
+    Node,
+    Program,
+    UnsupportedError,
+    frontier,
+    needed,
+)
 
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
@@ -345,7 +353,7 @@ def _advance(
 ) -> str:
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
-    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
+    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "per_run"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
         c: f"ints[{k}]" for k, c in enumerate(ints)
     }
@@ -357,7 +365,7 @@ def _advance(
         if program.carry[c][0] >= 0:
             names[program.carry[c][0]] = f"c{c}"
     e.in_place = _in_place(program)
-    e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
+    e.statements(names, frontier(program, classes, PER_RUN, lambda k: k == PER_RUN | TIME))
     e.lines += [e.calls.declarations, *e.calls.once_statements(names)] if e.calls.functions else []
     e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
     names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
@@ -391,7 +399,7 @@ def _in_place(program: Program) -> dict[int, int]:
     found = {}
     for a, o in program.carry:
         node = nodes[o]
-        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & LANE:
+        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & PER_RUN:
             (new,) = [x for x in node.args[1:] if x != a]
             # A call whose result is the new number has read the one before.
             if uses[a] == 1 + (
@@ -501,13 +509,15 @@ def _advance_in_segments(
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
-    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
+    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "per_run"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
         c: f"ints[{k}]" for k, c in enumerate(ints)
     }
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
     segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
-    before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
+    before = segments.add(
+        frontier(program, classes, PER_RUN, lambda k: k == PER_RUN | TIME), kept=True
+    )
     outputs = sorted({o for _, o in program.carry})
     within = segments.add(
         sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iblf_jax.kernels.program import LANE, SHARED, TIME, Node, Program, frontier
+from iblf_jax.kernels.program import PER_RUN, SHARED, TIME, Node, Program, frontier
 
 
 def literal(node: Node, dtype: np.dtype) -> str:
@@ -62,7 +62,7 @@ class Layout(NamedTuple):
         classes, kinds = program.classes(), program.kinds
         return Layout(
             frontier(program, classes, SHARED, lambda c: c != SHARED),
-            frontier(program, classes, TIME, lambda c: bool(c & LANE)),
+            frontier(program, classes, TIME, lambda c: bool(c & PER_RUN)),
             [i for i, kind in enumerate(kinds) if kind == "f"],
             [i for i, kind in enumerate(kinds) if kind != "f"],
         )
@@ -175,7 +175,7 @@ class FunctionCalls:
             return literal(node, self.dtype)
         if value in self._constants:
             return unpacked(node, self._constants[value])
-        if self._classes[value] != LANE or node.kind != "f":
+        if self._classes[value] != PER_RUN or node.kind != "f":
             return None
         if value not in self.once:
             self.once.append(value)

@@ -16,7 +16,7 @@ import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.core.status import Status
 from iblf_jax.engine import compile, native, plan, registry, single_run, step, transformable
-from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.kernels import UnsupportedError, cpu
 from iblf_jax.simulation.scenario import canonical
 
 PATHS = (
@@ -413,8 +413,8 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     CACHE.clear(single_run.FAILED_BUILDS)
     for part in (single_run._initialize, single_run._advance):
         part.clear_cache()
-    native.kernel.cache_clear()
-    native._turner.cache_clear()
+    cpu.kernel.cache_clear()
+    cpu.rows_function.cache_clear()
     with monkeypatch.context() as patch:
         patch.setenv("CXX", str(broken))
         with pytest.warns(
