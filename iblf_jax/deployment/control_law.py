@@ -233,12 +233,10 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
         after, results = function(*parts, index)
         return jax.tree.leaves(after), jax.tree.leaves(results)
 
-    shapes = [Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry)]
-    return written_out(
-        compile_step(
-            on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, lowering_limits()
-        ).program
-    )
+    dtype = np.dtype(scenario.initial.q.dtype)
+    shared, per_run, carried = (Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry))
+    step = compile_step(on_leaves, dtype, shared, per_run, carried, lowering_limits())
+    return written_out(step.program)
 
 
 def number_names(tree: Any) -> tuple[str, ...]:

@@ -42,7 +42,7 @@ from iblf_jax.kernels import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
 FAILED_BUILDS = "failed builds"
-"""Topic of the marks of executor, structure and shapes of the runs whose kernels could not be built;
+"""Topic of the marks of runs whose kernels could not be built, by executor, structure and shapes;
 they are not tried again in this process."""
 
 
