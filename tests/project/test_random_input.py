@@ -32,7 +32,7 @@ from iblf_jax import barriers, bounds, cli, robots
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
-from iblf_jax.engine import simulate
+from iblf_jax.engine import CompiledBatch, simulate
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
@@ -269,7 +269,7 @@ def test_no_silent_nan_in_a_run(paper, values):
     """Any numbers in any leaves: refused, or run; a run that is not finite says so, and its records
     are finite up to there."""
     # The step that a warning names takes longer to find than the run; other tests look at it.
-    with mock.patch("iblf_jax.engine.simulate.find_dt", return_value=1e-4):
+    with mock.patch("iblf_jax.engine.diagnosis.find_dt", return_value=1e-4):
         run = accepts_or_value_error(
             lambda: ij.simulate(ij.with_parameters(paper, values), **SHORT)
         )
@@ -463,7 +463,9 @@ def no_runs(monkeypatch):
         "certificates._certify._certificate_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
-    monkeypatch.setattr("iblf_jax.studies.blocks.chosen_backend", lambda *_, **__: "xla")
+    monkeypatch.setattr(
+        "iblf_jax.studies.blocks.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+    )
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
