@@ -46,9 +46,7 @@ def simplify(b: Builder, op: str, args: tuple[int, ...], kind: str) -> int | Non
 
 
 def without_absent(b: Builder, op: str, args: tuple[int, ...]) -> int | None:
-    """op(*args), of which one is absent (`Builder.absent`); None for an operation for which it is an
-    ordinary zero.
-    """
+    """op(*args), of which one is absent (`Builder.absent`); None if it counts as a usual zero."""
     x = args[0]
     y = args[-1]
     if op in ("mul", "neg") or (op == "div" and y != b.absent):
@@ -271,6 +269,17 @@ def _extreme(b: Builder, args, kind):
 
 
 _RULES = {
-    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "abs": _abs, "select": _select,
-    "and": _logic(True), "or": _logic(False), "not": _not, "is_finite": _is_finite, "max": _extreme, "min": _extreme,
-}  # fmt: skip
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "neg": _neg,
+    "abs": _abs,
+    "select": _select,
+    "and": _logic(True),
+    "or": _logic(False),
+    "not": _not,
+    "is_finite": _is_finite,
+    "max": _extreme,
+    "min": _extreme,
+}

@@ -135,5 +135,5 @@ OPERATIONS: dict[str, Operation] = {
     "convert": Operation(None, None, 1, {}, cheap=True, primitives=()),
     "lookup": Operation(None, None, 24, {}, primitives=()),
 }
-"""The operations of a program, besides constants and inputs. The effect of "convert" depends on both
-kinds, and a "lookup" has a table."""
+"""The operations of a program, besides constants and inputs. The effect of "convert" depends on
+both kinds, and a "lookup" has a table."""
