@@ -143,10 +143,10 @@ def run(
     name = kernel(program, shared.size, per_run.shape[0], build)
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     outputs += record_shapes(program, runs, steps, every)
-    settings = jnp.asarray(np.asarray([[0, steps, every or 0, threads]], np.int32))
+    attributes = jnp.asarray(np.asarray([[0, steps, every or 0, threads]], np.int32))
     if not isinstance(first, int) or first:
-        settings = settings.at[0, 0].set(first)
+        attributes = attributes.at[0, 0].set(first)
     floats, ints, *records = jax.ffi.ffi_call(name, outputs)(
-        shared.reshape(1, -1), per_run, *carry, settings
+        shared.reshape(1, -1), per_run, *carry, attributes
     )
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]

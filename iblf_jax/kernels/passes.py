@@ -61,7 +61,7 @@ def written_out(program: Program) -> Program:
 
     def rule(b: Builder, node, args, i):
         if node.op == "call":
-            results[i] = _inlined(b, node.value, args[-len(arguments_of(node)) :])
+            results[i] = _inlined(b, node.value, args[len(args) - len(arguments_of(node)) :])
             return -1
         if node.op == "result":
             return results[node.args[0]][node.value]

@@ -1,4 +1,4 @@
-"""The rules of the primitives that only rearrange numbers: they are applied to node numbers at once.
+"""The rules of the primitives that only rearrange numbers: they are applied to node numbers.
 
 An index that is unknown at compile time (the piece of a spline at time t) becomes a selection among
 the possible entries, or a lookup if all of these are constants.
