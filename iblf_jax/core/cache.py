@@ -1,14 +1,13 @@
-"""The folder of the user's in which compiled programs are kept between processes, XLA's and our own
-kernels.
+"""The user's folder of compiled programs, XLA's and our own kernels, which later processes reuse.
 
 It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of
-processor.  It is used from the first run of a process on, unless JAX has been given a folder of its
-own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used longest ago is removed
-once all takes more than LIMIT; removing the folder loses nothing but time.
+processor.  The first run of a process enables it, unless the user has configured another folder
+of JAX or disabled its cache (JAX_ENABLE_COMPILATION_CACHE=0).  When all entries take more than
+LIMIT, the least recently used ones are removed.  The folder may be deleted at any time.
 
-JAX loads whatever it finds under the name of a program.  In our folder each of its entries
-therefore ends in a digest of its name and its content: one that is damaged, or belongs to another
-  program, or is no file, is removed, and the program is compiled again.
+JAX does not verify what it loads.  In our folder each of its entries therefore ends in a digest of
+its name and its content: an entry that is damaged, belongs to another program or is not a file is
+removed, and the program is compiled again.
 """
 
 from __future__ import annotations
@@ -42,10 +41,9 @@ IN_USE = 3600.0
 
 
 class VerifiedCache:
-    """JAX's cache of compiled programs (`base`, in `folder`), of which only entries that are whole
-    and in their own place are used.
+    """JAX's cache of compiled programs (`base`, in `folder`) with verified entries.
 
-    It offers what JAX asks of a cache: `get` and `put`.
+    It has the two methods that JAX calls: `get` and `put`.
     """
 
     def __init__(self, base: Any, folder: Path) -> None:
@@ -60,9 +58,11 @@ class VerifiedCache:
         except OSError:
             return None
         # Only a file is opened: at a pipe, a reader waits.
-        whole = self._base.get(key) if is_file else None
-        if whole is not None:
-            image, digest = whole[:-DIGEST_SIZE], whole[-DIGEST_SIZE:]
+        entry = None
+        if is_file:
+            entry = self._base.get(key)
+        if entry is not None:
+            image, digest = entry[:-DIGEST_SIZE], entry[-DIGEST_SIZE:]
             if digest == entry_digest(key, image):
                 return image
         _remove(path)
@@ -112,13 +112,15 @@ def _verify_entries(folder: Path) -> None:
 
 @memoised(1)
 def keep_programs() -> None:
-    """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to,
-    or no folder is safe; once a process.
+    """Removes old entries and enables JAX's cache on the disk, once per process.
+
+    JAX's cache stays as it is where the user has configured or disabled it, or where no folder is
+    safe.
     """
     try:
         top = directory()
-        stranger = _not_ours(top)
-        if stranger is None:
+        foreign = _not_ours(top)
+        if foreign is None:
             _trim(top)  # kernels are here whatever JAX does
         config: Any = jax.config  # its fields are made when JAX starts
         if (
@@ -130,13 +132,13 @@ def keep_programs() -> None:
         # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are
         # shared by machines.
         folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
-        if stranger is None:
+        if foreign is None:
             folder.mkdir(mode=0o700, exist_ok=True)
-            stranger = _not_ours(folder)
+            foreign = _not_ours(folder)
     except OSError:
         return
-    if stranger is not None:
-        problem = f"{top} holds {stranger!r}, a link or of another user; remove it."
+    if foreign is not None:
+        problem = f"{top} holds {foreign!r}, a link or of another user; remove it."
         notices.warn(f"compiled programs are not kept: {problem}")
     elif os.access(folder, os.W_OK | os.X_OK):
         config.update("jax_compilation_cache_dir", str(folder))

@@ -33,8 +33,7 @@ class Reference(Protocol):
 
 @component
 class Sinusoid:
-    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.
-    (4.2)
+    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.              (4.2)
 
     Args:
       offset: middle of the motion, () or (n,) [rad].

@@ -18,8 +18,7 @@ STARTS = ("zero", "matched")
 
 @component
 class Printed:
-    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q').
-    (3.11)
+    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q').    (3.11)
 
     Its error obeys f_tilde' = f' - kf f_tilde - kf M0' q': the last term is what `Momentum`
     removes.

@@ -84,4 +84,6 @@ class Payload:
         has looked at.
         """
         P = pseudo_inertia(self.mass, self.centre, self.inertia)
-        return P if self.start is None else jnp.zeros_like(P)
+        if self.start is None:
+            return P
+        return jnp.zeros_like(P)
