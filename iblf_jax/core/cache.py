@@ -31,13 +31,13 @@ from iblf_jax.kernels import cpuinfo, directory, processor
 LIMIT = 2 * 2**30
 """Bytes."""
 JAX_SUFFIX = "-cache"
-"""Of the names of JAX's entries."""
+"""Suffix of the names of JAX's entries."""
 SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin")
-"""Of the names of what may be removed: JAX's and ours."""
+"""Suffixes of the names of entries that may be removed: JAX's and ours."""
 DIGEST_SIZE = 32
 """Bytes of a digest."""
 IN_USE = 3600.0
-"""Seconds for which nobody removes what was used: another process may be about to load it."""
+"""Seconds after its last use in which an entry stays: another process may be loading it."""
 
 
 class VerifiedCache:
@@ -77,7 +77,7 @@ class VerifiedCache:
 
 
 def entry_digest(key: str, image: bytes) -> bytes:
-    """What an entry ends in: entries that change places do not fit it."""
+    """The digest at the end of an entry, of its name and its content."""
     return hashlib.sha256(key.encode() + b"\0" + image).digest()
 
 
@@ -185,22 +185,25 @@ def _not_ours(folder: Path) -> str | None:
 
 
 def _trim(folder: Path) -> None:
-    """Removes what was used longest ago, until the rest is small enough."""
+    """Removes the least recently used entries until the rest is small enough."""
     top = _entries(folder)
-    inner = [
-        Path(x.path)
-        for x, _ in top
-        if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False)
-    ]
-    kept = [
-        (status, x.path)
-        for x, status in [*top, *(y for part in inner for y in _entries(part))]
-        if x.name.endswith(SUFFIXES)
-    ]
-    size = sum(status.st_size for status, _ in kept)
-    for status, path in sorted(kept, key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime)):
-        if size <= LIMIT or max(status.st_atime, status.st_mtime) > time.time() - IN_USE:
+    entries = list(top)
+    for x, _ in top:
+        if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False):
+            entries += _entries(Path(x.path))
+    kept = [(_last_use(status), status.st_size, x.path) for x, status in entries if _is_ours(x)]
+    size = sum(bytes_of_one for _, bytes_of_one, _ in kept)
+    for last_use, bytes_of_one, path in sorted(kept):
+        if size <= LIMIT or last_use > time.time() - IN_USE:
             break
         with contextlib.suppress(OSError):
             os.unlink(path)
-            size -= status.st_size
+            size -= bytes_of_one
+
+
+def _last_use(status: os.stat_result) -> float:
+    return max(status.st_atime, status.st_mtime)
+
+
+def _is_ours(entry: os.DirEntry) -> bool:
+    return entry.name.endswith(SUFFIXES)

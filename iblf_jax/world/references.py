@@ -82,7 +82,7 @@ class Quintic:
 
 @component
 class WaypointSpline:
-    """The quintic spline through waypoints, at rest at the first and the last one and held there.
+    """The quintic spline through waypoints, at rest at both ends and constant beyond them.
 
     It has four continuous derivatives between the ends, and zero velocity and acceleration at them.
     It is linear in the waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them

@@ -108,7 +108,7 @@ def kf_advice(kf: jax.Array) -> list[str]:
 def held_eta(
     observer, t, q, dq, tau, model: Robot, state: jax.Array, period: jax.Array
 ) -> jax.Array:
-    """Eta a period later where all else is held, (n,) [N m]: eta' = kf (eta* - eta), so eta* - eta
+    """Eta a period later for constant inputs, (n,) [N m]: eta' = kf (eta* - eta), so eta* - eta
     falls by exp(-kf period).
     """
     rate = observer.derivative(t, q, dq, tau, model, state)

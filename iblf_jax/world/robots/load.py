@@ -87,7 +87,7 @@ def load(
     checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
     repairs = Repairs(checks.flag("repair", repair))
     root = description.read(path)
-    request = _Request(base, tip, dict(locked), gravity, repairs)
+    request = _ArmRequest(base, tip, dict(locked), gravity, repairs)
     try:
         arm = _READERS[root.tag](root, path, request)
     except ValueError as error:
@@ -97,7 +97,7 @@ def load(
     return arm
 
 
-class _Request(NamedTuple):
+class _ArmRequest(NamedTuple):
     """The arguments of `load` except the path."""
 
     base: str | None
@@ -107,7 +107,7 @@ class _Request(NamedTuple):
     repairs: Repairs
 
 
-def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _ArmRequest) -> Arm:
     """The arm of a URDF whose root element has been read."""
     file = urdf.checked(root)
     tree = Tree.compiled(file.text, str(path), file.root, file.separate_weights)
@@ -117,7 +117,7 @@ def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _Request) -> 
     )
 
 
-def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _ArmRequest) -> Arm:
     """The arm of an MJCF whose root element has been read."""
     model = mjcf.checked(root, Path(path).parent)
     tree = Tree.compiled(model.text, str(path), "world", model.separate_weights)
