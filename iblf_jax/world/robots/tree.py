@@ -43,7 +43,10 @@ class Tree:
         self.model = model
         self.weights = weights
         """Body -> what it weighs in its inertial frame, where that is not the model's number."""
-        names = lambda kind, count: [mujoco.mj_id2name(model, kind, i) for i in range(count)]  # noqa: E731
+
+        def names(kind: Any, count: int) -> list[str | None]:
+            return [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+
         objects = mujoco.mjtObj
         self.bodies = [
             name or f"body{i}" for i, name in enumerate(names(objects.mjOBJ_BODY, model.nbody))
