@@ -1,4 +1,4 @@
-"""`presets`: which scenarios are ready to run, and any of them as TOML to start from."""
+"""`presets`: lists the predefined scenarios, or prints one of them as a scenario file."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = subparsers.add_parser(
         "presets",
-        help="list the scenarios that are ready to run",
+        help="list the predefined scenarios",
         description="List the presets, describe one, or print it as a scenario file.",
     )
     parser.add_argument("name", nargs="?", metavar="PRESET", help="describe this one")
     parser.add_argument(
-        "--toml", action="store_true", help="print it as a scenario file: start from that"
+        "--toml", action="store_true", help="print it as a scenario file, to be edited"
     )
     parser.add_argument(
         "--arg",
@@ -51,6 +51,6 @@ def run(args: argparse.Namespace) -> int:
         print(scenario_to_toml(scenario, run={"duration": 20.0, "dt": 1e-3}), end="")
     else:
         arguments = inspect.signature(PRESETS[args.name]).parameters.values()
-        taken = " ".join(f"--arg {argument.name}={argument.default}" for argument in arguments)
-        print(f"{args.name} {taken}\n\n{inspect.getdoc(PRESETS[args.name])}")
+        options = " ".join(f"--arg {argument.name}={argument.default}" for argument in arguments)
+        print(f"{args.name} {options}\n\n{inspect.getdoc(PRESETS[args.name])}")
     return 0
