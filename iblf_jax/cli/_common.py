@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "record_every": 1}
 """Options of a run that neither the command line nor the scenario file gives."""
 
+FAILURES = "a bound was violated, the state diverged, or the step was too large."
+"""The reasons for which a run fails, for help texts."""
+
 
 def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
     """Adds SCENARIO (optional if there is a default), --arg and --set."""
@@ -33,22 +36,27 @@ def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None 
         words += f" (default: {default})"
         optional = {"nargs": "?", "default": default}
     parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=words, **optional)
-    parser.add_argument(
-        "--arg",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="an argument of the preset, such as law=log; may be repeated",
-    )
+    add_preset_arguments(parser)
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="PATH=VALUE",
         help=(
-            "another value for a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be"
+            "the value of a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be"
             " repeated"
         ),
+    )
+
+
+def add_preset_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds --arg."""
+    parser.add_argument(
+        "--arg",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="an argument of the preset, such as law=log; may be repeated",
     )
 
 

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._common import (
+    FAILURES,
     add_run_arguments,
     add_scenario_arguments,
     optional_folder,
@@ -30,10 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
             "Run several laws on one scenario, at their given gains and at equal effort (RMS torque"
             " above gravity), and print one table for each."
         ),
-        epilog=(
-            "Exit code 1 if a run at the given gains failed: a bound was violated, the state"
-            " diverged, or the step was too large."
-        ),
+        epilog=f"Exit code 1 if a run at the given gains failed: {FAILURES}",
     )
     add_scenario_arguments(parser, default="zhang_yan_2024")
     add_run_arguments(parser)

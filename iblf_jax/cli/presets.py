@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import inspect
 
+from iblf_jax.cli._common import add_preset_arguments, assignments
+
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds the command."""
@@ -17,19 +19,12 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--toml", action="store_true", help="print it as a scenario file, to be edited"
     )
-    parser.add_argument(
-        "--arg",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="an argument of the preset, such as law=log; may be repeated",
-    )
+    add_preset_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import assignments
     from iblf_jax.core import tables
     from iblf_jax.files.scenario import preset_scenario, scenario_to_toml
     from iblf_jax.presets import PRESETS

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._common import (
+    FAILURES,
     add_run_arguments,
     add_scenario_arguments,
     metrics_table,
@@ -28,10 +29,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "simulate",
         help="run a scenario once",
         description="Run a scenario once; print its status and metrics.",
-        epilog=(
-            "Exit code 1 if the run failed: a bound was violated, the state diverged, or the step"
-            " was too large."
-        ),
+        epilog=f"Exit code 1 if the run failed: {FAILURES}",
     )
     add_scenario_arguments(parser)
     add_run_arguments(parser)

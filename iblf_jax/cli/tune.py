@@ -43,12 +43,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import output_folder
+    from iblf_jax.cli._common import optional_folder
     from iblf_jax.files.tuning import tune_file
 
-    folder = None
-    if args.out:
-        folder = output_folder(args.out)
+    folder = optional_folder(args.out)
     options = {"checkpoint": args.checkpoint, "iterations": args.iterations}
     if args.quiet:
         options["progress"] = False
