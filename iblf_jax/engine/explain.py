@@ -19,7 +19,7 @@ from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import TimeStep
-from iblf_jax.kernels import OPERATIONS, PER_RUN, Program, SHARED, TIME, written_out
+from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
