@@ -76,7 +76,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
             for v in eqn.outvars:
                 _check_float(b, v.aval.dtype, eqn)
             results = RULES[name](b, eqn, *operands)
-            if isinstance(results, np.ndarray):
+            if not isinstance(results, list | tuple):  # a reduction to one number is a NumPy scalar
                 results = [results]
         else:
             raise UnsupportedError(f"the primitive {name!r} is not lowered")
