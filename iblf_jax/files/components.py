@@ -74,7 +74,7 @@ def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
     return "any family", {name: found[0] for name, found in seen.items() if len(found) == 1}
 
 
-# ---------------------------------------------------------------------------------------------------------------- to tables
+# --- to tables
 
 
 def encode(part: Any, hint: Any, path: str) -> Any:
@@ -133,7 +133,7 @@ def encode_fields(part: Any, path: str) -> dict[str, Any]:
     return table
 
 
-# -------------------------------------------------------------------------------------------------------------- from tables
+# --- from tables
 
 
 def decode(value: Any, hint: Any, path: str) -> Any:

@@ -170,7 +170,7 @@ class DamagedFileError(ValueError):
     """The content of a file is not what its digest was made of."""
 
 
-# ------------------------------------------------------------------------------------------------------------ the Dataset
+# --- the Dataset
 
 
 def _attrs(units: str, description: str) -> dict[str, str]:
@@ -276,7 +276,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
     return varying, attributes
 
 
-# ------------------------------------------------------------------------------------------------------------------ files
+# --- files
 
 
 def _ending(path: Path) -> str:

@@ -123,7 +123,7 @@ def read_toml(path: str | os.PathLike) -> dict[str, Any]:
         ) from error
 
 
-# ---------------------------------------------------------------------------------------------------------------- to tables
+# --- to tables
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
@@ -235,7 +235,7 @@ def _equal(a: Any, b: Any) -> bool:
     )
 
 
-# -------------------------------------------------------------------------------------------------------------- from tables
+# --- from tables
 
 
 def from_dict(
