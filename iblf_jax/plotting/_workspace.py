@@ -99,7 +99,7 @@ def draw_boundaries(axes: Any, robot: Any, regions: Sequence[Region], limits: np
             if row_of(robot, region.point) == row:
                 draw_one(axes, region, limits, look)
         nowhere: list[list[float]] = [[]] * len(limits)
-        words = escaped(f"boundary of {in_words(named, robot)}")
+        words = escaped(f"bound of {in_words(named, robot)}")
         axes.plot(*nowhere, **look, linewidth=1.2, label=words)
 
 
