@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.step import folded
+from iblf_jax.engine import folded
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import (

@@ -7,7 +7,6 @@ smooth: the law needs q_d' and q_d", and its derivative alpha' is continuous onl
 
 from __future__ import annotations
 
-import functools
 from typing import Protocol
 
 import jax
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.caches import memoised
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 
@@ -33,8 +33,7 @@ class Reference(Protocol):
 
 @component
 class Sinusoid:
-    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.
-    (4.2)
+    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.              (4.2)
 
     Args:
       offset: middle of the motion, () or (n,) [rad].
@@ -83,7 +82,7 @@ class Quintic:
 
 @component
 class WaypointSpline:
-    """The quintic spline through waypoints, at rest at the first and the last one and held there.
+    """The quintic spline through waypoints, at rest at both ends and constant beyond them.
 
     It has four continuous derivatives between the ends, and zero velocity and acceleration at them.
     It is linear in the waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them
@@ -136,7 +135,7 @@ class WaypointSpline:
         return matvec(self.waypoints.T, basis)
 
 
-@functools.lru_cache(maxsize=32)
+@memoised(32)
 def _cardinal_splines(times: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are
     1 at one waypoint.

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Actuator, Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered, unlimited
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import as_at, joined, jump_times_of
@@ -17,7 +17,7 @@ from iblf_jax.core.time import as_at, joined, jump_times_of
 
 @component
 class Chain:
-    """Each is told what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0),
+    """Each receives what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0),
     Motor(bandwidth=300.0)))`.
 
     Args:
@@ -46,9 +46,7 @@ class Chain:
     @property
     def unlimited(self) -> Chain:
         """The same without limits."""
-        return dataclasses.replace(
-            self, parts=tuple(getattr(part, "unlimited", part) for part in self.parts)
-        )
+        return dataclasses.replace(self, parts=tuple(map(unlimited, self.parts)))
 
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""
@@ -66,9 +64,9 @@ class Chain:
         """The parts' states, each of which delivers the torque."""
         return tuple(part.init(tau) for part in self.parts)
 
-    def deliver(self, asked: jax.Array, dq: jax.Array, state: Any) -> Delivered:
+    def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
         """What the last delivers; a limit of any is one of the chain."""
-        torque, limited, rates = asked, jnp.zeros(asked.shape, bool), []
+        torque, limited, rates = command, jnp.zeros(command.shape, bool), []
         for part, own in zip(self.parts, state, strict=True):
             delivered = part.deliver(torque, dq, own)
             torque, limited = delivered.tau, limited | delivered.limited

@@ -1,10 +1,9 @@
 """The backstepping law of the paper, for any barrier.
 
-Step one: were q' = alpha(t, q), the barrier's V1 would decay.  Step two: drive e2 = q' - alpha to
-  zero,
+Step one: with q' = alpha(t, q), the barrier's V1 decays.  Step two: the torque drives
+e2 = q' - alpha to zero,
 
-    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - w s,
-    (3.14)
+    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - w s,                                       (3.14)
 
 with s = dV1/dq the barrier's slope ("Con" in the paper) and alpha' the total time derivative of
 alpha, taken by jvp along (1, q').  The paper has w = 1.  Another weight w_i > 0 scales the Lyapunov
@@ -26,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.barriers._base import CLAIMS, guard_is_active, value_unit
+from iblf_jax.control.barriers._base import CLAIMS, barrier_member, guard_is_active, value_unit
 from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -38,7 +37,8 @@ READINGS = ("printed", "corrected")
 @component
 class Backstepping:
     """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).
-    (3.14)
+
+    It is (3.14) of the paper.
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
@@ -133,7 +133,7 @@ def fit_o(law) -> None:
     Raises:
       ValueError: an `o` for a barrier that has no kappa.
     """
-    uses_o = getattr(law.barrier, "uses_o", True)
+    uses_o = barrier_member(law.barrier, "uses_o")
     if uses_o and law.o is None:
         object.__setattr__(law, "o", jnp.full_like(law.k1, 0.1))
     if not uses_o and law.o is not None:

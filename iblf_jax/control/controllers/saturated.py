@@ -1,7 +1,7 @@
 """Actuator limits around any law; the paper leaves them to future work.
 
-The loop gives observer and plant the torque that was applied, so an observer that is told the truth
-estimates f and not the cut. While the torque is cut, no law's claims hold; outside, they do again.
+The loop passes the applied torque to observer and plant, so the observer estimates f without the
+torque that was cut.  The claims of a law hold only while its torque is not cut.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from iblf_jax.control.controllers._base import (
     Controller,
     LawContext,
     State,
+    law_member,
     switching_functions,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots._base import robot_member
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
@@ -55,7 +57,7 @@ class Saturated:
 
     def advice(self) -> list[str]:
         """The wrapped law's."""
-        return getattr(self.law, "advice", list)()
+        return law_member(self.law, "advice")()  # type: ignore[no-any-return]
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""
@@ -76,20 +78,16 @@ class Saturated:
         context: LawContext,
         state: State,
     ) -> tuple[Command, State]:
-        """The wrapped law's command with its torque limited; `saturated` says where it asked for
+        """The wrapped law's command with its torque limited; `saturated` says where it commanded
         more than the limit.
         """
         command, rate = self.law.command(t, q, dq, f_hat, context, state)
-        asked = command.tau
-        tau = (
-            jnp.clip(asked, -self.limit, self.limit)
-            if self.edge == "hard"
-            else self.limit * _smooth_clip(asked / self.limit)
-        )
-        return (
-            command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)),
-            rate,
-        )
+        saturated = command.saturated | (jnp.abs(command.tau) > self.limit)
+        if self.edge == "hard":
+            tau = jnp.clip(command.tau, -self.limit, self.limit)
+        else:
+            tau = self.limit * _smooth_clip(command.tau / self.limit)
+        return command._replace(tau=tau, saturated=saturated), rate
 
 
 UNLIMITED = 1e6
@@ -108,7 +106,9 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
     Raises:
       ValueError: as `Saturated`.
     """
-    effort = getattr(robot, "effort", jnp.inf)
+    effort = robot_member(robot, "effort")
+    if effort is None:
+        effort = jnp.inf
     if not checks.is_concrete(effort):
         return Saturated(
             law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge

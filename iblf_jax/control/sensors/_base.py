@@ -1,4 +1,4 @@
-"""The contracts of a sensor, and of the way in which one that reads positions comes to velocities.
+"""The contracts of a sensor, and of the velocity estimate of a sensor that measures positions.
 
 A sensor is read once a period, at its start.  What it draws are standard normal numbers, which the
 loop gives it: they depend on seed, run, sample and joint alone.  Torque is never measured.
@@ -12,13 +12,14 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
 
 
 class Measurement(NamedTuple):
-    """What law and observer are told."""
+    """What law and observer receive."""
 
     q: jax.Array
     """Position, (n,) [rad]."""
@@ -29,10 +30,10 @@ class Measurement(NamedTuple):
 class Sensor(Protocol):
     """What the package asks of a sensor.
 
-    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on
-      it; and `resolution`, what a count is,
-    () or (n,) [rad], for the default ranges of gains.  It may have a method
-    `advice(period)`, a list of warnings.
+    A sensor that rounds also has the properties `unrounded`, the same sensor without rounding, with
+    which the fastest mode of a loop is computed, and `resolution`, the size of a count, () or (n,)
+    [rad], for the default ranges of gains.  A sensor may have a method `advice(period)`, a list of
+    warnings.
     """
 
     @property
@@ -89,6 +90,18 @@ class Velocity(Protocol):
           state: of the sample before.
         """
         ...
+
+
+sensor_member = OptionalMembers(
+    unrounded=None, resolution=0.0, velocity=None, advice=lambda period: []
+)
+"""Reads what a sensor, or its velocity, may lack."""
+
+
+def unrounded(sensor: Sensor) -> Sensor:
+    """A sensor without its rounding; itself if it does not round."""
+    found = sensor_member(sensor, "unrounded")
+    return sensor if found is None else found
 
 
 def above_nyquist(name: str, cutoff: jax.Array, period: jax.Array) -> list[str]:

@@ -1,7 +1,6 @@
 """The contract of a robot, and what follows from its energies alone.
 
-    M(q) q" + C(q, q') q' + G(q) = tau + f
-    (2.1)
+    M(q) q" + C(q, q') q' + G(q) = tau + f                                                  (2.1)
 
 A robot is known by its mass matrix M(q) and its potential U(q): then G = dU/dq, and C follows from
 the Christoffel symbols,
@@ -24,6 +23,8 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.time import as_at
 
 T = TypeVar("T")
 
@@ -36,14 +37,13 @@ class Robot(Protocol):
     [kg], a point mass at the tip, is one of them in every member, so that any robot can carry what
     its model does not know.
 
-    Two methods more are used where a member has them, through `at_time` and `friction_torque`
-    below: `at(t)`, the robot as it is at time t [s], for one that changes while it moves, with
-      `jump_times()`, (m,) [s], if it jumps then, as disturbances have (steps of a run
-    are divided there); and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.
-    Both are of the plant only: law and observer know neither, and (2.1) has them in f.  A third,
-      `energy_gradient(q, v)`, is used by the function of this name where a member
-    has something shorter than the general formula.  A class may name its `geometry_fields`, a tuple
-    of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
+    A member may have further methods (`robot_member` holds their defaults).  `at(t)` returns the
+    robot as it is at time t [s], for one that changes during a run; `jump_times()`, (m,) [s], are
+    the times at which it jumps, where steps of a run are divided.  `friction_torque(dq)`, (n,)
+    [N m], is the friction of its joints.  These belong to the plant only: law and observer do not
+    know them, and (2.1) has them in f.  `energy_gradient(q, v)` replaces the general formula of the
+    function of this name where a member has a shorter one.  A class may name its `geometry_fields`,
+    a tuple of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
     """
 
     @property
@@ -82,10 +82,25 @@ class Robot(Protocol):
         ...
 
 
+robot_member = OptionalMembers(
+    joints=(),
+    kinds=None,
+    limits=None,
+    speed=None,
+    effort=None,
+    skeleton=None,
+    geometry_fields=(),
+    friction_torque=jnp.zeros_like,
+    energy_gradient=None,
+)
+"""Reads what a robot may lack: the members that `Robot` describes as optional, and what a robot
+from a file has: names, kinds and limits of its joints."""
+
+
 def at_time(robot: T, t: jax.Array) -> T:
     """The robot as it is at time t [s]: itself, unless it has a method `at`."""
     _is_robot(robot)
-    return robot.at(t) if hasattr(robot, "at") else robot
+    return as_at(robot, t)
 
 
 @jax.jit
@@ -110,7 +125,7 @@ def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
     robot has a method of this name.
     """
     (dq,) = checks.vectors(dq=dq)
-    return robot.friction_torque(dq) if hasattr(robot, "friction_torque") else jnp.zeros_like(dq)
+    return robot_member(robot, "friction_torque")(dq)  # type: ignore[no-any-return]
 
 
 def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
@@ -146,8 +161,10 @@ def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     0", "joint 1", ...
     """
     n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
-    names = tuple(map(str, getattr(robot, "joints", ())))
-    return names if len(names) == n else tuple(f"joint {i}" for i in range(n))
+    names = tuple(map(str, robot_member(robot, "joints")))
+    if len(names) == n:
+        return names
+    return tuple(f"joint {i}" for i in range(n))
 
 
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:
@@ -167,8 +184,9 @@ def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     """
     _is_robot(robot)
     q, v = checks.vectors(robot.n, q=q, v=v)
-    if hasattr(robot, "energy_gradient"):
-        return robot.energy_gradient(q, v)
+    own_method = robot_member(robot, "energy_gradient")
+    if own_method is not None:
+        return own_method(q, v)  # type: ignore[no-any-return]
     return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
 
 
