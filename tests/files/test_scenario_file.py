@@ -199,7 +199,7 @@ def _with_start_times(scenario: ij.Scenario, value: Any) -> ij.Scenario:
     return dataclasses.replace(scenario, initial=initial)
 
 
-# ------------------------------------------------------------------------------------------------------------- bad files
+# --- bad files
 
 
 def changed(tables: dict[str, Any], key: str, value: Any) -> dict[str, Any]:

@@ -405,7 +405,7 @@ def test_random_samples_are_apart(rng):
     assert np.unique(e1).size == e1.size
 
 
-# ------------------------------------------------------------------------------------------------------------- any number of joints
+# --- any number of joints
 
 
 @ij.component
