@@ -31,7 +31,7 @@ import dataclasses
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -354,7 +354,7 @@ def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
     as_table(arguments, "arguments")
     if not isinstance(name, str) or name not in PRESETS:
         raise checks.fail("preset", name, "the name of a preset", did_you_mean(name, PRESETS))
-    preset: Callable[..., Scenario] = PRESETS[name]
+    preset = PRESETS[name]
     taken = inspect.signature(preset).parameters
     known_keys(arguments, "arguments", taken)
     hints = field_hints(preset)

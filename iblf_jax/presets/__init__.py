@@ -13,14 +13,4 @@ from iblf_jax.presets.paper import zhang_yan_2024 as zhang_yan_2024
 from iblf_jax.presets.paper import zhang_yan_2024_full_state as zhang_yan_2024_full_state
 from iblf_jax.presets.paper import zhang_yan_2024_funnel as zhang_yan_2024_funnel
 from iblf_jax.presets.paper import zhang_yan_2024_saturated as zhang_yan_2024_saturated
-
-PRESETS = {
-    "zhang_yan_2024": zhang_yan_2024,
-    "printed_gap": printed_gap,
-    "zhang_yan_2024_saturated": zhang_yan_2024_saturated,
-    "zhang_yan_2024_funnel": zhang_yan_2024_funnel,
-    "zhang_yan_2024_full_state": zhang_yan_2024_full_state,
-    "ur5": ur5,
-    "iiwa14": iiwa14,
-}
-"""Name of a preset -> the function that makes it."""
+from iblf_jax.presets.table import PRESETS as PRESETS
