@@ -388,8 +388,8 @@ def test_figures(alone, kept):
     tip = next(x for x in drawn.get_lines() if x.get_label() == "filtered").get_xydata()
     np.testing.assert_allclose(tip[-1], points(np.asarray(kept.q[-1]))[1])
     assert {x.get_label() for x in drawn.get_lines()} >= {
-        "wall of the tip",
-        "wall of the origin of joint 1",
+        "bound of the tip",
+        "bound of the origin of joint 1",
         "reference",
     }
     line = next(x for x in figure.axes[0].get_lines() if x.get_label() == "alone")
