@@ -22,13 +22,18 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         description=(
             "Run the sweep that a file describes (a scenario file with [run], [grid], [sweep] and,"
             " if runs are perturbed, [perturbations]).  With --store it is written unit by unit;"
-            " killed or interrupted, the same command goes on from there."
+            " killed or interrupted, the same command computes the rest."
         ),
         epilog=EPILOG,
     )
     parser.add_argument("file", metavar="SWEEP.toml", help="the sweep file")
     parser.add_argument(
-        "--store", metavar="FOLDER.zarr", help="write to this store, and go on from what it holds"
+        "--store", metavar="FOLDER.zarr", help="write to this store, and compute what it lacks"
+    )
+    parser.add_argument(
+        "--shared",
+        action="store_true",
+        help="several processes run this command on the same store at the same time",
     )
     add_study_arguments(parser)
     parser.set_defaults(run=run)
@@ -40,16 +45,21 @@ def run(args: argparse.Namespace) -> int:
     def work(how: dict[str, Any]) -> int:
         from iblf_jax.core.status import FAILED
         from iblf_jax.files.study import load_study_file
-        from iblf_jax.studies import distributed
+        from iblf_jax.studies import StoreOptions, distributed
         from iblf_jax.studies.sweep import sweep
 
         file = load_study_file(args.file, "sweep")
+        options = dict(file.options)
+        unit = options.pop("unit", None)
+        store = None
+        if args.store is not None:
+            store = StoreOptions(args.store, unit, shared=args.shared)
         data = sweep(
             file.scenario,
             file.grid,
             perturbations=file.perturbations,
-            store=args.store,
-            **file.options | how,
+            store=store,
+            **options | how,
         )
         if distributed.rank() == 0:
             print(report(data))

@@ -34,7 +34,7 @@ from iblf_jax.files.components import construct
 from iblf_jax.files.scenario import from_dict, read_toml
 from iblf_jax.files.values import Words, as_table, did_you_mean, inline_table, known_keys, numbers
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies import distributions
+from iblf_jax.studies import Design, distributions
 from iblf_jax.studies.distributions import KINDS, Perturbation
 
 OPTIONS: dict[str, dict[str, type]] = {
@@ -129,7 +129,10 @@ def _options(table: Any, kind: str) -> dict[str, Any]:
             )
     if kind == "study" and "runs" not in table:
         raise checks.fail("study.runs", Words("nothing"), "a number of runs")
-    return dict(table)
+    options = dict(table)
+    if "points" in options:
+        options["design"] = Design(options.get("design", "grid"), options.pop("points"))
+    return options
 
 
 def perturbations_of(data: dict[str, Any]) -> dict[str, Perturbation]:

@@ -50,8 +50,8 @@ class Cases(NamedTuple):
     key: jax.Array
 
 
-class Lanes(NamedTuple):
-    """What differs between the runs of a block, run axis first."""
+class CaseInputs(NamedTuple):
+    """What differs between the cases of a block, case axis first."""
 
     index: Any
     """Run number: what the draw depends on, (B,) uint32."""

@@ -28,7 +28,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopRequest:
-    """While this context is open, the first Ctrl-C or SIGTERM only sets `asked`; the second one
+    """While this context is open, the first Ctrl-C or SIGTERM only sets `requested`; the second one
     interrupts at once.
 
     Signals reach the main thread only; elsewhere, and where somebody else handles or ignores them,
@@ -36,7 +36,7 @@ class StopRequest:
     """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.requested = False
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> StopRequest:
@@ -64,13 +64,13 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+        if self.requested:
             # before it raises: that may be inside __enter__ or __exit__, which then do not come to
             # their end
             self._give_back()
             before = self._before[signal.Signals(number)]
             (before if callable(before) else signal.default_int_handler)(number, frame)
-        self.asked = True
+        self.requested = True
         with contextlib.suppress(Exception):  # nobody may be there to read it
             sys.stderr.write(
                 f"\n{STOP_SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand;"

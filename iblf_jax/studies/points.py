@@ -20,7 +20,15 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS, split, unit_points
 from iblf_jax.studies.distributions import Perturbation, is_distribution, value
-from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, sample_size, targets_of
+from iblf_jax.studies.draws import (
+    CaseInputs,
+    Cases,
+    Target,
+    check_paths,
+    draw,
+    sample_size,
+    targets_of,
+)
 
 MOST_DIMS = 60
 """NumPy's arrays have 64; runs and joints come on top."""
@@ -166,10 +174,13 @@ def _distribution(path: str, way: Any) -> Any:
 def _draw_points(
     cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    lanes = Lanes(np.arange(count, dtype=np.uint32), {}, designed)
-    drawn, fine = jax.jit(
-        jax.vmap(lambda lane: draw(cases, targets, lane.index, lane.points, lane.u)[1:])
-    )(lanes)
+    inputs = CaseInputs(np.arange(count, dtype=np.uint32), {}, designed)
+
+    def one(point: CaseInputs):
+        _, drawn, admissible = draw(cases, targets, point.index, point.points, point.u)
+        return drawn, admissible
+
+    drawn, fine = jax.jit(jax.vmap(one))(inputs)
     if not np.all(fine):
         bad = int(np.argmin(np.asarray(fine)))
         shown = {path: np.asarray(x[bad]).tolist() for path, x in drawn.items()}

@@ -14,12 +14,14 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status
+from iblf_jax.engine import block_size
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, own_dims
 from iblf_jax.studies import statistics
-from iblf_jax.studies.blocks import block_size, run_blocks
+from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.config import describe_component
+from iblf_jax.studies.options import ThisProcess
 from iblf_jax.world.bounds import tube_at
 from iblf_jax.world.regions import margins
 
@@ -141,15 +143,11 @@ def bands(
     levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
     exclude_failed = checks.flag("exclude_failed", exclude_failed)
     count = min(checks.positive_integer("runs", runs), study.runs)
-    record_every = max(1, setup.study_run.steps // checks.positive_integer("samples", samples))
+    record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
     parts, times = [], np.zeros(0)
+    one_block_at_a_time = ThisProcess(chunk=size)
     for _, (arrays, t, _, _) in run_blocks(
-        setup.study_run,
-        setup.shared,
-        setup.lanes,
-        range(-(-count // size)),
-        chunk=size,
-        record_every=record_every,
+        setup, range(-(-count // size)), one_block_at_a_time, record_every=record_every
     ):
         parts.append(arrays)
         times = t[0]
@@ -233,10 +231,10 @@ def to_xarray(study: Study) -> xarray.Dataset:
     attributes |= {
         "duration": study.duration,
         "dt": study.dt,
-        "method": setup.study_run.method,
+        "method": setup.program.method,
         "sampler": setup.sampler,
     }
-    attributes |= {"backend": setup.study_run.backend, "iblf_jax_version": iblf_jax.__version__}
+    attributes |= {"backend": study.backend, "iblf_jax_version": iblf_jax.__version__}
     attributes["perturbations"] = json.dumps(
         {path: describe_component(p) for path, p in study.perturbations.items()}
     )

@@ -30,7 +30,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
-from iblf_jax.studies.recommended import tell_of_step
+from iblf_jax.studies.recommended import warn_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.tuning.evaluation import Rollouts, drawn, rollouts
@@ -314,7 +314,7 @@ def _run(
     )
     found, made = whole
     if len(scenarios) > 1:  # once a report
-        tell_of_step(
+        warn_of_step(
             found.status, found.fastest_mode, found.relative_error, timing["dt"], timing["method"]
         )
     each = (

@@ -32,7 +32,7 @@ from iblf_jax import barriers, bounds, cli, robots
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
-from iblf_jax.engine import simulate
+from iblf_jax.engine import CompiledBatch, simulate
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
@@ -454,7 +454,6 @@ def no_runs(monkeypatch):
     for place in (
         "engine.simulate.run_one",
         "studies.blocks._execute",
-        "studies.setup._execute",
         "tuning.problem.rollouts",
         "tuning.problem.slope",
         "tuning.problem.gradient",
@@ -463,7 +462,9 @@ def no_runs(monkeypatch):
         "certificates._certify._one",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
-    monkeypatch.setattr("iblf_jax.studies.blocks.chosen_backend", lambda *_, **__: "xla")
+    monkeypatch.setattr(
+        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+    )
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
