@@ -156,14 +156,18 @@ def why_no_theorem(scenario: Scenario) -> str:
 
 def decay_rate(law: Backstepping | FullState) -> jax.Array | None:
     """Decay rate of the barrier's V1 along alpha, (n,) [1/s]; None if the barrier states none."""
-    stated = optional_member(law.barrier, "decay_rate")
-    return None if stated is None else stated(law.k1)
+    return _decay_of(law.barrier, law.k1)
 
 
 def decay_phi(law: FullState) -> jax.Array | None:
     """Decay rate of the velocity barrier's phi, (n,) [1/s]; None if the barrier states none."""
-    stated = optional_member(law.velocity_barrier, "decay_rate")
-    return None if stated is None else stated(law.K2)
+    return _decay_of(law.velocity_barrier, law.K2)
+
+
+def _decay_of(barrier: Any, gain: jax.Array) -> jax.Array | None:
+    """Decay rate that a barrier states for a gain, (n,) [1/s], or None."""
+    stated = optional_member(barrier, "decay_rate")
+    return None if stated is None else stated(gain)
 
 
 def constants_of(scenario: Scenario) -> Claim | FullClaim:
@@ -202,19 +206,6 @@ def rho_terms(
         2.0 * jnp.min(constants.K2 - LOWEST_K2) / lambda_max,
         2.0 * jnp.min(constants.kf - LOWEST_KF[case]),
     ])  # fmt: skip
-
-
-@partial(jax.jit, static_argnames="case")
-def rho(
-    constants: Claim | FullClaim,
-    lambda_max: jax.typing.ArrayLike,
-    case: int,
-    lambda_min: jax.typing.ArrayLike = 0.0,
-) -> jax.Array:
-    """The rate of the claim, () [1/s].
-    (3.19), (3.27), (F.3)
-    """
-    return jnp.min(rho_terms(constants, lambda_max, case, lambda_min))
 
 
 # --- the claim with weights ----------------------------------------------------------------------
@@ -282,11 +273,13 @@ def best_weights(
     # Axes: rates rho, then fractions of the largest b.
     rho = top * GRID[:, None]
     a = 1.0 - rho / (2.0 * slowest)
-    fractions = GRID[None, :] if case == 2 else np.zeros((1, 1))
+    fractions = {1: np.zeros((1, 1)), 2: GRID[None, :]}[case]
     b = 2.0 * (np.min(kf) - rho / 2.0) * fractions
     room = kf - (b + rho)[..., None] / 2.0
     w_f = np.max(0.25 / (a[..., None] * K2 * room), axis=-1)
-    rho2 = w_f * F_d**2 / (2.0 * b) if case == 2 else np.zeros_like(w_f)
+    rho2 = np.zeros_like(w_f)
+    if case == 2:
+        rho2 = w_f * F_d**2 / (2.0 * b)
     mean_decay = -np.expm1(-rho * duration) / (rho * duration)
     mean = (V_rest + w_f * half_square) * mean_decay + rho2 / rho
     row, column = np.unravel_index(np.argmin(mean), mean.shape)

@@ -15,7 +15,7 @@ import numpy as np
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
 OWN_INEQUALITY = "inequality, own V"
 """Name of the inequality that a law states about itself."""
-OBSERVED_ONLY = "no claim, only seen ("
+OBSERVED_ONLY = "no claim, only observed ("
 """Beginning of the note of a line that holds on the run although no theorem claims it."""
 
 
@@ -65,11 +65,13 @@ class Line:
         """
         if self.margin is None and self.value is None:
             return ""
-        parts = [] if self.run is None else [f"run {self.run}"]
-        parts += [] if self.joint is None else [f"joint {self.joint}"]
-        parts += [] if self.time is None else [f"t = {self.time:.4g} s"]
-        parts += [] if self.first is None else [f"first broken at t = {self.first:.4g} s"]
-        return ", ".join(parts)
+        parts = (
+            ("run {}", self.run),
+            ("joint {}", self.joint),
+            ("t = {:.4g} s", self.time),
+            ("first broken at t = {:.4g} s", self.first),
+        )
+        return ", ".join(text.format(value) for text, value in parts if value is not None)
 
 
 class Statement(NamedTuple):
@@ -85,6 +87,11 @@ class Statement(NamedTuple):
         return Line(self.name, self.equation, self.text, verdict, unit=self.unit, **fields)
 
 
+def verdict_of(holds: bool) -> str:
+    """The verdict of a claim that applies."""
+    return HOLDS if holds else FAILS
+
+
 def not_applicable(statement: Statement, reason: str, *, counts: bool = True) -> Line:
     """The line of a statement that is not claimed about this run."""
     return statement.line(NOT_APPLICABLE, note=reason, counts=counts)
@@ -92,7 +99,7 @@ def not_applicable(statement: Statement, reason: str, *, counts: bool = True) ->
 
 def check_positive(statement: Statement, margin: float, **fields: Any) -> Line:
     """The line of a statement whose margin must be positive."""
-    return statement.line(HOLDS if margin > 0 else FAILS, margin=margin, **fields)
+    return statement.line(verdict_of(margin > 0), margin=margin, **fields)
 
 
 def check_smallest(statement: Statement, t: np.ndarray, margins: np.ndarray) -> Line:
@@ -130,23 +137,23 @@ def check_margins(
     margins = np.asarray(margins, float)
     tolerances = np.broadcast_to(np.asarray(tolerances, float), margins.shape)
     per_joint = margins.ndim == 2
-    included = ~(excluded[:, None] if per_joint else excluded) & np.ones(margins.shape, bool)
-    broken = included & ~(margins >= -tolerances)
+    if per_joint:
+        excluded = np.broadcast_to(excluded[:, None], margins.shape)
+    broken = ~excluded & ~(margins >= -tolerances)
     # The smallest margin, among the broken ones if there are any.
-    candidates = broken if np.any(broken) else included
-    place = np.unravel_index(
-        np.argmin(np.where(candidates, np.nan_to_num(margins, nan=-np.inf), np.inf)),
-        margins.shape,
-    )
+    candidates = broken if np.any(broken) else ~excluded
+    compared = np.where(candidates, np.nan_to_num(margins, nan=-np.inf), np.inf)
+    place = np.unravel_index(np.argmin(compared), margins.shape)
     broken_rows = np.flatnonzero(broken.reshape(margins.shape[0], -1).any(axis=1))
-    first = float(t[broken_rows[0]]) if broken_rows.size else None
+    if broken_rows.size:
+        fields["first"] = float(t[broken_rows[0]])
+    if per_joint:
+        fields["joint"] = int(place[1])
     return statement.line(
-        FAILS if broken_rows.size else HOLDS,
-        first=first,
+        verdict_of(not broken_rows.size),
         margin=float(margins[place]),
         tolerance=float(tolerances[place]),
         time=float(t[place[0]]),
-        joint=int(place[1]) if per_joint else None,
         **fields,
     )
 
@@ -201,6 +208,9 @@ def over_runs(same: list[Line], invalid_runs: list[int]) -> Line:
         worst = next(iter(unchecked), worst)
     failed = sum(line.verdict == FAILS for line in same)
     absent = sum(line.verdict == NOT_APPLICABLE for line in same)
-    in_failed = f"fails in {failed} of {len(same)} runs" if failed else ""
-    in_absent = f"not applicable in {absent} of {len(same)} runs" if 0 < absent < len(same) else ""
-    return dataclasses.replace(worst, note=join_notes(in_failed, in_absent, worst.note))
+    notes = [worst.note]
+    if 0 < absent < len(same):
+        notes.insert(0, f"not applicable in {absent} of {len(same)} runs")
+    if failed:
+        notes.insert(0, f"fails in {failed} of {len(same)} runs")
+    return dataclasses.replace(worst, note=join_notes(*notes))

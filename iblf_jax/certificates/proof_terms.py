@@ -245,8 +245,7 @@ def _are_equal(one: Any, other: Any) -> jax.Array:
     if structure != jax.tree.structure(other):
         return jnp.zeros((), bool)
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    equal = [jnp.all(a == b) for a, b in pairs]
-    return jnp.all(jnp.stack(equal)) if equal else jnp.ones((), bool)
+    return jnp.all(jnp.stack([jnp.ones((), bool), *(jnp.all(a == b) for a, b in pairs)]))
 
 
 def _dropped_terms(scenario: Scenario, dM0, dq, e2, f_tilde) -> tuple[jax.Array, jax.Array]:
@@ -290,9 +289,10 @@ def _full_terms(
     V1 = law.weight * law.barrier.value(outer, state.q)
     phi = law.velocity_barrier.value(inner, state.dq)
     barriers_rate = rates["V"] - f_tilde @ (rates["disturbance"] - rates["disturbance_estimate"])
-    decays = 0.0
+    decays = jnp.zeros_like(V1)
     for stated, value in ((decay_rate(law), V1), (decay_phi(law), phi)):
-        decays = decays + (0.0 if stated is None else stated) * value
+        if stated is not None:
+            decays = decays + stated * value
     left = barriers_rate + jnp.sum(decays) - s2 @ solve_spd(M0, f_tilde) + jnp.sum(law.c * s2**2)
     above = state.dq > inner.q_d
     room = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
@@ -300,6 +300,12 @@ def _full_terms(
 
 
 # --- sizes of the terms, for rounding ------------------------------------------------------------
+
+
+def _leaf(part: Any, name: str, default: jax.Array) -> jax.Array:
+    """A leaf that only some laws and observers have."""
+    value = optional_member(part, name)
+    return default if value is None else value
 
 
 def _gap(xi: jax.Array, guard: float) -> jax.Array:
@@ -318,8 +324,8 @@ def _term_sizes(
     of relative error.
     """
     law, zero = unwrapped(scenario.controller), jnp.zeros_like(state.q)
-    K2, kf = optional_member(law, "K2"), optional_member(scenario.observer, "kf")
-    K2, kf = zero if K2 is None else K2, zero if kf is None else kf
+    K2 = _leaf(law, "K2", zero)
+    kf = _leaf(scenario.observer, "kf", zero)
     barrier = optional_member(law, "barrier")
     gap = _gap(now["xi"], optional_member(barrier, "guard"))
     speeds = jnp.abs(state.dq) + jnp.abs(now["alpha"]) + jnp.abs(now["dq_d"])
@@ -349,8 +355,7 @@ def _term_sizes(
         terms += _phi_term_sizes(law, scenario, t, state, M0, torque, accelerations)
     tube = scenario.context.tube(t)
     width = jnp.minimum(tube.k_l, tube.k_u)
-    weight = optional_member(law, "weight")
-    weight = jnp.ones_like(width) if weight is None else weight
+    weight = _leaf(law, "weight", jnp.ones_like(width))
     V_size = (
         jnp.sum(weight * (jnp.abs(state.q) / (width * gap)) ** 2)
         + speeds @ (jnp.abs(M0) @ speeds)

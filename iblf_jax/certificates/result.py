@@ -138,7 +138,9 @@ class Certificate:
         ]
         failing = [i for i, line in enumerate(self.applicable) if line.verdict == FAILS]
         table = tables.as_html(heading, rows, failing)
-        return f"{table}<p>{html.escape(self.omitted)}</p>" if self.omitted else table
+        if not self.omitted:
+            return table
+        return f"{table}<p>{html.escape(self.omitted)}</p>"
 
     @property
     def applicable(self) -> tuple[Line, ...]:
@@ -226,7 +228,9 @@ def _reason(note: str) -> str:
 def _number(value: float | None, unit: str) -> str:
     if value is None:
         return ""
-    return f"{value:.4g}" + ("" if unit == "1" else f" {unit}")
+    if unit == "1":
+        return f"{value:.4g}"
+    return f"{value:.4g} {unit}"
 
 
 def _for_json(value: Any) -> Any:

@@ -19,7 +19,6 @@ from iblf_jax.certificates import claims
 from iblf_jax.certificates.claims import CASES, FullClaim
 from iblf_jax.certificates.lines import (
     FAILS,
-    HOLDS,
     NOT_APPLICABLE,
     OBSERVED_ONLY,
     Line,
@@ -29,6 +28,7 @@ from iblf_jax.certificates.lines import (
     check_smallest,
     join_notes,
     not_applicable,
+    verdict_of,
 )
 from iblf_jax.certificates.reconstruction import padded_index
 from iblf_jax.certificates.run_summary import RunSummary, Segment
@@ -54,7 +54,7 @@ NOT_NEEDED = (
     "the paper's own envelope of V2 is lost, stability is not: the claim with weights (W.1) does"
     " not need it"
 )
-CASE_1_COUNTS = "f' = 0 on this run, so case 1 is what counts"
+CASE_1_COUNTS = "f' = 0 on this run, so case 1 decides"
 
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")
 RATE_BOUNDED = Statement("f' bounded", "Assumption 1", "|f'| <= F_d between jumps", "N m/s")
@@ -106,14 +106,14 @@ def exclusion_note(summary: RunSummary) -> str:
     """Which samples the claims exclude, and where they start again, in words."""
     excluded = ""
     if summary.excluded:
-        why = "the guard or a torque limit was at work"
+        why = "the guard or a torque limit was active"
         if summary.claims.bounds_velocities:
-            why = "alpha was outside, or the guard or a torque limit at work"
-        excluded = f"{summary.excluded} of {summary.samples} samples are left out: {why}"
+            why = "alpha was outside, or the guard or a torque limit active"
+        excluded = f"{summary.excluded} of {summary.samples} samples are excluded: {why}"
     restarts = ""
     if summary.jumps.size:
         times = ", ".join(f"{x:.4g}" for x in summary.jumps)
-        restarts = f"f jumps at t = {times} s, and the claim starts anew there"
+        restarts = f"f jumps at t = {times} s, and the claim starts again there"
     return join_notes(excluded, restarts)
 
 
@@ -162,7 +162,7 @@ def _assumptions(segment: Segment) -> list[Line]:
 def _finite(statement: Statement, t: np.ndarray, values: np.ndarray, note: str = "") -> Line:
     """The line of a quantity that must be finite at every step, with its largest value."""
     at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
-    verdict = HOLDS if np.all(np.isfinite(values)) else FAILS
+    verdict = verdict_of(bool(np.all(np.isfinite(values))))
     return statement.line(verdict, value=float(values[at]), time=float(t[at]), note=note)
 
 
@@ -181,7 +181,7 @@ def _with_status(summary: RunSummary, line: Line, flag: Status) -> Line:
     """A line about something that the run's status reports, too: the verdict is that of the status,
     which covers every step of the run itself.
     """
-    verdict = FAILS if int(summary.run.status) & int(flag) else HOLDS
+    verdict = verdict_of(not int(summary.run.status) & int(flag))
     if verdict == line.verdict:
         return line
     return dataclasses.replace(
@@ -206,8 +206,8 @@ def _gains(summary: RunSummary) -> list[Line]:
         (kf_2, constants.kf - claims.LOWEST_KF[2], not case_1),
     )
     lines = []
-    for statement, margins, counts in conditions:
-        margins = np.asarray(margins)
+    for statement, above_lowest, counts in conditions:
+        margins = np.asarray(above_lowest)
         line = check_positive(
             statement,
             float(margins.min()),
@@ -229,8 +229,7 @@ def _full_gains(summary: RunSummary) -> list[Line]:
         if not isinstance(constants, FullClaim):
             lines.append(not_applicable(statement, summary.claims.no_theorem))
             continue
-        terms = claims.rho_terms(constants, summary.lambda_max, case, lambda_min)
-        margin = 0.5 * float(terms[2])
+        margin = 0.5 * float(summary.rho_terms[case, "run"][2])
         needed = np.asarray(constants.kf).min() - claims.LOWEST_FULL[case]
         note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
         if margin <= 0 < needed:
@@ -246,7 +245,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     """The rate rho of one case, with the eigenvalues of M0 along the run or over the admissible
     box.
     """
-    full, constants = summary.claims.bounds_velocities, summary.claims.constants
+    full = summary.claims.bounds_velocities
     name = f"rho, case {case}" + {"run": "", "box": ", over the box"}[domain]
     equation = RHO[case]
     text = (
@@ -263,23 +262,20 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     reason = summary.claims.no_theorem
     if case == 1 and summary.case == 2:
         reason = summary.why_not_theorem(1)
-    if reason or constants is None:
+    if reason:
         return not_applicable(statement, reason)
-    source: Any = summary if domain == "run" else summary.over_box
-    terms = claims.rho_terms(
-        constants, jnp.asarray(source.lambda_max), case, jnp.asarray(source.lambda_min)
-    )
+    source: Any = {"run": summary, "box": summary.over_box}[domain]
     least = ["the decay rate of V1", "K2 over lambda_max(M0)", "kf"]
     eigenvalue = f"lambda_max(M0) = {source.lambda_max:.4g} kg m^2"
     if full:
         least = ["the decay rate of V1", "the decay rate of phi", "kf and c"]
         eigenvalue = f"lambda_min(M0) = {source.lambda_min:.4g} kg m^2"
-    searched = f" ({summary.over_box.searched})" if domain == "box" else ""
+    searched = {"run": "", "box": f" ({summary.over_box.searched})"}[domain]
     line = check_positive(
         statement,
         summary.rho[case, domain],
         value=summary.rho[case, domain],
-        note=f"{eigenvalue}{searched}; set by {least[int(np.argmin(np.asarray(terms)))]}",
+        note=f"{eigenvalue}{searched}; set by {least[np.argmin(summary.rho_terms[case, domain])]}",
         counts=not (case == 2 and summary.case == 1),
     )
     return _unless_replaced(summary, line)
@@ -302,7 +298,9 @@ def left_side(segment: Segment, case: int) -> np.ndarray:
     """The left side of the differential inequality at every step, (T,) [1/s]."""
     proof = segment.proof
     left = proof.dV + segment.summary.rho[case, "run"] * proof.V
-    return left if case == 1 else left - 0.5 * np.sum(proof.df**2, axis=1)
+    if case == 2:
+        left = left - 0.5 * np.sum(proof.df**2, axis=1)
+    return left
 
 
 def _inequality(segment: Segment, case: int) -> Line:
@@ -487,17 +485,17 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
     by_law = Statement(
         "dropped term of the law",
         "(3.13)",
-        "e2^T M0' e2/2 alone <= the margin that the proof leaves",
+        "e2^T M0' e2/2 <= the margin that the proof leaves",
         "1/s",
     )
     by_observer = Statement(
         "dropped term of the observer",
         "(3.11)",
-        "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves",
+        "-f_tilde^T kf M0' q' <= the margin that the proof leaves",
         "1/s",
     )
     unclaimed = summary.claims.no_theorem or summary.invalid
-    why_no_case = "" if case else summary.why_not_theorem(summary.case)
+    why_no_case = summary.why_not_theorem(case or summary.case)
     terms = (
         (by_law, proof.dropped_e2, _why_law_is_exact(summary)),
         (by_observer, proof.dropped_f, _why_observer_is_exact(summary)),

@@ -19,7 +19,6 @@ import os
 import shutil
 import stat
 import time
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax.core import notices
+from iblf_jax.core.caches import memoised
 from iblf_jax.kernels import cpuinfo, directory, processor
 
 LIMIT = 2 * 2**30
@@ -110,7 +110,7 @@ def _verify_entries(folder: Path) -> None:
         compilation_cache._cache_initialized = True
 
 
-@cache
+@memoised(1)
 def keep_programs() -> None:
     """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to,
     or no folder is safe; once a process.

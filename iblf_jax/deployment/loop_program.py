@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.engine.step import Form, Inputs, advance, start
-from iblf_jax.kernels.program import Program
+from iblf_jax.kernels import Program
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.sampling import has_noise

@@ -14,9 +14,7 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.deployment.c_names import Parameters, comment, number
 from iblf_jax.deployment.control_law import FLAGS, ControlLaw
-from iblf_jax.kernels.emit_c import header, plain_function
-from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.program import INPUTS, Program
+from iblf_jax.kernels import INPUTS, OPERATIONS, Program, header, plain_function
 from iblf_jax.simulation.scenario import Scenario
 
 SEGMENT = 500
@@ -161,7 +159,11 @@ def written(law: Law) -> Written:
     ]
     seen = [f"const {name}_parameters *p", "const F *m", "const F *t", "const F *q", "const F *dq"]
     seen += [f"const F *{x}" for x in REFERENCE] if law.told_reference else []
-    inputs = {"shared": parameters.numbers, "lane": lane, "carry": [f"m[{k}]" for k in range(size)]}
+    inputs = {
+        "shared": parameters.numbers,
+        "per_run": lane,
+        "carry": [f"m[{k}]" for k in range(size)],
+    }
     results = len(programs.start.samples), size + len(programs.sample.samples)
     start = plain_function(
         programs.start, f"{name}_start", [seen[0], *seen[2:]], inputs, _places(results[0]), SEGMENT

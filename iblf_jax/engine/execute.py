@@ -32,10 +32,15 @@ from iblf_jax.engine.mechanism import Mechanism, known_of
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Carry, Inputs, Outcome, Probed, TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
-from iblf_jax.kernels.packed import Shapes
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import Program, UnsupportedError
-from iblf_jax.kernels.toolchain import StoppedError, ToolchainError, stop_compilers
+from iblf_jax.kernels import (
+    Program,
+    Shapes,
+    StoppedError,
+    ToolchainError,
+    UnsupportedError,
+    stop_compilers,
+    written_out,
+)
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 

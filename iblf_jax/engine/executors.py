@@ -16,7 +16,15 @@ from iblf_jax.engine import plan
 from iblf_jax.engine.batch import Batch, Executor, Leaves
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.step import Form, Probe, keep_if
-from iblf_jax.kernels.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
+from iblf_jax.kernels import (
+    CompiledStep,
+    Packed,
+    Shapes,
+    compile_step,
+    pack,
+    unpack,
+    unpacked_records,
+)
 
 
 def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
@@ -101,7 +109,7 @@ def checkpointed(
 
 @lru_cache(maxsize=64)
 def _on_leaves(step: Any, treedef, is_lane: tuple[bool, ...], carry_treedef) -> Callable:
-    """A step as a function of lists of leaves, for `lowered`; the same object for the same
+    """A step as a function of lists of leaves, for `compile_step`; the same object for the same
     structure.
     """
 
@@ -115,7 +123,7 @@ def _on_leaves(step: Any, treedef, is_lane: tuple[bool, ...], carry_treedef) -> 
     return on_leaves
 
 
-def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
+def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
     """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes).
 
     Raises:
@@ -127,7 +135,7 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
     # A derivative's literal zero says "does not depend".
     sparse = getattr(step, "is_derivative", False)
     shapes = Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), Shapes.of(flat, 1)
-    return lowered(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
+    return compile_step(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
 
 
 def lowered_on(

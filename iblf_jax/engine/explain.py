@@ -18,9 +18,7 @@ from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import TimeStep
-from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import LANE, SHARED, TIME, Program
+from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
@@ -32,8 +30,8 @@ LIBRARY_CALL = 40
 NAMES = {
     SHARED: "once",
     SHARED | TIME: "a step, shared",
-    LANE: "a run",
-    LANE | TIME: "a step and run",
+    PER_RUN: "a run",
+    PER_RUN | TIME: "a step and run",
 }
 
 
@@ -123,21 +121,21 @@ def explain(
 
 
 def instructions(program: Program, width: int) -> float:
-    """Vector instructions of a step for a register of runs (class LANE | TIME)."""
+    """Vector instructions of a step for a register of runs (class PER_RUN | TIME)."""
     classes, uses = program.classes(), Counter(a for node in program.nodes for a in node.args)
     fused = {
         next(
             (
                 a
                 for a in node.args
-                if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == LANE | TIME
+                if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == PER_RUN | TIME
             ),
             None,
         )
         for node in program.nodes
         if node.op in ("add", "sub")
     }
-    counted = program.counts()[LANE | TIME]
+    counted = program.counts()[PER_RUN | TIME]
     total = -len(fused - {None})
     for op, n in counted.items():
         cost = OPERATIONS[op].cost

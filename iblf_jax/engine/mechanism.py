@@ -19,7 +19,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import layers
-from iblf_jax.kernels.program import Known
+from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
 
 QUATERNIONS = ("rotation", "tip_rotation")

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iblf_jax.kernels.program import LoweringLimits
+from iblf_jax.kernels import LoweringLimits
 
 BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
 """How a user may ask for a batch to be executed; "vmap" is the scan executor."""

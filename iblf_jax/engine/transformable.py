@@ -31,8 +31,7 @@ from iblf_jax.engine.executors import scan
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Outcome, recorded
-from iblf_jax.kernels.program import UnsupportedError
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import ToolchainError, UnsupportedError
 from iblf_jax.simulation.scenario import Scenario
 
 

@@ -7,7 +7,7 @@ is that of a study file (`files.study`):
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # arguments of `tune`: runs, seed, risk, level, iterations
+    [tune]                                  # runs, seed, risk, level, iterations of `tune`
     parameters = [
       "controller.k1",
       { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
@@ -77,7 +77,7 @@ from iblf_jax.tuning.options import EARLIER_NAMES, REPLACED, Report
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
-from iblf_jax.tuning.runs import BACKENDS
+from iblf_jax.tuning.runs import check_backend
 from iblf_jax.tuning.solvers import SOLVERS
 from iblf_jax.world.robots import joint_names
 
@@ -178,6 +178,7 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
         options["solver"] = _solver(table["solver"])
     if "report" in table:
         report = as_table(table["report"], "tune.report")
+        known_keys(report, "tune.report", [field.name for field in dataclasses.fields(Report)])
         options["report"] = components.construct(Report, dict(report), "tune.report")
     if "risk" in table:
         checks.one_of("tune.risk", table["risk"], KINDS)
@@ -316,7 +317,7 @@ def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objecti
     return total
 
 
-# ------------------------------------------------------------------------------------------------------------- saved results
+# ----------------------------------------------------------------------------------- saved results
 
 
 RESULT = (
@@ -441,7 +442,7 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         },
     )
     tableau(setup.method)
-    checks.one_of("backend", setup.backend, BACKENDS)
+    check_backend(setup.backend)
     checks.whole_steps(setup.duration, setup.dt)
     check_confidence(setup.confidence)
     for name in ("runs", "report_runs"):

@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
@@ -24,21 +22,21 @@ from iblf_jax.identification.coordinates import (
     with_widths,
 )
 from iblf_jax.identification.log import Log, Said, read
-from iblf_jax.identification.regression import LARGEST_DELAY, coordinate_scales, started
-from iblf_jax.identification.replay import slopes, slopes_under
-from iblf_jax.identification.result import FINEST, LACKS, Identification, judged
-from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for, windows
-from iblf_jax.identification.smoothing import Smoothed, smoothed
+from iblf_jax.identification.problem import IdentificationProblem
+from iblf_jax.identification.regression import LARGEST_DELAY, Start, coordinate_scales, started
+from iblf_jax.identification.result import FINEST, LACKS, Identification, assessed
+from iblf_jax.identification.shooting import Prior, Refined, Windows, windows
+from iblf_jax.identification.smoothing import smoothed
 from iblf_jax.identification.standstill import (
     BETTER,
     HOPELESS,
     NONE,
     SLOW,
     WORSE,
+    Free,
     by_the_law,
     free_about_standstill,
 )
-from iblf_jax.identification.structure import LeftOut, left_out
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 
@@ -110,108 +108,181 @@ def identify(
     Source: H. G. Bock's multiple shooting; L. Ljung, System Identification, 2nd ed., 1999; C.
       Rucker, P. M. Wensing 2022 for inertias.
     """
-    begin = time.monotonic()
-    torque = ("interpolated" if _is_continuous(log) else "held") if torque is None else torque
+    began = time.monotonic()
+    given = canonical(scenario)
+    options = _checked_options(log, window, torque, delay, loss, widths, limits, priors, iterations)
+    with jax.enable_x64(True):  # noise of 1e-4 rad leaves no room for the rounding of float32
+        problem = _problem(given, log, paths, held_out, options)
+        result = _solved(problem, began)
+    dtype = given.initial.q.dtype
+    return dataclasses.replace(result, scenario=astype(result.scenario, dtype), start=given)
+
+
+class Options(NamedTuple):
+    """The checked options of `identify`."""
+
+    window: float
+    zero_order_hold: bool
+    delay: float | None
+    loss: str
+    widths: bool
+    limits: Mapping[str, Any]
+    priors: Mapping[str, Any]
+    iterations: int
+
+
+def _checked_options(
+    log: Any,
+    window: Any,
+    torque: Any,
+    delay: Any,
+    loss: Any,
+    widths: Any,
+    limits: Any,
+    priors: Any,
+    iterations: Any,
+) -> Options:
+    """The options of `identify`; ValueError for one that is invalid."""
+    if torque is None:
+        torque = "interpolated" if _is_continuous(log) else "held"
     checks.one_of("torque", torque, TORQUES)
     checks.one_of("loss", loss, LOSSES)
     window = checks.time_span("window", window)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
-    limits = (
-        {} if limits is None else checks.mapping("limits", limits, '{"plant.mass": (0.1, 5.0)}')
-    )
-    priors = (
-        {} if priors is None else checks.mapping("priors", priors, '{"plant.mass": (2.0, 0.1)}')
-    )
+    if limits is None:
+        limits = {}
+    limits = checks.mapping("limits", limits, '{"plant.mass": (0.1, 5.0)}')
+    if priors is None:
+        priors = {}
+    priors = checks.mapping("priors", priors, '{"plant.mass": (2.0, 0.1)}')
     _check_delay(delay)
-    given = canonical(scenario)
-    with jax.enable_x64(True):  # noise of 1e-4 rad leaves no room for the rounding of float32
-        start = canonical(astype(given, "float64"))
-        wanted = with_widths(start, paths) if checks.flag("widths", widths) else paths
-        replayed, c = coordinates(start, wanted, limits)
-        if c.delay:
-            delay = None
-        logs, back = _logs(log, held_out, start.n)
-        held = torque == "held"
-        w = windows(logs, window, back, held)
-        _enough(w, len(c.x), logs, window)
-        seen = smoothed(
-            [
-                fitted
-                for x, share in zip(logs, back, strict=True)
-                for fitted in _front(x, 1.0 - share)
-            ],
-            held,
+    widths = checks.flag("widths", widths)
+    return Options(window, torque == "held", delay, loss, widths, limits, priors, iterations)
+
+
+def _problem(
+    given: Scenario, log: Any, paths: list[str], held_out: Any, options: Options
+) -> IdentificationProblem:
+    """What is identified, from which data; ValueError for logs that are too short."""
+    start = canonical(astype(given, "float64"))
+    all_paths = with_widths(start, paths) if options.widths else paths
+    simulated, c = coordinates(start, all_paths, options.limits)
+    logs, held_back = _logs(log, held_out, start.n)
+    fitted_windows = windows(logs, options.window, held_back, options.zero_order_hold)
+    _enough(fitted_windows, len(c.x), logs, options.window)
+    fitted_logs = [
+        part
+        for one, share in zip(logs, held_back, strict=True)
+        for part in _front(one, 1.0 - share)
+    ]
+    fixed_delay = None
+    if options.delay is not None and not c.delay:
+        fixed_delay = float(options.delay)
+    return IdentificationProblem(
+        start=start,
+        simulated=simulated,
+        coordinates=c,
+        logs=logs,
+        windows=fitted_windows,
+        smoothed=smoothed(fitted_logs, options.zero_order_hold),
+        prior=_prior(c, options.priors),
+        requested=len([path for path in paths if path != DELAY]),
+        fixed_delay=fixed_delay,
+        zero_order_hold=options.zero_order_hold,
+        loss=options.loss,
+        iterations=options.iterations,
+    )
+
+
+def _solved(problem: IdentificationProblem, began: float) -> Identification:
+    """The result: regression, free torques near standstill, then the friction law."""
+    guess = started(
+        problem.simulated, problem.coordinates, problem.smoothed, "log", problem.fixed_delay
+    )
+    noise = np.maximum(problem.smoothed.noise, 1e-9)
+    by_law = by_the_law(problem.windows.y.shape, len(problem.coordinates.x))
+    before = problem.replay(problem.coordinates.x, by_law).best_starts(
+        np.append(to_z(problem.coordinates, problem.coordinates.x), guess.delay), noise
+    )[1]
+    search = _Search(problem, guess, noise)
+    free_fit = search.with_free_torques()
+    end, friction_ratio = search.with_friction_law(by_law, free_fit)
+    return assessed(problem, guess, end, before, friction_ratio, time.monotonic() - began)
+
+
+class _Search:
+    """The nonlinear search: simulation error over windows, by `Replay.refined`."""
+
+    def __init__(self, problem: IdentificationProblem, guess: Start, noise: np.ndarray) -> None:
+        self.problem = problem
+        self.first = np.append(guess.z, guess.delay)
+        self.noise = noise
+        scales = coordinate_scales(problem.coordinates, guess.scale)
+        self.scale = np.append(scales, OFFSET)
+
+    def refined(self, x: np.ndarray, z: np.ndarray, free: Free, hopeless: Any = np.inf) -> Refined:
+        """The fit from z on, with these free torques.
+
+        Args:
+          x: parameters at which the steps of the integrator are chosen.
+          z: start of the search, the delay last.
+          free: torques that are free near standstill.
+          hopeless: residuals at which the search is given up.
+        """
+        problem = self.problem
+        return problem.replay(x, free).refined(
+            z, problem.limits, self.scale, self.noise, problem.prior, problem.iterations, hopeless
         )
-        prior = _prior(c, priors)
-        guess = started(replayed, c, seen, "log", delay)
 
-        law = by_the_law(w.y.shape, len(c.x))
+    def with_free_torques(self) -> Refined | None:
+        """The best fit with free torques near standstill; None if no friction is identified.
 
-        def replay(x, friction):
-            return Replay(
-                replayed,
-                c,
-                w,
-                logs,
-                held,
-                loss,
-                _substeps(replayed, c, x, seen, min(one.step for one in logs)),
-                friction,
+        The friction law may be wrong near standstill, and this search converges from any start. A
+        larger range of speeds is tried only if the smaller one leaves more than noise.
+        """
+        problem = self.problem
+        noise = np.maximum(problem.smoothed.noise, FINEST)
+        size = np.std(problem.smoothed.tau, axis=0)
+        best: Refined | None = None
+        for speed in SLOW:
+            free = free_about_standstill(
+                problem.simulated,
+                problem.coordinates,
+                problem.windows,
+                problem.logs,
+                size,
+                speed,
             )
-
-        noise, counts = np.maximum(seen.noise, 1e-9), np.maximum(seen.noise, FINEST)
-        fixed = None if delay is None else float(delay)
-        ends = tuple(
-            np.append(x, side * LARGEST_DELAY if fixed is None else fixed)
-            for x, side in ((c.low, -1.0), (c.high, 1.0))
-        )
-        first = np.append(to_z(c, c.x), guess.delay)
-        before = replay(c.x, law).best_starts(first, noise)[1]
-        scale = np.append(coordinate_scales(c, guess.scale), OFFSET)
-        z, loose, worse = np.append(guess.z, guess.delay), None, 0.0
-        for slow in SLOW:  # found from any start; then the law of friction from there
-            free = free_about_standstill(replayed, c, w, logs, np.std(seen.tau, axis=0), slow)
             if not free.held.any():
                 break
-            found = replay(np.where(free.held, NONE, to_x(c, z[:-1])[0]), free).refined(
-                z, ends, scale, noise, prior, iterations
-            )
-            if loose is not None and not np.max(found.left / counts) < BETTER * np.max(
-                loose.left / counts
-            ):
+            z = self.first if best is None else best.z
+            x = np.where(free.held, NONE, to_x(problem.coordinates, z[:-1])[0])
+            found = self.refined(x, z, free)
+            residual = np.max(found.left / noise)
+            if best is not None and not residual < BETTER * np.max(best.left / noise):
                 break
-            loose, z = found, found.z
-            if np.max(loose.left / counts) < LACKS:
+            best = found
+            if residual < LACKS:
                 break
-        least = (
-            np.inf if loose is None else np.maximum(loose.left, FINEST)
-        )  # a log of a simulation has no noise: less is not better
-        hopeless = HOPELESS * least
-        end = replay(to_x(c, z[:-1])[0], law).refined(
-            z, ends, scale, noise, prior, iterations, hopeless
-        )
-        if loose is not None:
-            worse = float(np.max(end.left / least))
-            end = (loose if worse > WORSE else end)._replace(steps=loose.steps + end.steps)
-        result = judged(
-            start,
-            c,
-            w,
-            end,
-            prior,
-            before,
-            guess,
-            len([path for path in paths if path != DELAY]),
-            ends,
-            fixed is None,
-            worse,
-            tuple(x.name for x in logs),
-            time.monotonic() - begin,
-            partial(_lacking_terms, replayed, c, seen),
-        )
-    return dataclasses.replace(
-        result, scenario=astype(result.scenario, given.initial.q.dtype), start=given
-    )
+        return best
+
+    def with_friction_law(self, by_law: Free, free_fit: Refined | None) -> tuple[Refined, float]:
+        """The fit with the friction law, or the one with free torques if that is clearly better.
+
+        Returns:
+          The fit, and the residual of the friction law relative to that of free torques, 0 without
+          these.
+        """
+        z = self.first if free_fit is None else free_fit.z
+        x = to_x(self.problem.coordinates, z[:-1])[0]
+        if free_fit is None:
+            return self.refined(x, z, by_law), 0.0
+        # A log of a simulation has no noise: a smaller residual is no improvement.
+        smallest = np.maximum(free_fit.left, FINEST)
+        law_fit = self.refined(x, z, by_law, HOPELESS * smallest)
+        ratio = float(np.max(law_fit.left / smallest))
+        chosen = free_fit if ratio > WORSE else law_fit
+        return chosen._replace(steps=free_fit.steps + law_fit.steps), ratio
 
 
 def _check_delay(delay: Any) -> None:
@@ -222,18 +293,6 @@ def _check_delay(delay: Any) -> None:
     if number.ndim != 0 or not abs(float(number)) <= LARGEST_DELAY:
         expected = f"one number [s], of a size of at most {LARGEST_DELAY:g} s"
         raise checks.fail("delay", delay, expected, "Leave it out to have it found from the log.")
-
-
-def _lacking_terms(
-    scenario: Scenario, c: Coordinates, seen: Smoothed, z: np.ndarray, fitted: np.ndarray
-) -> LeftOut:
-    """The terms that a fit which ended at z, the delay last, lacks; `fitted` are the numbers that
-    it moved, (p + 1,) bool.
-    """
-    x, _ = to_x(c, z[:-1])
-    points = (jnp.asarray(a) for a in (x, seen.t, seen.q, seen.dq, seen.ddq))
-    at_end = slopes(scenario, *points, places=c.places)
-    return left_out(seen, np.asarray(at_end.torque), np.asarray(at_end.by_x), float(z[-1]), fitted)
 
 
 def _is_continuous(log: Any) -> bool:
@@ -254,20 +313,12 @@ def _logs(log: Any, held_out: Any, n: int) -> tuple[list[Log], list[float]]:
 
 
 def _front(log: Log, share: float) -> list[Log]:
-    """The first share of a log; nothing of one that is held back."""
+    """The first share of a log; an empty list for one that is held back."""
     count = round(share * len(log.t))
-    return (
-        [
-            log._replace(
-                t=log.t[:count],
-                q=log.q[:count],
-                tau=log.tau[:count],
-                dq=None if log.dq is None else log.dq[:count],
-            )
-        ]
-        if count
-        else []
-    )
+    if not count:
+        return []
+    dq = None if log.dq is None else log.dq[:count]
+    return [log._replace(t=log.t[:count], q=log.q[:count], tau=log.tau[:count], dq=dq)]
 
 
 def _enough(w: Windows, p: int, logs: list[Log], length: float) -> None:
@@ -309,11 +360,3 @@ def _prior(c: Coordinates, priors: Mapping[str, Any]) -> Prior:
         checks.check_values(f"priors[{path!r}]: standard deviation", std, "positive")
         mean[own], precision[own, own] = centre, np.diag(std**-2)
     return Prior(mean, precision)
-
-
-def _substeps(
-    scenario: Scenario, c: Coordinates, x: np.ndarray, seen: Smoothed, step: float
-) -> int:
-    """Steps of the integrator from sample to sample."""
-    points = (jnp.asarray(a) for a in (seen.t, seen.q, seen.dq, seen.tau))
-    return substeps_for(slopes_under(scenario, jnp.asarray(x), *points, places=c.places), step)

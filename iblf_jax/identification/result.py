@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,8 +14,9 @@ import numpy as np
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
 from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, to_x
+from iblf_jax.identification.problem import IdentificationProblem, missing_terms
 from iblf_jax.identification.regression import Start
-from iblf_jax.identification.shooting import Prior, Refined, Windows
+from iblf_jax.identification.shooting import Refined, Windows
 from iblf_jax.identification.statistics import UNKNOWN, Known, Whiteness, in_words, known, whiteness
 from iblf_jax.identification.structure import LeftOut, biased, remedy_for
 from iblf_jax.identification.structure import in_words as in_words_of
@@ -389,118 +389,153 @@ def _for_json(x: Any) -> Any:
     return x if not isinstance(x, float) or math.isfinite(x) else None
 
 
-def judged(
-    start: Scenario,
-    c: Coordinates,
-    w: Windows,
-    end: Refined,
-    prior: Prior,
-    before: np.ndarray,
+def assessed(
+    problem: IdentificationProblem,
     guess: Start,
-    asked: int,
-    ends: tuple[np.ndarray, ...],
-    delay_found: bool,
-    worse: float,
-    logs: tuple[str, ...],
+    end: Refined,
+    before: np.ndarray,
+    friction_ratio: float,
     seconds: float,
-    lacking_terms: Callable[[np.ndarray, np.ndarray], LeftOut],
 ) -> Identification:
-    """The result.
+    """The result of a fit, with its statistics.
 
     Args:
-      start: the user's scenario.
-      c, w: coordinates and windows.
-      end: of the search.
-      prior: what was known before.
-      before: residuals with the numbers of the start.
-      guess: of the regression.
-      asked: how many of the paths the user wrote.
-      ends: limits of z.
-      delay_found: whether the delay was looked for.
-      worse: how many times as much the law of friction leaves as free torques about standstill; 0
-        without such.
-      logs: their names.
-      seconds: what it took.
-      lacking_terms: z and which of its numbers were fitted -> the terms that the fit lacks.
+      problem: what was identified from which data.
+      guess: the regression.
+      end: the fit.
+      before: residuals with the parameters of the start.
+      friction_ratio: residual of the friction law relative to that of free torques near standstill;
+        0 without free torques.
+      seconds: computing time.
     """
-    x, slope = to_x(c, end.z[:-1])
-    p = len(x)
-    by_x = np.eye(p + 1)
-    by_x[:p, :p] = np.linalg.inv(slope)
-    looked = np.append(~end.free.held, delay_found)
-    both = np.ix_(looked, looked)
-    information = (by_x.T @ end.told.information[w.kept] @ by_x)[:, looked][:, :, looked]
-    scores = (end.told.scores[w.kept] @ by_x)[:, looked]
-    precision = np.zeros((p + 1, p + 1))
-    precision[:p, :p] = prior.precision
+    start, c, windows = problem.start, problem.coordinates, problem.windows
+    white = [
+        whiteness(end.told.residuals[windows.kept][:, :, j]) for j in range(windows.y.shape[-1])
+    ]
+    fit = _fits(start, windows, end, before, white, guess)
     scale = np.append(guess.scale, OFFSET)
-    white = [whiteness(end.told.residuals[w.kept][:, :, j]) for j in range(w.y.shape[-1])]
-    fit = _fits(start, w, end, before, white, guess)
-    lacking = max(one.lacking for one in fit)
-    found = known(
-        information, scores, precision[both], scale[looked], lacking if lacking > LACKS else 1.0
-    )
-    names = np.array([*c.names, "the torque's delay"])[looked]
-    errors, covariance = np.full(p + 1, np.inf), np.zeros((p + 1, p + 1))
-    errors[looked], covariance[both] = found.errors, found.covariance
-    asked_for = _without_limits(
-        information,
-        scores + (precision @ np.append(x - prior.mean, 0.0))[looked] / len(scores),
-        scale[looked],
-    )
-    beyond = np.zeros(p + 1)
-    beyond[looked] = asked_for
-    x = np.where(end.free.held, c.x, x)
-    lacks = LeftOut((), np.zeros(p))
+    statistics = _statistics(problem, end, scale, max(one.lacking for one in fit))
+    x = np.where(end.free.held, c.x, to_x(c, end.z[:-1])[0])
+    missing = LeftOut((), np.zeros(len(x)))
     if any(one.has_structure for one in fit):
-        lacks = lacking_terms(end.z, looked & ~_at_limits(end, ends, scale))
-    bias = biased(lacks, x, errors[:p])
+        fitted = statistics.estimated & ~_at_limits(end, problem.limits, scale)
+        missing = missing_terms(problem.simulated, c, problem.smoothed, end.z, fitted)
+    bias = biased(missing, x, statistics.errors[:-1])
     numbers = tuple(
-        _number(c, i, float(x[i]), float(errors[i]), beyond[i], end, ends, scale, float(bias[i]))
-        for i in range(p)
-    )
-    combinations = tuple(in_words(direction, tuple(names)) for direction in found.directions.T)
-    untold = tuple(
-        words
-        for words, size in zip(combinations, found.singular, strict=True)
-        if not size > 1.0 / UNKNOWN
-    )
-    delay_error = float(errors[p]) if delay_found else None
-    scenario, notes = _with_numbers(start, c, x, end.z[-1])
-    if c.delay and end.z[-1] < -3.0 * errors[p]:
-        notes.append(
-            "The logged torque acts before its time: it is not the command, and the scenario's"
-            " delay is 0."
+        _number(
+            c,
+            i,
+            float(x[i]),
+            float(statistics.errors[i]),
+            statistics.beyond[i],
+            end,
+            problem.limits,
+            scale,
+            float(bias[i]),
         )
-    return Identification(
-        scenario,
-        start,
-        c.paths,
-        asked,
-        numbers,
-        covariance[:p, :p],
-        float(end.z[-1]),
-        delay_error,
-        found.singular,
-        combinations,
-        untold,
-        scale[:p],
-        fit,
-        end.told.residuals,
-        w.t,
-        w.kept,
-        np.array([one.correlations for one in white]),
-        (
-            *_left_out_in_words(start, lacks, numbers),
-            *notes,
-            *_limited(c, numbers, beyond, ends),
-            *_notes(found, numbers, fit),
-            *_freed(start, end, worse),
-        ),
-        logs,
-        end.steps,
-        seconds,
+        for i in range(len(x))
     )
+    scenario, scenario_notes = _with_numbers(start, c, x, end.z[-1])
+    notes = (
+        *_left_out_in_words(start, missing, numbers),
+        *scenario_notes,
+        *_note_on_early_torque(c, end, statistics.errors[-1]),
+        *_limited(c, numbers, statistics.beyond, problem.limits),
+        *_notes(statistics.known, numbers, fit),
+        *_freed(start, end, friction_ratio),
+    )
+    return Identification(
+        scenario=scenario,
+        start=start,
+        paths=c.paths,
+        asked=problem.requested,
+        numbers=numbers,
+        covariance=statistics.covariance[:-1, :-1],
+        delay=float(end.z[-1]),
+        delay_error=float(statistics.errors[-1]) if problem.estimates_delay else None,
+        singular_values=statistics.known.singular,
+        combinations=statistics.combinations,
+        untold=statistics.unidentifiable,
+        scales=scale[:-1],
+        fit=fit,
+        residuals=end.told.residuals,
+        times=windows.t,
+        kept=windows.kept,
+        autocorrelations=np.array([one.correlations for one in white]),
+        notes=notes,
+        logs=tuple(log.name for log in problem.logs),
+        steps=end.steps,
+        seconds=seconds,
+    )
+
+
+class _Statistics(NamedTuple):
+    """The uncertainty of a fit; arrays have the p parameters and the delay."""
+
+    estimated: np.ndarray
+    """Entries that are estimated, (p + 1,) bool."""
+    known: Known
+    errors: np.ndarray
+    """Standard errors, (p + 1,); infinite where an entry is not estimated."""
+    covariance: np.ndarray
+    """(p + 1, p + 1); zero where an entry is not estimated."""
+    beyond: np.ndarray
+    """The step that the log suggests without limits, (p + 1,)."""
+    combinations: tuple[str, ...]
+    """The combinations of parameters, from the best known one on."""
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """The combinations that the log does not identify."""
+        pairs = zip(self.combinations, self.known.singular, strict=True)
+        return tuple(text for text, size in pairs if not size > 1.0 / UNKNOWN)
+
+
+def _statistics(
+    problem: IdentificationProblem, end: Refined, scale: np.ndarray, lacking: float
+) -> _Statistics:
+    """The statistics of a fit.
+
+    Args:
+      problem: what was identified from which data.
+      end: the fit.
+      scale: of the parameters and the delay, (p + 1,).
+      lacking: the largest residual, relative to the noise of the positions.
+    """
+    kept = problem.windows.kept
+    x, slope = to_x(problem.coordinates, end.z[:-1])
+    p = len(x)
+    z_by_x = np.eye(p + 1)
+    z_by_x[:p, :p] = np.linalg.inv(slope)
+    estimated = np.append(~end.free.held, problem.estimates_delay)
+    both = np.ix_(estimated, estimated)
+    information = (z_by_x.T @ end.told.information[kept] @ z_by_x)[:, estimated][:, :, estimated]
+    scores = (end.told.scores[kept] @ z_by_x)[:, estimated]
+    precision = np.zeros((p + 1, p + 1))
+    precision[:p, :p] = problem.prior.precision
+    widening = lacking if lacking > LACKS else 1.0
+    found = known(information, scores, precision[both], scale[estimated], widening)
+    errors = np.full(p + 1, np.inf)
+    errors[estimated] = found.errors
+    covariance = np.zeros((p + 1, p + 1))
+    covariance[both] = found.covariance
+    from_prior = precision @ np.append(x - problem.prior.mean, 0.0)
+    all_scores = scores + from_prior[estimated] / len(scores)
+    beyond = np.zeros(p + 1)
+    beyond[estimated] = _without_limits(information, all_scores, scale[estimated])
+    names = np.array([*problem.coordinates.names, "the torque's delay"])[estimated]
+    combinations = tuple(in_words(direction, tuple(names)) for direction in found.directions.T)
+    return _Statistics(estimated, found, errors, covariance, beyond, combinations)
+
+
+def _note_on_early_torque(c: Coordinates, end: Refined, delay_error: float) -> list[str]:
+    """A note where the delay of the torque is estimated to be negative."""
+    if not c.delay or not end.z[-1] < -3.0 * delay_error:
+        return []
+    return [
+        "The logged torque acts before its time: it is not the command, and the scenario's"
+        " delay is 0."
+    ]
 
 
 def _without_limits(information: np.ndarray, scores: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -18,10 +18,18 @@ from types import MappingProxyType
 
 import numpy as np
 
-from iblf_jax.kernels.layout import Calls, Layout, literal, places, unpacked
+from iblf_jax.kernels.layout import FunctionCalls, Layout, literal, places, unpacked
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.passes import scheduled
-from iblf_jax.kernels.program import LANE, TIME, Node, Program, UnsupportedError, frontier, needed
+from iblf_jax.kernels.program import (
+    PER_RUN,
+    TIME,
+    Node,
+    Program,
+    UnsupportedError,
+    frontier,
+    needed,
+)
 
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
@@ -77,7 +85,7 @@ class _Emitter:
     of a call are.
     """
 
-    def __init__(self, program: Program, tables: dict[str, str], calls: Calls) -> None:
+    def __init__(self, program: Program, tables: dict[str, str], calls: FunctionCalls) -> None:
         self.program = program
         self.turns = TURNS
         """Operations of which several are done with one test (`_turned`)."""
@@ -145,7 +153,7 @@ class _Emitter:
                 names[i] = old
                 continue
             if node.op == "call":
-                self.lines += self.calls.statement(i, args)
+                self.lines += self.calls.statements(i, args)
                 names[i] = "called"
                 continue
             if node.op == "lookup":
@@ -213,7 +221,7 @@ def source(
     ):
         program = scheduled(program)
     layout, tables = Layout.of(program), dict[str, str]()
-    calls = Calls(program, layout)
+    calls = FunctionCalls(program, layout)
     e = _Emitter(program, tables, calls)
     functions = _functions(calls, tables, segment)
     before, after = target
@@ -247,7 +255,7 @@ def plain_function(
       segment: operations above which it is cut, into functions of so many.
     """
     tables = dict[str, str]()
-    e = _Emitter(program, tables, Calls(program, Layout.of(program)))
+    e = _Emitter(program, tables, FunctionCalls(program, Layout.of(program)))
     e.tables = {i: f"{name}_{table}" for i, table in e.tables.items()}
     e.turns = frozenset()  # each by itself
     names = {
@@ -278,18 +286,20 @@ def header(name: str) -> str:
     return (files("iblf_jax.kernels") / "c" / name).read_text()
 
 
-def _functions(calls: Calls, tables: dict[str, str], segment: int | None) -> list[str]:
+def _functions(calls: FunctionCalls, tables: dict[str, str], segment: int | None) -> list[str]:
     """The functions that a program calls, each cut into some of `segment` operations if given."""
     texts = []
-    for k, (function, given) in enumerate(zip(calls.functions, calls.given, strict=True)):
+    for k, (function, arguments, _) in enumerate(calls.functions):
         e = _Emitter(function, tables, calls)
         names = {
-            i: given[node.value] for i, node in enumerate(function.nodes) if node.op == "argument"
+            i: arguments[node.value]
+            for i, node in enumerate(function.nodes)
+            if node.op == "argument"
         }
         results = list(
             zip(
                 function.samples,
-                places([function.nodes[i] for i in function.samples], "r", "s")[0],
+                places([function.nodes[i] for i in function.samples], "r", "s"),
                 strict=True,
             )
         )
@@ -343,7 +353,7 @@ def _advance(
 ) -> str:
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
-    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
+    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "per_run"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
         c: f"ints[{k}]" for k, c in enumerate(ints)
     }
@@ -355,8 +365,8 @@ def _advance(
         if program.carry[c][0] >= 0:
             names[program.carry[c][0]] = f"c{c}"
     e.in_place = _in_place(program)
-    e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
-    e.lines += [e.calls.room, *e.calls.filled(names)] if e.calls.functions else []
+    e.statements(names, frontier(program, classes, PER_RUN, lambda k: k == PER_RUN | TIME))
+    e.lines += [e.calls.declarations, *e.calls.once_statements(names)] if e.calls.functions else []
     e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
     names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
     e.statements(names, [o for _, o in program.carry])
@@ -389,7 +399,7 @@ def _in_place(program: Program) -> dict[int, int]:
     found = {}
     for a, o in program.carry:
         node = nodes[o]
-        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & LANE:
+        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & PER_RUN:
             (new,) = [x for x in node.args[1:] if x != a]
             # A call whose result is the new number has read the one before.
             if uses[a] == 1 + (
@@ -499,13 +509,15 @@ def _advance_in_segments(
     program, nodes, classes = e.program, e.program.nodes, e.classes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
-    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
+    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "per_run"}
     places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
         c: f"ints[{k}]" for k, c in enumerate(ints)
     }
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
     segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
-    before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
+    before = segments.add(
+        frontier(program, classes, PER_RUN, lambda k: k == PER_RUN | TIME), kept=True
+    )
     outputs = sorted({o for _, o in program.carry})
     within = segments.add(
         sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False
@@ -517,8 +529,8 @@ def _advance_in_segments(
     moved = [
         (c, (segments.names | constant)[o]) for c, (a, o) in enumerate(program.carry) if a != o
     ]
-    e.lines += [segments.room, e.calls.room, *signs]
-    e.lines += [*(f"  {call}" for call in before), *e.calls.filled(segments.names)]
+    e.lines += [segments.room, e.calls.declarations, *signs]
+    e.lines += [*(f"  {call}" for call in before), *e.calls.once_statements(segments.names)]
     e.lines += [
         "  for (int step = 0; step < count; step++, row += COLUMNS) {",
         *(f"  {call}" for call in within),

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import platform
 import stat
-from functools import cache
 from pathlib import Path
+
+from iblf_jax.kernels.caches import CACHES
 
 
 def directory() -> Path:
@@ -33,7 +34,7 @@ def directory() -> Path:
     return path
 
 
-@cache
+@CACHES.function(maxsize=1)
 def processor() -> str:
     """What a compiled program is tied to: the processor's model and features."""
     names = ("model name", "flags", "Features", "CPU part")

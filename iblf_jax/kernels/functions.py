@@ -17,15 +17,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
     INPUTS,
-    LANE,
+    PER_RUN,
     Builder,
     Ids,
     LoweringLimits,
@@ -140,11 +140,13 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
         elif node.op == "const":
             pattern.append((node.kind, node.value.hex() if node.kind == "f" else node.value))
         else:
-            pattern.append((node.kind, first.setdefault(i, place), b.moves(i), i in b.known_finite))
+            pattern.append(
+                (node.kind, first.setdefault(i, place), b.depends_on_state(i), i in b.known_finite)
+            )
     return tuple(pattern)
 
 
-@lru_cache(maxsize=16)
+@CACHES.function(maxsize=16)
 def _template(called: Called) -> Template:
     b = Builder(
         called.dtype,
@@ -179,7 +181,7 @@ def _template(called: Called) -> Template:
     )
 
 
-@lru_cache(maxsize=16)
+@CACHES.function(maxsize=16)
 def _with_reciprocals(called: Called) -> Program:
     return with_reciprocals(_template(called).program)
 
@@ -187,7 +189,7 @@ def _with_reciprocals(called: Called) -> Program:
 def _moving(program: Program) -> int:
     """How many operations move with the state."""
     return sum(
-        bool(c & LANE) and node.op not in INPUTS
+        bool(c & PER_RUN) and node.op not in INPUTS
         for c, node in zip(program.classes(), program.nodes, strict=True)
     )
 
@@ -201,14 +203,16 @@ def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:
     ]
 
 
-@lru_cache(maxsize=16)
+@CACHES.function(maxsize=16)
 def _split(called: Called, everywhere: Uses, anywhere: Uses) -> Split:
     """What a call computes: what moves and every caller uses."""
     program, places = _with_reciprocals(called), _template(called).results
     nodes, classes = program.nodes, program.classes()
 
     def moving(wanted: Iterable[int]) -> list[int]:
-        return [i for i in needed(nodes, wanted) if classes[i] & LANE and nodes[i].op not in INPUTS]
+        return [
+            i for i in needed(nodes, wanted) if classes[i] & PER_RUN and nodes[i].op not in INPUTS
+        ]
 
     results, asked = _samples(program, places, everywhere), _samples(program, places, anywhere)
     inside = moving(results)
@@ -228,7 +232,7 @@ def _write(b: Builder, program: Program, known: dict[int, int], wanted: Iterable
     nodes they are.
     """
     for i in needed(program.nodes, wanted, known):
-        known[i] = b.again(program.nodes[i], [known[a] for a in program.nodes[i].args])
+        known[i] = b.copy(program.nodes[i], [known[a] for a in program.nodes[i].args])
 
 
 def _new(known: dict[int, int], program: Program, places: Ids) -> Ids:

@@ -1,5 +1,7 @@
-"""Where the numbers of a program stand in the generated C: constants, columns of time, and what
-goes in and out of functions.
+"""Assigns a place in the generated C to every number of a program.
+
+`Layout` has the constants, the numbers that are computed once per time step, and the carried
+numbers. `FunctionCalls` has the arguments and the results of the functions that a program calls.
 """
 
 from __future__ import annotations
@@ -10,171 +12,242 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iblf_jax.kernels.program import LANE, SHARED, TIME, Node, Program, frontier
+from iblf_jax.kernels.program import PER_RUN, SHARED, TIME, Node, Program, frontier
 
 
 def literal(node: Node, dtype: np.dtype) -> str:
-    """A constant as a vector of runs."""
+    """The C expression of a constant, as a vector with one entry per run."""
     if node.kind == "b":
-        return f"splat_i({-1 if node.value else 0})"
+        return "splat_i(-1)" if node.value else "splat_i(0)"
     if node.kind == "i":
         return f"splat_i({node.value})"
     if math.isnan(node.value):
         return "splat(NAN)"
-    if math.isinf(node.value):
-        return f"splat({'-' if node.value < 0 else ''}INFINITY)"
-    return f"splat({node.value.hex()}{'f' if dtype == np.float32 else ''})"
+    if node.value == math.inf:
+        return "splat(INFINITY)"
+    if node.value == -math.inf:
+        return "splat(-INFINITY)"
+    if dtype == np.float32:
+        return f"splat({node.value.hex()}f)"
+    return f"splat({node.value.hex()})"
 
 
 def c_type(node: Node) -> str:
-    """The C type of a number of every run."""
+    """The C type of a node: "F" for floating-point numbers, "I" for integers and truth values."""
     return "F" if node.kind == "f" else "I"
 
 
 def unpacked(node: Node, place: str) -> str:
-    """A word of a table as a vector of runs."""
-    return f"splat({place}.f)" if node.kind == "f" else f"splat_i({place}.i)"
+    """The C expression of an entry of a table, as a vector with one entry per run."""
+    if node.kind == "f":
+        return f"splat({place}.f)"
+    return f"splat_i({place}.i)"
 
 
 class Layout(NamedTuple):
-    """Which numbers of a program stand where in the generated code."""
+    """The places of the numbers of a program that are kept between its functions."""
 
     constants: list[int]
     """Nodes that are computed once."""
     columns: list[int]
-    """Nodes that are computed once a step."""
+    """Nodes that are computed once per time step, for all runs."""
     floats: list[int]
+    """Positions of the floating-point numbers in the carry."""
     ints: list[int]
-    """Places in the carry."""
+    """Positions of the integers and truth values in the carry."""
 
     @staticmethod
     def of(program: Program) -> Layout:
-        """That of a program."""
+        """The layout of a program."""
         classes, kinds = program.classes(), program.kinds
         return Layout(
             frontier(program, classes, SHARED, lambda c: c != SHARED),
-            frontier(program, classes, TIME, lambda c: bool(c & LANE)),
+            frontier(program, classes, TIME, lambda c: bool(c & PER_RUN)),
             [i for i, kind in enumerate(kinds) if kind == "f"],
             [i for i, kind in enumerate(kinds) if kind != "f"],
         )
 
 
-def places(
-    nodes: Iterable[Node], floats: str, others: str, begin: tuple[int, int] = (0, 0)
-) -> tuple[list[str], tuple[int, int]]:
-    """A place for each node, in two arrays that are filled from `begin` on, and how far they are
-    filled then.
+class Positions(NamedTuple):
+    """The next free positions of two arrays."""
+
+    floats: int = 0
+    others: int = 0
+
+    def after(self, nodes: Iterable[Node]) -> Positions:
+        """The next free positions after these nodes."""
+        types = [c_type(node) for node in nodes]
+        return Positions(self.floats + types.count("F"), self.others + types.count("I"))
+
+    def largest(self, other: Positions) -> Positions:
+        """The larger position of each array."""
+        return Positions(max(self.floats, other.floats), max(self.others, other.others))
+
+
+START = Positions()
+"""The beginning of both arrays."""
+
+
+def places(nodes: Iterable[Node], floats: str, others: str, first: Positions = START) -> list[str]:
+    """The C expression of the place of each node.
+
+    Args:
+      nodes: the nodes, in order.
+      floats: name of the array of floating-point numbers.
+      others: name of the array of all other numbers.
+      first: position in each array of its first node.
     """
-    used, found = dict(zip((floats, others), begin, strict=True)), list[str]()
+    names = {"F": floats, "I": others}
+    positions = {"F": first.floats, "I": first.others}
+    found = []
     for node in nodes:
-        array = floats if c_type(node) == "F" else others
-        found.append(f"{array}[{used[array]}]")
-        used[array] += 1
-    return found, (used[floats], used[others])
+        kind = c_type(node)
+        found.append(f"{names[kind]}[{positions[kind]}]")
+        positions[kind] += 1
+    return found
 
 
-def given_to(call: Node) -> tuple[int, ...]:
-    """What the function of a call is given."""
-    return call.args if call.kind == "call" else call.args[1:]
+def arguments_of(call: Node) -> tuple[int, ...]:
+    """The nodes that a call passes to its function."""
+    if call.kind == "call":
+        return call.args
+    return call.args[1:]  # the first one is the condition of a conditional call
 
 
-class Calls:
-    """The functions that a program calls, and where the numbers are that go in and out.
+class CalledFunction(NamedTuple):
+    """A function that a program calls."""
 
-    What is the same in every call is read where it is: shared constants, and what is computed once
-      a run (`once`).  The rest is put into
-    arrays for each call, `p` of floats and `q` of others; the results of each call have places of
-    their own, in `r` and `s`.
+    program: Program
+    arguments: list[str]
+    """The C expression of each argument inside the function."""
+    passed: list[int]
+    """Positions of the arguments that each call passes in arrays."""
+
+
+class FunctionCalls:
+    """The calls of a program, and the places of their arguments and results.
+
+    A function reads an argument that is the same in every call where it is: a shared constant, or a
+    number that is computed once per run (`once`). Each call passes the other arguments in two
+    arrays, `p` of floating-point numbers and `q` of all others. The results of each call have
+    places of their own in the arrays `r` and `s`.
     """
 
     def __init__(self, program: Program, layout: Layout) -> None:
-        nodes = self.nodes = program.nodes
-        calls = [i for i, node in enumerate(nodes) if node.op == "call"]
-        self.functions: list[Program] = list(
-            {id(nodes[i].value): nodes[i].value for i in calls}.values()
-        )
+        self.nodes = program.nodes
+        self.dtype = program.dtype
         self.once: list[int] = []
-        """Nodes that are computed once a run."""
-        self.given: list[list[str]] = []
-        """What a function calls its arguments, one list a function."""
-        self.put: list[list[int]] = []
-        """Which of them are put into arrays."""
-        self.results: dict[int, str] = {}
-        """What the program calls a result."""
-        self.begins: dict[int, tuple[int, int]] = {}
-        """Where the results of a call begin."""
-        self.used = (0, 0)
-        constants, classes = (
-            {i: f"constants[{k}]" for k, i in enumerate(layout.constants)},
-            program.classes(),
-        )
+        """Nodes that are computed once per run."""
+        self._classes = program.classes()
+        self._constants = {i: f"constants[{k}]" for k, i in enumerate(layout.constants)}
+        calls = [i for i, node in enumerate(self.nodes) if node.op == "call"]
+        programs = {id(self.nodes[i].value): self.nodes[i].value for i in calls}
+        self.functions = [self._function(called, calls) for called in programs.values()]
+        self.first: dict[int, Positions] = {}
+        """Call -> positions of its first results."""
+        self.size = START
+        """Sizes of the arrays of results."""
+        self.results = self._places_of_results(calls)
+        """Node of a result -> its C expression in the program."""
 
-        def where_it_is(same: set[int]) -> str | None:
-            a = next(iter(same))
-            if len(same) == 1 and nodes[a].op == "const":
-                return literal(nodes[a], program.dtype)
-            if len(same) == 1 and a in constants:
-                return unpacked(nodes[a], constants[a])
-            if len(same) == 1 and classes[a] == LANE and nodes[a].kind == "f":
-                self.once += [] if a in self.once else [a]
-                return f"once[{self.once.index(a)}]"
+    def _function(self, called: Program, calls: list[int]) -> CalledFunction:
+        """A called function with the places of its arguments."""
+        own_calls = [self.nodes[i] for i in calls if self.nodes[i].value is called]
+        columns = list(zip(*map(arguments_of, own_calls), strict=True))
+        shared = [self._shared_place(set(column)) for column in columns]
+        passed = [k for k, place in enumerate(shared) if place is None]
+        in_arrays = places([self.nodes[columns[k][0]] for k in passed], "p", "q")
+        place_of = dict(zip(passed, in_arrays, strict=True))
+        arguments = [place or place_of[k] for k, place in enumerate(shared)]
+        return CalledFunction(called, arguments, passed)
+
+    def _shared_place(self, values: set[int]) -> str | None:
+        """The place of an argument that every call reads at the same place; None for others.
+
+        Args:
+          values: the nodes that the calls pass for this argument.
+        """
+        if len(values) > 1:
             return None
+        (value,) = values
+        node = self.nodes[value]
+        if node.op == "const":
+            return literal(node, self.dtype)
+        if value in self._constants:
+            return unpacked(node, self._constants[value])
+        if self._classes[value] != PER_RUN or node.kind != "f":
+            return None
+        if value not in self.once:
+            self.once.append(value)
+        return f"once[{self.once.index(value)}]"
 
-        for function in self.functions:
-            arguments = list(
-                zip(*(given_to(nodes[i]) for i in calls if nodes[i].value is function), strict=True)
-            )
-            known = [where_it_is(set(each)) for each in arguments]
-            self.put.append([k for k, name in enumerate(known) if name is None])
-            own = iter(places([nodes[arguments[k][0]] for k in self.put[-1]], "p", "q")[0])
-            self.given.append([name or next(own) for name in known])
-        found, begin = {}, (0, 0)
-        for i in calls:
-            made = [nodes[i].value.nodes[s] for s in nodes[i].value.samples]
-            read = max(
-                (node.value for node in nodes if node.op == "result" and node.args[0] == i),
-                default=-1,
-            )
-            self.begins[i] = begin
-            found[i], end = places(made, "r", "s", begin)
-            self.used = (max(self.used[0], end[0]), max(self.used[1], end[1]))
-            # What nobody reads of a call may be written over by the next one.
-            begin = places(made[: read + 1], "r", "s", begin)[1]
-        self.results = {
-            i: found[node.args[0]][node.value]
-            for i, node in enumerate(nodes)
+    def _places_of_results(self, calls: list[int]) -> dict[int, str]:
+        """The places of all results, one call after the other."""
+        place_of: dict[int, list[str]] = {}
+        free = START
+        for call in calls:
+            called = self.nodes[call].value
+            results = [called.nodes[sample] for sample in called.samples]
+            self.first[call] = free
+            place_of[call] = places(results, "r", "s", free)
+            self.size = self.size.largest(free.after(results))
+            # The next call may overwrite the results that the program does not read.
+            free = free.after(results[: self._number_of_read_results(call)])
+        return {
+            i: place_of[node.args[0]][node.value]
+            for i, node in enumerate(self.nodes)
             if node.op == "result"
         }
 
-    @property
-    def room(self) -> str:
-        """The arrays of what is computed once, and of results."""
-        return f"  F once[{len(self.once) + 1}], r[{self.used[0] + 1}]; I s[{self.used[1] + 1}];"
+    def _number_of_read_results(self, call: int) -> int:
+        """The number of results of a call up to the last one that the program reads."""
+        read = [n.value for n in self.nodes if n.op == "result" and n.args[0] == call]
+        return max(read, default=-1) + 1
 
-    def filled(self, names: dict[int, str]) -> list[str]:
-        """Statements that put there what is computed once."""
+    @property
+    def declarations(self) -> str:
+        """Declarations of the arrays of numbers that are computed once, and of results."""
+        floats, others = self.size
+        return f"  F once[{len(self.once) + 1}], r[{floats + 1}]; I s[{others + 1}];"
+
+    def once_statements(self, names: dict[int, str]) -> list[str]:
+        """Statements that store the numbers that are computed once per run."""
         return [f"  once[{k}] = {names[i]};" for k, i in enumerate(self.once)]
 
-    def statement(self, call: int, args: Sequence[str]) -> list[str]:
-        """A call."""
+    def statements(self, call: int, args: Sequence[str]) -> list[str]:
+        """The statements of a call.
+
+        Args:
+          call: its node.
+          args: C expressions of the arguments of the node.
+        """
         node = self.nodes[call]
-        condition, args = (None, args) if node.kind == "call" else (args[0], args[1:])
-        k = next(k for k, function in enumerate(self.functions) if function is node.value)
-        given = {"F": list[str](), "I": list[str]()}
-        for place in self.put[k]:
-            given[c_type(self.nodes[given_to(node)[place]])].append(args[place])
-        # Element by element: a list of all makes GCC clear the array before.
-        arrays = [
-            f"  {t} {name}{call}[{len(given[t]) + 1}];" for t, name in (("F", "p"), ("I", "q"))
-        ]
-        arrays += [
-            f"  {name}{call}[{k}] = {x};"
-            for t, name in (("F", "p"), ("I", "q"))
-            for k, x in enumerate(given[t])
-        ]
-        floats, others = self.begins[call]
-        made = [
-            *arrays,
-            f"  function_{k}(constants, once, p{call}, q{call}, r + {floats}, s + {others});",
-        ]
-        return made if condition is None else [f"  if (AT({condition}, 0)) {{", *made, "  }"]
+        is_conditional = node.kind != "call"
+        values = args[1:] if is_conditional else args
+        number = next(
+            k for k, function in enumerate(self.functions) if function.program is node.value
+        )
+        passed = {"F": list[str](), "I": list[str]()}
+        for position in self.functions[number].passed:
+            argument = self.nodes[arguments_of(node)[position]]
+            passed[c_type(argument)].append(values[position])
+        lines = self._arrays(call, passed)
+        floats, others = self.first[call]
+        lines.append(
+            f"  function_{number}(constants, once, p{call}, q{call}, r + {floats}, s + {others});"
+        )
+        if is_conditional:
+            return [f"  if (AT({args[0]}, 0)) {{", *lines, "  }"]
+        return lines
+
+    @staticmethod
+    def _arrays(call: int, passed: dict[str, list[str]]) -> list[str]:
+        """Statements that fill the arrays of a call's arguments.
+
+        They assign element by element: GCC clears an array that has a list of all its elements.
+        """
+        arrays = {"F": f"p{call}", "I": f"q{call}"}
+        lines = [f"  {kind} {arrays[kind]}[{len(passed[kind]) + 1}];" for kind in ("F", "I")]
+        for kind in ("F", "I"):
+            lines += [f"  {arrays[kind]}[{k}] = {x};" for k, x in enumerate(passed[kind])]
+        return lines

@@ -15,9 +15,9 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from ctypes import byref, c_char_p, c_int, c_size_t, c_void_p
-from functools import cache
 from pathlib import Path
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.toolchain import ToolchainError, content_of, kept
 
 NVRTC_FLAGS = (
@@ -47,7 +47,7 @@ def _candidates() -> Iterator[Path | str]:
             yield Path(os.environ[name]) / "lib64" / "libnvrtc.so"
 
 
-@cache
+@CACHES.function(maxsize=1)
 def library() -> ctypes.CDLL:
     """NVRTC; ToolchainError if there is none."""
     for path in _candidates():

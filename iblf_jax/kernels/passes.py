@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from functools import lru_cache
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.program import LANE, TIME, Builder, Node, Program, finished, needed
+from iblf_jax.kernels.program import PER_RUN, TIME, Builder, Node, Program, finished, needed
 
 
 def rebuilt(program: Program, rule) -> Program:
@@ -25,7 +25,7 @@ def rebuilt(program: Program, rule) -> Program:
     for i, node in enumerate(program.nodes):
         args = tuple(new[a] for a in node.args)
         made = rule(b, node, args, i)
-        new.append(b.again(node, args) if made is None else made)
+        new.append(b.copy(node, args) if made is None else made)
     carry_in = [new[a] if a >= 0 else -1 for a, _ in program.carry]
     return finished(
         b,
@@ -36,7 +36,7 @@ def rebuilt(program: Program, rule) -> Program:
     )
 
 
-@lru_cache(maxsize=64)
+@CACHES.function(maxsize=64)
 def written_out(program: Program) -> Program:
     """The program with its functions written out wherever they are called."""
     found: dict[int, list[int]] = {}
@@ -49,7 +49,7 @@ def written_out(program: Program) -> Program:
                 new.append(
                     args[inner.value]
                     if inner.op == "argument"
-                    else b.again(inner, [new[a] for a in inner.args])
+                    else b.copy(inner, [new[a] for a in inner.args])
                 )
             found[i] = [new[s] for s in function.samples]
             return -1
@@ -64,11 +64,15 @@ def with_reciprocals(program: Program) -> Program:
     uses = Counter(node.args[1] for node in program.nodes if node.op == "div" and node.kind == "f")
 
     def is_shared(i: int) -> bool:
-        return not classes[i] & LANE
+        return not classes[i] & PER_RUN
 
     def reciprocal(b: Builder, old: int, new: int) -> int:
         node = program.nodes[old]
-        if node.op == "select" and classes[old] & LANE and all(is_shared(a) for a in node.args[1:]):
+        if (
+            node.op == "select"
+            and classes[old] & PER_RUN
+            and all(is_shared(a) for a in node.args[1:])
+        ):
             condition, yes, no = (
                 b.nodes[new].args if b.nodes[new].op == "select" else (None, None, None)
             )
@@ -106,7 +110,7 @@ def scheduled(program: Program) -> Program:
     nodes, classes = program.nodes, program.classes()
     cost, users = [_cost(node) for node in nodes], [list[int]() for _ in nodes]
     delay = [max(2 * c, LATENCY) if c else 0 for c in cost]
-    order, left = [i for i, c in enumerate(classes) if c != LANE | TIME], [0] * len(nodes)
+    order, left = [i for i, c in enumerate(classes) if c != PER_RUN | TIME], [0] * len(nodes)
     known = set(order)
     for i, node in enumerate(nodes):
         for a in set(node.args) - known if i not in known else ():
@@ -131,7 +135,7 @@ def scheduled(program: Program) -> Program:
                 heapq.heappush(waiting, (at[user], user))
         now += cost[i]
     # What only samples need stays last: a call that only they need must not write over what the
-    # next one has left there (`layout.Calls`).
+    # next one has left there (`layout.FunctionCalls`).
     in_time = set(needed(nodes, [o for _, o in program.carry])) | known
     order.sort(key=lambda i: i not in in_time)
     place = {i: k for k, i in enumerate(order)}

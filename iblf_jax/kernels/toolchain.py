@@ -31,12 +31,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.drafts import draft, remove_abandoned
 from iblf_jax.kernels.folder import directory, processor
 from iblf_jax.kernels.messages import announce_if_slow
@@ -170,7 +170,7 @@ def _version(command: tuple[str, ...]) -> Version:
     return version
 
 
-@cache
+@CACHES.function(maxsize=16)
 def _version_of(command: tuple[str, ...], changed: int) -> Version | ToolchainError:
     """The version, or why there is none: a compiler that hangs is started once."""
     try:
@@ -206,19 +206,13 @@ def built_for() -> dict[str, str]:
     }
 
 
-_running: set[int] = set()
-"""Compilers that run now."""
-_making: dict[str, threading.Lock] = {}
-"""Key -> the lock of who makes it."""
-_failures: dict[str, ToolchainError] = {}
-"""Key -> why a thread that built it ahead could not."""
 _this_thread = threading.local()
 
 
 def stop_compilers() -> None:
     """Kills every compiler that this process has started."""
-    for pid in tuple(_running):
-        _running.discard(pid)
+    for pid in tuple(CACHES.running):
+        CACHES.running.discard(pid)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(pid, signal.SIGKILL)
 
@@ -259,7 +253,7 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
         with getattr(process, stream) as pipe:
             said.append(pipe.read(MOST_TEXT))
 
-    _running.add(process.pid)
+    CACHES.running.add(process.pid)
     listener, end = threading.Thread(target=listen, daemon=True), time.monotonic() + seconds
     listener.start()
     try:
@@ -273,8 +267,8 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
             raise ToolchainError(f"{name} took longer than {seconds:g} s and was stopped") from None
         raise
     finally:
-        stopped = process.pid not in _running
-        _running.discard(process.pid)
+        stopped = process.pid not in CACHES.running
+        CACHES.running.discard(process.pid)
     if stopped:
         raise StoppedError(f"{name} was stopped")
     text = said[0] if said else b""
@@ -337,15 +331,15 @@ def _made_once(key: str) -> Iterator[None]:
     """
     waiting = True
     try:
-        with _making.setdefault(key, threading.Lock()):
+        with CACHES.locks.setdefault(key, threading.Lock()):
             waiting = False
-            if key in _failures:
-                raise _failures.pop(key)
+            if key in CACHES.failures:
+                raise CACHES.failures.pop(key)
             try:
                 yield
             except ToolchainError as error:
                 if getattr(_this_thread, "is_ahead", False) and not isinstance(error, StoppedError):
-                    _failures[key] = error
+                    CACHES.failures[key] = error
                 raise
     except BaseException:
         if waiting:
@@ -425,24 +419,20 @@ def content_of(path: Path) -> bytes:
     return image
 
 
-_libraries: dict[str, ctypes.CDLL] = {}
-"""Key -> what this process has loaded of it: once, as XLA takes one address for a name."""
-
-
 def loaded(library: Path, *names: str) -> ctypes.CDLL:
     """A library of `built` in this process, from a copy that nobody can change; ToolchainError if
     it does not load or lacks a name.
     """
     key = library.stem
     try:
-        found = _libraries[key] if key in _libraries else _load(content_of(library))
+        found = CACHES.libraries[key] if key in CACHES.libraries else _load(content_of(library))
         for name in names:
             getattr(found, name)
     except (OSError, AttributeError) as error:
         with contextlib.suppress(OSError):
             library.unlink()  # the compiler may do better another time
         raise ToolchainError(f"a kernel does not load: {error}") from None
-    return _libraries.setdefault(key, found)
+    return CACHES.libraries.setdefault(key, found)
 
 
 def _load(image: bytes) -> ctypes.CDLL:

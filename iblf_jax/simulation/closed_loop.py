@@ -306,7 +306,9 @@ def discrete_observer(scenario: Scenario) -> Any:
     if sampling is None or sampling.observer != "poles":
         return observer
     at_period = optional_member(observer, "at_period")
-    return observer if at_period is None else at_period(sampling.period)
+    if at_period is None:
+        return observer
+    return at_period(sampling.period)
 
 
 def law_update(
@@ -434,8 +436,10 @@ def perturbed_rate(
       compiled: wrapper of functions that are compiled on their own.
     """
     if not isinstance(perturbed, PerturbedState):
-        weight = () if dt is None else (dt,)
-        return compiled(evaluate)(scenario, t, perturbed, *weight)[0]
+        arguments = [scenario, t, perturbed]
+        if dt is not None:
+            arguments.append(dt)
+        return compiled(evaluate)(*arguments)[0]
     scenario = _without_rounding_and_limits(scenario)
     controller, observer, sensor = perturbed.memory
     state = with_integrated_part(initial_state(scenario), perturbed.plant)
@@ -452,10 +456,14 @@ def perturbed_rate(
 
 def _without_rounding_and_limits(scenario: Scenario) -> Scenario:
     """The scenario with the smooth variants of its sensor and its actuator."""
-    sensor = optional_member(scenario.sensor, "unrounded")
-    actuator = optional_member(scenario.actuator, "unlimited")
     return dataclasses.replace(
         scenario,
-        sensor=scenario.sensor if sensor is None else sensor,
-        actuator=scenario.actuator if actuator is None else actuator,
+        sensor=_variant(scenario.sensor, "unrounded"),
+        actuator=_variant(scenario.actuator, "unlimited"),
     )
+
+
+def _variant(part: Any, name: str) -> Any:
+    """A variant of a part, or the part itself if it has none."""
+    variant = optional_member(part, name)
+    return part if variant is None else variant

@@ -107,7 +107,9 @@ def _combine(state, dt, weights, slopes):
     def combine_leaf(x, *ks):
         # weight * dt is shared by all leaves and runs; x is added last, so it is rounded once.
         terms = [weight * dt * k for weight, k in zip(weights, ks, strict=True) if weight != 0.0]
-        return x + sum(terms[1:], terms[0]) if terms else x
+        if not terms:
+            return x
+        return x + sum(terms[1:], terms[0])
 
     return jax.tree.map(combine_leaf, state, *slopes)
 

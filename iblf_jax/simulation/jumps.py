@@ -85,7 +85,9 @@ def _(primals, tangents):
 
 def stage_time(piece: Piece, t: jax.Array) -> jax.Array:
     """The time at which a stage is evaluated, () [s]: on the piece's own side of every jump."""
-    return t if piece.earliest is None else _limited(t, piece.earliest, piece.latest)
+    if piece.earliest is None:
+        return t
+    return _limited(t, piece.earliest, piece.latest)
 
 
 def divided(
@@ -127,7 +129,9 @@ def divided(
         if count:
             earliest, latest = _limits(times, passed | done[-count:], span)
         arrived = _arrived(done, number, count, arrival is not None)
-        length = until if since is None else until - since
+        length = until
+        if since is not None:
+            length = until - since
         pieces.append(Piece(begin, length, made, earliest, latest, arrived))
         if chosen is not None:
             begin, since, made = span.start + until, until, jnp.any(chosen)

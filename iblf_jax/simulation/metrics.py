@@ -1,19 +1,19 @@
-"""Metrics: what a run is judged by, each a fold over its samples.
+"""Metrics of a run; each is a fold over its samples.
 
-A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`; it sees every step whatever is
-recorded, so the same definition serves one recorded run, a million runs that store no trajectory,
-and a tuning loss.
+A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`. It receives every step, whatever
+the run records, so the same definition serves one recorded run, a million runs that store no
+trajectory, and a tuning loss.
 
 Integrals are sums by the trapezoidal rule, of second order in the step,
 
-    int_0^T g dt = sum_k dt_k g(t_k),      dt_k = dt, and dt/2 for the first and the last sample
-    (`Sample.dt`).
+    int_0^T g dt = sum_k dt_k g(t_k),
+    dt_k = dt, and dt/2 for the first and the last sample  (`Sample.dt`).
 
-Where signals jump, at a sample of a sampled law, at the arrival of a command, or at a jump time of
-the scenario, the fold sees both limits as samples of one time, so the rule is applied to each
-smooth part by itself.
+Where signals jump (at a sample of a sampled law, at the arrival of a command, or at a jump time of
+the scenario) the fold receives both limits as samples of one time, so the rule applies to each
+smooth part separately.
 
-A fold is a component: thresholds are leaves.  Its `units` name what `finish` returns.
+A fold is a component: its thresholds are leaves. Its `units` name the results of `finish`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
 from iblf_jax.simulation.accuracy import UNITS
+from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
 from iblf_jax.simulation.signals import speed_margin
 
 
 class Fold(Protocol):
-    """What the package asks of a metric.
+    """The protocol of a metric.
 
-    It may also have, as a class attribute, `needs`: an optional signal that it reads, which not
-      every scenario has (`OF_SCENARIO`).
+    A fold that reads an optional signal, which not every scenario has (`OF_SCENARIO`), names it in
+    a class attribute `needs`.
     """
 
     units: ClassVar[dict[str, str]]
@@ -55,6 +56,12 @@ class Fold(Protocol):
     def finish(self, acc: Any) -> dict[str, jax.Array]:
         """The named results."""
         ...
+
+
+def _root_mean_square(integral: jax.Array, time: jax.Array) -> jax.Array:
+    """sqrt(integral / time), with a finite gradient at 0."""
+    mean = integral / time
+    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
 
 
 class _TrackingSums(NamedTuple):
@@ -99,11 +106,8 @@ class Tracking:
 
     def finish(self, acc: _TrackingSums) -> dict[str, jax.Array]:
         """rmse, ise, iae, itae, peak_error, each (n,)."""
-        # The root is guarded so that its gradient is finite on a run without any error.
-        mean = acc.ise / acc.time
-        rmse = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
         return {
-            "rmse": rmse,
+            "rmse": _root_mean_square(acc.ise, acc.time),
             "ise": acc.ise,
             "iae": acc.iae,
             "itae": acc.itae,
@@ -121,7 +125,7 @@ class _SettlingState(NamedTuple):
 
 @component
 class Settling:
-    """When |e1| falls under a tolerance for good, and how far e1 goes past zero.
+    """Settling time and overshoot of e1.
 
     settling_time: the first sample time from which on |e1| < tolerance; infinite if the run ends
       outside.
@@ -135,7 +139,7 @@ class Settling:
     units: ClassVar[dict[str, str]] = {"settling_time": "s", "overshoot": "rad"}
 
     def init(self, sample: Sample) -> _SettlingState:
-        """Settled since the start, until a sample says otherwise."""
+        """Settled since the start, until a sample is outside."""
         zero = jnp.zeros_like(sample.e1)
         return _SettlingState(jnp.zeros(sample.e1.shape, bool), zero, zero, jnp.sign(sample.e1))
 
@@ -155,24 +159,35 @@ class Settling:
         }
 
 
-def _first_outside(acc: Any, margin: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Time and joint, or region, of the first violation, after an instant with these margins."""
-    first = jnp.any(~(margin > 0)) & (acc.first < 0)
-    return jnp.where(first, t, acc.time), jnp.where(
-        first, jnp.argmin(margin).astype(jnp.int32), acc.first
-    )
-
-
 class _MarginState(NamedTuple):
-    margin: jax.Array
-    xi: jax.Array
+    smallest: tuple[jax.Array, ...]
+    """Smallest margins so far; those of the first entry decide about violations."""
     time: jax.Array
+    """Of the first violation; infinite before."""
     first: jax.Array
+    """Joint, or region, of the first violation; -1 before."""
+
+
+def _no_violation(t: jax.Array, *margins: jax.Array) -> _MarginState:
+    """The state before the first sample, for margins of these shapes."""
+    smallest = tuple(jnp.full_like(margin, jnp.inf) for margin in margins)
+    return _MarginState(smallest, jnp.full_like(t, jnp.inf), jnp.int32(-1))
+
+
+def _with_margins(acc: _MarginState, t: jax.Array, *margins: jax.Array) -> _MarginState:
+    """The state after an instant with these margins."""
+    watched = margins[0]
+    is_first = jnp.any(~(watched > 0)) & (acc.first < 0)
+    return _MarginState(
+        tuple(map(jnp.minimum, acc.smallest, margins)),
+        jnp.where(is_first, t, acc.time),
+        jnp.where(is_first, jnp.argmin(watched).astype(jnp.int32), acc.first),
+    )
 
 
 @component
 class Margin:
-    """How near the joints came to their bounds, and the first violation.
+    """Smallest distance of the joints to their bounds, and the first violation.
 
     margin = min(q - lower, upper - q), continuous through zero; xi_margin = 1 - max |xi|;
     first_violation_time is infinite and first_violation_joint -1 on a run that keeps its bounds.
@@ -187,45 +202,32 @@ class Margin:
 
     def init(self, sample: Sample) -> _MarginState:
         """Infinitely far from the bounds."""
-        far = jnp.full_like(sample.q, jnp.inf)
-        return _MarginState(far, far, jnp.full_like(sample.t, jnp.inf), jnp.int32(-1))
+        return _no_violation(sample.t, sample.q, sample.q)
 
     def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
         margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
-        return _MarginState(
-            jnp.minimum(acc.margin, margin),
-            jnp.minimum(acc.xi, 1.0 - jnp.abs(sample.xi)),
-            *_first_outside(acc, margin, sample.t),
-        )
+        return _with_margins(acc, sample.t, margin, 1.0 - jnp.abs(sample.xi))
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
         """Margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
         return {
-            "margin": acc.margin,
-            "xi_margin": acc.xi,
+            "margin": acc.smallest[0],
+            "xi_margin": acc.smallest[1],
             "first_violation_time": acc.time,
             "first_violation_joint": acc.first,
         }
 
 
-class _SpeedState(NamedTuple):
-    margin: jax.Array
-    alpha: jax.Array
-    time: jax.Array
-    first: jax.Array
-
-
 @component
 class VelocityMargin:
-    """How near the velocities, and the virtual velocity alpha, came to the bounds of the
-    velocities, and the first violation.
+    """Smallest distance of the velocities, and of the virtual velocity alpha, to the velocity
+    bounds, and the first violation.
 
     velocity_margin = min(q' - v_l, v_u - q') and alpha_margin = min(alpha - v_l, v_u - alpha), both
-    continuous through zero: alpha outside means that a law which follows it cannot keep the bounds.
-      first_velocity_violation_time is infinite and
-    first_velocity_violation_joint -1 on a run that keeps them.  For scenarios with
-    `velocity_bounds` alone, whose runs carry it unless told otherwise.
+    continuous through zero; a law that follows an alpha outside the bounds cannot keep them.
+    first_velocity_violation_time is infinite and first_velocity_violation_joint -1 on a run that
+    keeps them.  Only for scenarios with `velocity_bounds`, whose runs carry it by default.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -236,46 +238,36 @@ class VelocityMargin:
     }
     needs: ClassVar[str] = "dq_lower"
 
-    def init(self, sample: Sample) -> _SpeedState:
+    def init(self, sample: Sample) -> _MarginState:
         """Infinitely far from the bounds."""
-        far = jnp.full_like(sample.dq, jnp.inf)
-        return _SpeedState(far, far, jnp.full_like(sample.t, jnp.inf), jnp.int32(-1))
+        return _no_violation(sample.t, sample.dq, sample.dq)
 
-    def update(self, acc: _SpeedState, sample: Sample) -> _SpeedState:
+    def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
-        margin = speed_margin(sample, sample.dq)
-        return _SpeedState(
-            jnp.minimum(acc.margin, margin),
-            jnp.minimum(acc.alpha, speed_margin(sample, sample.alpha)),
-            *_first_outside(acc, margin, sample.t),
-        )
+        of_alpha = speed_margin(sample, sample.alpha)
+        return _with_margins(acc, sample.t, speed_margin(sample, sample.dq), of_alpha)
 
-    def finish(self, acc: _SpeedState) -> dict[str, jax.Array]:
+    def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
         """velocity_margin and alpha_margin, each (n,); first_velocity_violation_time and
         first_velocity_violation_joint, ().
         """
         return {
-            "velocity_margin": acc.margin,
-            "alpha_margin": acc.alpha,
+            "velocity_margin": acc.smallest[0],
+            "alpha_margin": acc.smallest[1],
             "first_velocity_violation_time": acc.time,
             "first_velocity_violation_joint": acc.first,
         }
 
 
-class _RegionState(NamedTuple):
-    margin: jax.Array
-    time: jax.Array
-    first: jax.Array
-
-
 @component
 class RegionMargin:
-    """How near the points of the robot came to the walls of their regions, and the first violation.
+    """Smallest distance of the robot's points to the boundaries of their regions, and the first
+    violation.
 
-    region_margin = min over time of the distance to the wall, region by region, continuous through
-    zero.  first_region_violation_time is infinite and first_region_violation_region -1 on a run
-    that stays in all of them.  For scenarios with `regions` alone, whose runs carry it unless told
-    otherwise.
+    region_margin = min over time of the distance to the boundary, region by region, continuous
+    through zero.  first_region_violation_time is infinite and first_region_violation_region -1 on a
+    run that stays in all of them.  Only for scenarios with `regions`, whose runs carry it by
+    default.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -285,25 +277,20 @@ class RegionMargin:
     }
     needs: ClassVar[str] = "region_margin"
 
-    def init(self, sample: Sample) -> _RegionState:
-        """Infinitely far from the walls."""
-        return _RegionState(
-            jnp.full_like(sample.region_margin, jnp.inf),
-            jnp.full_like(sample.t, jnp.inf),
-            jnp.int32(-1),
-        )
+    def init(self, sample: Sample) -> _MarginState:
+        """Infinitely far from the boundaries."""
+        return _no_violation(sample.t, sample.region_margin)
 
-    def update(self, acc: _RegionState, sample: Sample) -> _RegionState:
+    def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
-        margin = sample.region_margin
-        return _RegionState(jnp.minimum(acc.margin, margin), *_first_outside(acc, margin, sample.t))
+        return _with_margins(acc, sample.t, sample.region_margin)
 
-    def finish(self, acc: _RegionState) -> dict[str, jax.Array]:
+    def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
         """region_margin, (m,) for m regions; first_region_violation_time and
         first_region_violation_region, ().
         """
         return {
-            "region_margin": acc.margin,
+            "region_margin": acc.smallest[0],
             "first_region_violation_time": acc.time,
             "first_region_violation_region": acc.first,
         }
@@ -311,10 +298,9 @@ class RegionMargin:
 
 @component
 class Slack:
-    """By how much a filter had to break its conditions on the joints at most: largest_slack.
+    """Largest violation of a safety filter's own conditions on the joints: largest_slack.
 
-    For laws with a filter (`controllers.SafetyFilter`) alone, whose runs carry it unless told
-    otherwise.
+    Only for laws with a filter (`controllers.SafetyFilter`), whose runs carry it by default.
     """
 
     units: ClassVar[dict[str, str]] = {"largest_slack": "rad/s^2"}
@@ -335,8 +321,9 @@ class Slack:
 
 @component
 class RegionSlack:
-    """The same of its conditions on the regions, largest_region_slack; for laws with a filter in
-    scenarios with regions.
+    """Largest violation of a safety filter's own conditions on the regions: largest_region_slack.
+
+    Only for laws with a filter in scenarios with regions, whose runs carry it by default.
     """
 
     units: ClassVar[dict[str, str]] = {"largest_region_slack": "m/s^2"}
@@ -366,11 +353,11 @@ class _TorqueSums(NamedTuple):
 
 @component
 class Torque:
-    """What the actuators had to do.
+    """Size and variation of the torque.
 
-    effort = int |tau|^2 over all joints; torque_rms, peak_torque, torque_variation = sum |tau_k+1 -
-    tau_k| (chatter), and saturated_share, the part of the time in which the torque was cut, joint
-    by joint.
+    effort = int |tau|^2 over all joints; and joint by joint torque_rms, peak_torque,
+    torque_variation = sum |tau_k+1 - tau_k| (chatter), and saturated_share, the fraction of the
+    time in which the torque was limited.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -399,79 +386,64 @@ class Torque:
 
     def finish(self, acc: _TorqueSums) -> dict[str, jax.Array]:
         """effort, (); the others (n,)."""
-        mean = acc.square / acc.time
-        rms = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
         return {
             "effort": jnp.sum(acc.square),
-            "torque_rms": rms,
+            "torque_rms": _root_mean_square(acc.square, acc.time),
             "peak_torque": acc.peak,
             "torque_variation": acc.variation,
             "saturated_share": acc.saturated / acc.time,
         }
 
 
-class _AboveGravitySums(NamedTuple):
+class _SquareSums(NamedTuple):
     time: jax.Array
     square: jax.Array
 
 
 @component
 class AboveGravity:
-    """What the law did beyond holding the arm up: effort_above_gravity = sqrt(mean |tau - G0(q)|^2)
-    over all joints.
+    """Torque beyond gravity compensation: effort_above_gravity = sqrt(mean |tau - G0(q)|^2) over
+    all joints.
 
-    `compare` holds it equal between laws.
+    `compare` scales the gains of laws so that they are equal in it.
     """
 
     units: ClassVar[dict[str, str]] = {"effort_above_gravity": "N m"}
 
-    def init(self, sample: Sample) -> _AboveGravitySums:
+    def init(self, sample: Sample) -> _SquareSums:
         """Zeros."""
-        return _AboveGravitySums(jnp.zeros_like(sample.t), jnp.zeros_like(sample.t))
+        return _SquareSums(jnp.zeros_like(sample.t), jnp.zeros_like(sample.t))
 
-    def update(self, acc: _AboveGravitySums, sample: Sample) -> _AboveGravitySums:
+    def update(self, acc: _SquareSums, sample: Sample) -> _SquareSums:
         """Adds one sample."""
-        return _AboveGravitySums(
+        return _SquareSums(
             acc.time + sample.dt,
             acc.square + sample.dt * jnp.sum((sample.tau - sample.gravity) ** 2),
         )
 
-    def finish(self, acc: _AboveGravitySums) -> dict[str, jax.Array]:
+    def finish(self, acc: _SquareSums) -> dict[str, jax.Array]:
         """The effort above gravity, ()."""
-        mean = acc.square / acc.time
-        return {
-            "effort_above_gravity": jnp.where(
-                mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0
-            )
-        }
-
-
-class _EstimateSums(NamedTuple):
-    time: jax.Array
-    square: jax.Array
+        return {"effort_above_gravity": _root_mean_square(acc.square, acc.time)}
 
 
 @component
 class Estimation:
-    """How well the observer knew the uncertain term: estimate_rmse = sqrt(mean f_tilde^2), f_tilde
-    = f - f_hat.
-    """
+    """Error of the observer: estimate_rmse = sqrt(mean f_tilde^2), f_tilde = f - f_hat."""
 
     units: ClassVar[dict[str, str]] = {"estimate_rmse": "N m"}
 
-    def init(self, sample: Sample) -> _EstimateSums:
+    def init(self, sample: Sample) -> _SquareSums:
         """Zeros."""
-        return _EstimateSums(jnp.zeros_like(sample.t), jnp.zeros_like(sample.disturbance))
+        return _SquareSums(jnp.zeros_like(sample.t), jnp.zeros_like(sample.disturbance))
 
-    def update(self, acc: _EstimateSums, sample: Sample) -> _EstimateSums:
+    def update(self, acc: _SquareSums, sample: Sample) -> _SquareSums:
         """Adds one sample."""
         f_tilde = sample.disturbance - sample.disturbance_estimate
-        return _EstimateSums(acc.time + sample.dt, acc.square + sample.dt * f_tilde**2)
+        return _SquareSums(acc.time + sample.dt, acc.square + sample.dt * f_tilde**2)
 
-    def finish(self, acc: _EstimateSums) -> dict[str, jax.Array]:
+    def finish(self, acc: _SquareSums) -> dict[str, jax.Array]:
         """estimate_rmse, (n,)."""
-        mean = acc.square / acc.time
-        return {"estimate_rmse": jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)}
+        return {"estimate_rmse": _root_mean_square(acc.square, acc.time)}
 
 
 OF_SCENARIO = {
@@ -489,76 +461,76 @@ OF_SCENARIO = {
         "Such as ij.controllers.SafetyFilter(law), and regions=(...).",
     ),
 }
-"""Optional signal -> what of a scenario gives it, and how."""
+"""Optional signal -> the part of a scenario that it needs, and an example."""
 
 
 def has_signal(scenario: Scenario, signal: str) -> bool:
     """Whether runs of a scenario have an optional signal, one of `OF_SCENARIO`."""
     if signal == "dq_lower":
         return scenario.velocity_bounds is not None
-    filters = signal == "region_margin" or any(
-        getattr(law, "filters", False) for law in layers(scenario.controller)
-    )
-    return filters and (signal == "slack" or len(scenario.regions) > 0)
+    has_regions = len(scenario.regions) > 0
+    if signal == "region_margin":
+        return has_regions
+    has_filter = any(optional_member(law, "filters") for law in layers(scenario.controller))
+    return has_filter and (signal == "slack" or has_regions)
 
 
 def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of
     the scenario do not have.
     """
-    needs = getattr(fold, "needs", None)
+    needs = optional_member(fold, "needs")
     if needs is None:
         return
     checks.one_of(f"{field}.needs", needs, OF_SCENARIO)
     if not has_signal(scenario, needs):
-        words, remedy = OF_SCENARIO[needs]
+        part, remedy = OF_SCENARIO[needs]
         got = f"{checks.with_article(type(fold).__name__)} that reads {needs}"
-        raise checks.fail(field, got, f"a scenario with {words}", remedy)
+        raise checks.fail(field, got, f"a scenario with {part}", remedy)
 
 
 def as_folds(
     metrics: Sequence[Fold] | None, dtype: jax.typing.DTypeLike, scenario: Scenario | None = None
 ) -> tuple[Fold, ...]:
-    """The folds that a user asked for (None: the standard ones), checked, their numbers in one
-    floating-point type.
+    """The requested folds (None: the standard ones), checked, their numbers in one floating-point
+    type.
 
     Args:
       metrics: the folds, or None.
       dtype: of their numbers.
-      scenario: that they are for, if it is known.
+      scenario: of the run, if it is known.
 
     Raises:
-      ValueError: something that is not a fold, one that needs what the scenario does not have
-        (bounds on the velocities, regions), units that are no words, fields that are no numbers, or
-        two folds that return the same name.
+      ValueError: something that is not a fold, one that needs a signal that the scenario does not
+        have, units that are no words, fields that are no numbers, or two folds that return the same
+        name.
     """
     if metrics is None:
-        return tuple(
-            _in_type("metrics", fold, dtype)
-            for fold in (*standard(), *(() if scenario is None else watched(scenario)))
-        )
+        folds = standard()
+        if scenario is not None:
+            folds += watched(scenario)
+        return tuple(_in_type("metrics", fold, dtype) for fold in folds)
     if not isinstance(metrics, tuple | list):
         raise checks.fail(
             "metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,)."
         )
     owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
     for i, fold in enumerate(metrics):
-        checks.conforms(f"metrics[{i}]", fold, Fold, "iblf_jax.metrics has them.")
+        field = f"metrics[{i}]"
+        checks.conforms(field, fold, Fold, "iblf_jax.metrics has them.")
         if scenario is not None:
-            fit_joints(fold, scenario.n, f"metrics[{i}]")
-            check_needs(f"metrics[{i}]", fold, scenario)
-        for name, unit in checks.mapping(
-            f"metrics[{i}].units", fold.units, '{"rmse": "rad"}'
-        ).items():
-            checks.word(f"metrics[{i}].units[{name!r}]", unit, "a unit in words")
+            fit_joints(fold, scenario.n, field)
+            check_needs(field, fold, scenario)
+        units = checks.mapping(f"{field}.units", fold.units, '{"rmse": "rad"}')
+        for name, unit in units.items():
+            checks.word(f"{field}.units[{name!r}]", unit, "a unit in words")
             if name in owner:
-                raise checks.fail(
-                    f"metrics[{i}]",
-                    fold,
+                expected, remedy = (
                     "names that no other fold returns",
                     f"{owner[name]} returns {name!r} too.",
                 )
-            owner[name] = f"metrics[{i}]"
+                raise checks.fail(field, fold, expected, remedy)
+            owner[name] = field
     return tuple(_in_type(f"metrics[{i}]", fold, dtype) for i, fold in enumerate(metrics))
 
 
@@ -573,23 +545,23 @@ def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
 
 
 def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
-    """Name and unit of everything that a run with some folds returns: theirs, and its accuracy."""
-    return tuple(pair for fold in folds for pair in getattr(fold, "units", {}).items()) + UNITS
+    """Name and unit of every result of a run with some folds: theirs, and those of its accuracy."""
+    of_folds = [optional_member(fold, "units") for fold in folds]
+    return tuple(pair for units in of_folds for pair in units.items()) + UNITS
 
 
 def standard() -> tuple[Fold, ...]:
-    """The folds that every run carries unless told otherwise; some scenarios' carry more
-    (`watched`).
+    """The folds that every run carries by default; runs of some scenarios carry more (`watched`).
 
-    Made on the call: an array made at import would start JAX's backend and fix its precision before
-      a user can choose.
+    They are constructed on the call: an array made at import would start JAX's backend and fix its
+    precision before a user can choose.
     """
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
 
 
 def watched(scenario: Scenario) -> tuple[Fold, ...]:
-    """The folds that runs of a scenario carry besides the standard ones: of bounds on velocities,
-    of regions, of a filter.
+    """The folds that runs of a scenario carry besides the standard ones: margins of velocity bounds
+    and regions, and slacks of a filter.
     """
     return tuple(
         fold
@@ -610,4 +582,4 @@ MEMBERS = {
     "above_gravity": AboveGravity,
     "estimation": Estimation,
 }
-"""Every fold by the name that a saved tuning result gives it."""
+"""Every fold by its name in a saved tuning result."""

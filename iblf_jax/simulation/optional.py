@@ -1,8 +1,8 @@
 """Optional members of the parts of a scenario, and what the package assumes where one is missing.
 
 The protocols of laws, barriers, observers, sensors, actuators and metrics list members that a class
-may leave out. `optional_member` is the only way in which `simulation` and `certificates` read them,
-so a class that a user wrote without such a member works with the default of this table.
+may leave out. `simulation` and `certificates` read them through `optional_member` only, so a class
+that a user wrote without such a member works with the default of this table.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ DEFAULTS: Mapping[str, Any] = MappingProxyType({
     "dt": None,
     # metrics
     "needs": None,
+    "units": MappingProxyType({}),
     # components that wrap another one, have named rows, or units that depend on other fields
     "wraps": None,
     "rows": MappingProxyType({}),

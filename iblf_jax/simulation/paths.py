@@ -1,15 +1,17 @@
 """One path language for every leaf of a scenario: "controller.K2", "plant.mass[1]", "initial.q",
 "disturbance.phase".
 
-Sweeps, perturbations, tuning and scenario files all address leaves by these paths.  Names follow
-the fields of the components; `[i]` selects a part of a `Sum` or one entry of an array.  A component
-with rows that have names (class attribute `rows`, such as `robots.Arm`) can be addressed by them:
-"plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 do as well as names. A name
-without a letter, or with a bracket, a line break or the like, is written as a JSON string:
-'plant.link["a]b"].mass'. `robot.` stands for `plant.` and `model.` together: use it to change the
-robot that is simulated and the one that the law knows alike. A component that wraps another (class
-attribute `wraps`, such as `controllers.Saturated`) is looked through: "controller.K2" is the
-wrapped law's K2, and "controller.law.K2" works too.
+Sweeps, perturbations, tuning and scenario files address leaves by these paths.
+
+- Names follow the fields of the components; `[i]` selects a part of a `Sum` or one entry of an
+  array.
+- A component whose rows have names (class attribute `rows`, such as `robots.Arm`) can be addressed
+  by them: "plant.link[forearm].mass", "plant.joint[elbow].damping"; numbers from 0 work as well. A
+  name without a letter, or with a bracket, a line break or the like, is written as a JSON string:
+  'plant.link["a]b"].mass'.
+- `robot.` stands for `plant.` and `model.` together and changes both robots alike.
+- A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is
+  transparent: "controller.K2" is the wrapped law's K2, and "controller.law.K2" works too.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.optional import optional_member
+from iblf_jax.simulation.scenario import NUMBERS, Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
@@ -36,7 +39,7 @@ _TOKEN = re.compile(
 
 
 class RowName(str):
-    """A token of a path that was the name of a row, in brackets."""
+    """Token of a path: the name of a row, in brackets."""
 
     __slots__ = ()
 
@@ -54,14 +57,7 @@ class ParameterTable(tuple[Parameter, ...]):
     """The addressable leaves of a scenario; prints as a table, in notebooks too."""
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
-        def shown(value):
-            return (
-                np.array2string(np.asarray(value), precision=6, threshold=8)
-                if checks.is_concrete(value)
-                else "traced"
-            )
-
-        return [(p.path, str(p.shape), p.unit, shown(p.value)) for p in self]
+        return [(p.path, str(p.shape), p.unit, _value_text(p.value)) for p in self]
 
     def __repr__(self) -> str:
         return "\n".join(tables.as_text([Parameter._fields, *self._rows()]))
@@ -70,97 +66,121 @@ class ParameterTable(tuple[Parameter, ...]):
         return tables.as_html(Parameter._fields, self._rows())
 
 
+def _value_text(value: Any) -> str:
+    """A value as a table shows it."""
+    if not checks.is_concrete(value):
+        return "traced"
+    return np.array2string(np.asarray(value), precision=6, threshold=8)
+
+
 def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
     """Every addressable leaf of a scenario: path, shape, unit, value.
 
     Args:
       scenario: any Scenario.
-      named: rows of leaves by their names too, "plant.link[forearm].mass" besides "plant.mass";
-        without them every number is there once.
+      named: list rows of leaves by their names, too: "plant.link[forearm].mass" besides
+        "plant.mass"; without them every number is listed once.
 
     Returns:
       A tuple of `Parameter`, which prints as a table.
     """
-    _need_component(scenario)
+    _check_component(scenario)
     return ParameterTable(_walk(scenario, "", checks.flag("named", named)))
 
 
-def _need_component(scenario: Any) -> None:
-    if not dataclasses.is_dataclass(scenario) or isinstance(scenario, type):
+def _check_component(scenario: Any) -> None:
+    """Raises ValueError for something that has no fields."""
+    if not _is_component(scenario):
         raise checks.fail(
             "scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario."
         )
 
 
+def _is_component(part: Any) -> bool:
+    return dataclasses.is_dataclass(part) and not isinstance(part, type)
+
+
+def _joined(path: str, name: str) -> str:
+    """The path of a member of the component at `path`."""
+    return f"{path}.{name}" if path else name
+
+
 def _walk(
     part: Any, path: str, named: bool, units: Mapping[str, str] | None = None
 ) -> Iterator[Parameter]:
+    """The leaves below a part; `units` are those that the field of the part declares."""
     units = units or {}
     if isinstance(part, tuple | list):
         for i, x in enumerate(part):
             yield from _walk(x, f"{path}[{i}]", named, units)
-    elif dataclasses.is_dataclass(part) and not isinstance(part, type):
-        own = {field.name for field in dataclasses.fields(part)}
-        of_leaves = {**_own_units(part), **units}
-        for field in dataclasses.fields(part):
-            if field.metadata.get("static"):
-                continue
-            value, name = getattr(part, field.name), f"{path}.{field.name}" if path else field.name
-            if field.name == getattr(type(part), "wraps", None):
-                # As a user would type them, unless the wrapper has a field of that name.
-                for inner in _walk(value, path, named):
-                    rest = inner.path[len(path) :].lstrip(".")
-                    yield (
-                        inner
-                        if parse(rest)[0] not in own
-                        else inner._replace(path=f"{name}.{rest}")
-                    )
-                continue
-            if isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-                yield Parameter(name, jnp.shape(value), _unit(field, of_leaves), value)
-            else:
-                yield from _walk(value, name, named, {**units, **field.metadata.get("units", {})})
-        if named:
-            yield from _rows(part, path)
+        return
+    if not _is_component(part):
+        return
+    leaf_units = {**_own_units(part), **units}
+    for field in dataclasses.fields(part):
+        if field.metadata.get("static"):
+            continue
+        value, name = getattr(part, field.name), _joined(path, field.name)
+        if field.name == _wrapped_field(part):
+            yield from _walk_wrapped(part, value, path, name, named)
+        elif isinstance(value, NUMBERS):
+            yield Parameter(name, jnp.shape(value), _unit(field, leaf_units), value)
+        else:
+            yield from _walk(value, name, named, {**units, **field.metadata.get("units", {})})
+    if named:
+        yield from _named_rows(part, path)
+
+
+def _walk_wrapped(
+    wrapper: Any, inner: Any, path: str, name: str, named: bool
+) -> Iterator[Parameter]:
+    """The leaves of a wrapped component under the path of its wrapper, except for those that have
+    the name of a field of the wrapper.
+    """
+    for parameter in _walk(inner, path, named):
+        rest = parameter.path[len(path) :].lstrip(".")
+        if _has_field(wrapper, str(parse(rest)[0])):
+            parameter = parameter._replace(path=f"{name}.{rest}")
+        yield parameter
+
+
+def _wrapped_field(part: Any) -> str | None:
+    """The field of a component that holds a wrapped one, or None."""
+    return optional_member(type(part), "wraps")
 
 
 def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
-    """The unit of a leaf: its own, unless what holds it says otherwise (`units` among the metadata
-    of its field).
-    """
+    """The unit of a leaf: that of `units`, if it is there, else its own."""
     return str(units.get(field.name, field.metadata.get("unit", "")))
 
 
 def _own_units(part: Any) -> Mapping[str, str]:
     """Units of a component's leaves that depend on its other fields, by name."""
-    return part.leaf_units() if hasattr(part, "leaf_units") else {}
+    leaf_units = optional_member(part, "leaf_units")
+    return {} if leaf_units is None else leaf_units()
 
 
-def _rows(part: Any, path: str) -> Iterator[Parameter]:
-    """The rows that have names."""
+def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
+    """The rows of leaves that have names."""
     units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
-    for word, (names, fields) in getattr(type(part), "rows", {}).items():
+    for kind, (names, fields) in optional_member(type(part), "rows").items():
         for i, name in enumerate(getattr(part, names)):
             for field in fields:
                 value = getattr(part, field)
+                # A leaf with one axis has one entry per row, and others have rows first or last.
                 row = value[..., i] if jnp.ndim(value) == 1 else value[i]
-                place = f"{word}[{_quoted(name)}].{field}"
-                yield Parameter(
-                    f"{path}.{place}" if path else place, jnp.shape(row), units[field], row
-                )
+                full = _joined(path, f"{kind}[{_quoted(name)}].{field}")
+                yield Parameter(full, jnp.shape(row), units[field], row)
 
 
 def _quoted(name: str) -> str:
-    """The name of a row as a path spells it."""
-    return (
-        name
-        if re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"')
-        else json.dumps(name)
-    )
+    """The name of a row as it is written in a path."""
+    needs_no_quotes = re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"')
+    return name if needs_no_quotes else json.dumps(name)
 
 
 def _unquoted(text: str) -> str | None:
-    """The name that a JSON string spells; None if it is none."""
+    """The name in a JSON string; None if it is not valid."""
     try:
         return json.loads(text)
     except ValueError:
@@ -175,16 +195,10 @@ def parse(path: str) -> list[str | int]:
         match = _TOKEN.match(path, position)
         if match is None or (position == 0) == path[position].startswith((".", "[")):
             break
-        name = match[4] if match[3] is None else _unquoted(match[3])
-        if match[1] is None and match[2] is None and name is None:
+        token = _token(match)
+        if token is None:
             break
-        tokens.append(
-            match[1]
-            if match[1] is not None
-            else int(match[2])
-            if match[2] is not None
-            else RowName(name)
-        )
+        tokens.append(token)
         position = match.end()
     if not isinstance(path, str) or not path or position < len(path):
         raise checks.fail(
@@ -193,9 +207,22 @@ def parse(path: str) -> list[str | int]:
     return tokens
 
 
+def _token(match: re.Match) -> str | int | None:
+    """The token that `_TOKEN` matched; None for an invalid JSON string."""
+    field, index, quoted, bare = match.groups()
+    if field is not None:
+        return field
+    if index is not None:
+        return int(index)
+    name = bare
+    if quoted is not None:
+        name = _unquoted(quoted)
+    return None if name is None else RowName(name)
+
+
 def expand(path: str) -> list[str]:
-    """The full paths that one path stands for: two for `robot.`, else itself.  ValueError if it is
-    not a path.
+    """The full paths of a path: two for `robot.`, else the path itself.  ValueError if it is not a
+    path.
     """
     parse(path)
     if path == "robot" or path.startswith(("robot.", "robot[")):
@@ -204,9 +231,12 @@ def expand(path: str) -> list[str]:
 
 
 def _unknown(scenario: Scenario, path: str) -> ValueError:
+    """The error about a path that leads to no leaf."""
     known = [p.path for p in parameters(scenario)]
     close = difflib.get_close_matches(path, known, n=3)
-    remedy = f"Did you mean {', '.join(close)}?" if close else "ij.parameters(scenario) lists them."
+    remedy = "ij.parameters(scenario) lists them."
+    if close:
+        remedy = f"Did you mean {', '.join(close)}?"
     return checks.fail("path", path, "the path of a leaf of this scenario", remedy)
 
 
@@ -216,23 +246,24 @@ def get(scenario: Scenario, path: str) -> Any:
 
 
 def places(scenario: Scenario, path: str) -> list[list[str | int]]:
-    """Where the numbers at a path are: fields and indices alone, for each full path that it stands
-    for.
-    """
+    """Fields and indices that lead to the numbers at a path, for each of its full paths."""
     return [_resolved(scenario, path, full)[0] for full in expand(path)]
 
 
 def leaves(scenario: Scenario, path: str) -> list[str]:
-    """The paths of the whole leaves that hold what is at a path."""
+    """The paths of the complete leaves that contain the numbers at a path."""
 
-    def joined(tokens):
+    def leaf_path(tokens):
         while isinstance(tokens[-1], int):
             tokens = tokens[:-1]
-        return "".join(
-            f"[{token}]" if isinstance(token, int) else f".{token}" for token in tokens
-        ).lstrip(".")
+        return "".join(map(_written, tokens)).lstrip(".")
 
-    return [joined(tokens) for tokens in places(scenario, path)]
+    return [leaf_path(tokens) for tokens in places(scenario, path)]
+
+
+def _written(token: str | int) -> str:
+    """A field or an index as it is written in a path."""
+    return f"[{token}]" if isinstance(token, int) else f".{token}"
 
 
 def unit_at(scenario: Scenario, path: str) -> str:
@@ -243,17 +274,20 @@ def unit_at(scenario: Scenario, path: str) -> str:
 def sign_at(scenario: Scenario, path: str) -> str | None:
     """The sign that the finite numbers at a path must have: None, "positive" or "nonnegative"."""
     sign = _metadata(scenario, path).get("sign")
-    return None if sign == "limit" else "positive" if sign == "positive limit" else sign
+    if sign is None or sign == "limit":
+        return None
+    return sign.removesuffix(" limit")
 
 
 def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
-    """What was declared of the leaf at a path."""
+    """The declared metadata of the leaf at a path, with its unit."""
     part: Any = scenario
     metadata: Mapping[str, Any] = {}
     units: dict[str, str] = {}
     for token in places(scenario, path)[0]:
         if isinstance(token, int):
-            part = part[token] if isinstance(part, tuple | list) else part
+            if isinstance(part, tuple | list):
+                part = part[token]
         else:
             field = next(f for f in dataclasses.fields(part) if f.name == token)
             metadata = {**field.metadata, "unit": _unit(field, {**_own_units(part), **units})}
@@ -263,51 +297,51 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
 
 
 def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int], Any]:
-    """Where a full path leads, as fields and indices, and the value there.
+    """Fields and indices of a full path, and the value there.
 
-    The names of wrapped components are filled in, and a row by its name becomes an index.
+    The names of wrapped components are inserted, and the name of a row becomes an index.
     """
     value: Any = scenario
-    place: list[str | int] = []
+    found: list[str | int] = []
     tokens = parse(full)
     while tokens:
         try:
             steps, tokens = _steps(value, tokens)
             for step in steps:
-                value = _entry(value, step) if isinstance(step, int) else _field(value, step)
+                value = _member(value, step)
         except (AttributeError, IndexError, TypeError, KeyError, ValueError):
             raise _unknown(scenario, path) from None
-        if (
-            isinstance(steps[-1], int)
-            and not isinstance(value, jax.Array | np.ndarray | float)
-            and not dataclasses.is_dataclass(value)
-        ):
+        is_entry = isinstance(value, jax.Array | np.ndarray | float)
+        if isinstance(steps[-1], int) and not (is_entry or dataclasses.is_dataclass(value)):
             raise _unknown(scenario, path)
-        place += steps
-    if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
+        found += steps
+    if not isinstance(value, NUMBERS):
         raise _unknown(scenario, path)
-    return place, value
+    return found, value
 
 
 def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
-    """The fields and indices that the first tokens stand for in a component, and the tokens that
-    are left.
+    """The fields and indices of the first tokens of a path in a component, and the tokens that are
+    left.
     """
     token = tokens[0]
     if isinstance(token, int):
         return [token], tokens[1:]
     if isinstance(token, RowName):
         raise KeyError(token)
-    rows = getattr(type(part), "rows", {})
-    if token in rows and not _has_field(part, token):
+    if _has_field(part, token):
+        return [token], tokens[1:]
+    rows = optional_member(type(part), "rows")
+    if token in rows:
         names, fields = rows[token]
-        which, field = tokens[1:3]
+        row, field = tokens[1:3]
         if field not in fields:
             raise KeyError(field)
-        index = which if isinstance(which, int) else getattr(part, names).index(which)
+        index = row if isinstance(row, int) else getattr(part, names).index(row)
         return [field, index], tokens[3:]
-    if getattr(type(part), "wraps", None) and not _has_field(part, token):
-        return [type(part).wraps], tokens
+    wrapped = _wrapped_field(part)
+    if wrapped:
+        return [wrapped], tokens
     return [token], tokens[1:]
 
 
@@ -315,13 +349,16 @@ def _has_field(part: Any, name: str) -> bool:
     return any(field.name == name for field in dataclasses.fields(part))
 
 
+def _member(part: Any, step: str | int) -> Any:
+    """The entry or field of a part."""
+    return _entry(part, step) if isinstance(step, int) else _field(part, step)
+
+
 def _entry(part: Any, index: int) -> Any:
-    """Part or entry `index`; unlike an array of JAX, which takes the nearest entry, it raises
-    IndexError beyond the ends.
-    """
+    """Part or entry `index`; IndexError beyond the ends, where JAX would take the nearest entry."""
     if not isinstance(part, tuple | list | jax.Array | np.ndarray):
         raise TypeError(part)
-    size = len(part) if isinstance(part, tuple | list) else part.shape[0]
+    size = len(part)
     if not -size <= index < size:
         raise IndexError(index)
     return part[index]
@@ -338,61 +375,55 @@ def _field(part: Any, name: str) -> Any:
 
 
 def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: str | None) -> Any:
-    """`part` with the leaf at `tokens` replaced; values are checked, structure is kept."""
-    if not tokens or isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
+    """A copy of `part` with the leaf at `tokens` replaced: checked, and of the same structure."""
+    if not tokens or isinstance(part, NUMBERS):
         return _new_value(part, tokens, value, path, sign)
     head, rest = tokens[0], tokens[1:]
     if isinstance(head, int):
-        return tuple(
-            _replaced(x, rest, value, path, sign) if i == head % len(part) else x
-            for i, x in enumerate(part)
-        )
+        parts = list(part)
+        parts[head] = _replaced(part[head], rest, value, path, sign)
+        return tuple(parts)
     copy = object.__new__(type(part))
     for field in dataclasses.fields(part):
-        old = getattr(part, field.name)
-        new = (
-            _replaced(old, rest, value, path, field.metadata.get("sign"))
-            if field.name == head
-            else old
-        )
-        object.__setattr__(copy, field.name, new)
+        member = getattr(part, field.name)
+        if field.name == head:
+            member = _replaced(member, rest, value, path, field.metadata.get("sign"))
+        object.__setattr__(copy, field.name, member)
     return copy
 
 
 def _new_value(
     old: Any, tokens: list[str | int], value: Any, path: str, sign: str | None
 ) -> jax.Array:
-    """The new array in place of a leaf, or of one of its entries."""
+    """The new array of a leaf of which all, or one entry, is replaced."""
     old = jnp.asarray(old)
     index = tuple(t for t in tokens if isinstance(t, int))
-    target = old[index] if index else old
+    shape = old[index].shape if index else old.shape
     new = checks.as_floats(path, value)
-    if new.shape not in ((), target.shape):
-        raise checks.fail(
-            path, value, f"one number or shape {target.shape}", f"Its shape is {new.shape}."
-        )
+    if new.shape not in ((), shape):
+        raise checks.fail(path, value, f"one number or shape {shape}", f"Its shape is {new.shape}.")
     checks.check_values(path, new, sign)
-    new = jnp.broadcast_to(new, target.shape).astype(old.dtype)
+    new = jnp.broadcast_to(new, shape).astype(old.dtype)
     return old.at[index].set(new) if index else new
 
 
 def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
-    """The scenario with some leaves replaced.
+    """A copy of the scenario with some leaves replaced.
 
     Args:
-      scenario: what to change; it stays as it is.
-      values: path -> number or array; a scalar fills every entry of its leaf.  Traced values are
-        fine: differentiate by them.
+      scenario: the original; it stays as it is.
+      values: path -> number or array; a scalar fills every entry of its leaf.  Values may be
+        traced, for derivatives by them.
 
     Returns:
-      A new Scenario of the same structure: nothing recompiles, unless a zero, one or equality of an
-        arm's geometry comes or goes.
+      A new Scenario of the same structure: nothing recompiles, unless a zero, a one or an equality
+        in an arm's geometry appears or disappears.
 
     Raises:
       ValueError: an unknown path, a wrong shape, sign or type; the message names the path and the
         remedy.
     """
-    _need_component(scenario)
+    _check_component(scenario)
     if not isinstance(values, Mapping):
         raise checks.fail(
             "values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}'
@@ -407,7 +438,7 @@ def why_inadmissible(scenario: Scenario, values: Mapping[str, Any]) -> str:
     """Why the scenario with these leaves replaced cannot be run, in words (a start outside its
     bounds, a negative mass); "" if it can.
     """
-    with notices.muted():  # advice on gains
+    with notices.muted():  # without advice on gains
         try:
             canonical(with_parameters(scenario, values))
         except ValueError as error:

@@ -1,7 +1,7 @@
-"""What a run gives back: `Rollout`, and the named `Metrics` in it.
+"""The result of a run: `Rollout`, and the named `Metrics` in it.
 
-Both are pytrees, so `jax.vmap(ij.simulate...)` gives a Rollout of many runs, time axis after the
-run axis; an index selects a run.
+Both are pytrees, so `jax.vmap(ij.simulate...)` returns a Rollout of many runs, with the time axis
+after the run axis; an index selects a run.
 """
 
 from __future__ import annotations
@@ -66,11 +66,9 @@ class Metrics(Mapping):
     def __repr__(self) -> str:
         rows = []
         for name, value in self.values_by_name.items():
-            shown = (
-                np.array2string(np.asarray(value), precision=4, threshold=8)
-                if checks.is_concrete(value)
-                else str(value)
-            )
+            shown = str(value)
+            if checks.is_concrete(value):
+                shown = np.array2string(np.asarray(value), precision=4, threshold=8)
             rows.append(f"  {name:22s} {shown} {self.units.get(name, '')}".rstrip())
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 
@@ -81,38 +79,38 @@ class Rollout(Signals):
     """One run of a scenario, or many: every array below has a leading run axis then.
 
     Its signals, `run.t`, `run.q`, `run.tau` ..., are those of `simulation.signals`, (T,) or (T, n)
-    for T recorded samples and n joints; those that the scenario does not have (bounds of the
-    velocities) are `()`.  Recorded samples are every `record_every`-th step from t = 0; metrics and
-    status cover every step.
+    for T recorded samples and n joints; signals that the scenario does not have (bounds of the
+    velocities) are `()`.  Every `record_every`-th step from t = 0 is recorded; metrics and status
+    cover every step.
     """
 
     scenario: Scenario
-    """What was run."""
+    """The scenario of the run."""
     controller_state: Any
     """State of the law, time axis first; `()` if it has none."""
     observer_state: Any
     """State of the observer, time axis first; `()` if it has none."""
     metrics: Metrics
     """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, ()
-    [1]: the estimated error of the positions that the time step is to blame for, as it is and
-    relative to the width of the tube (`accuracy`)."""
+    [1]: the estimated error of the positions that the time step causes, absolute and relative to
+    the width of the tube (`accuracy`)."""
     status: jax.Array
     """Bit flags of `Status`, () int32; 0 is ok."""
     fastest_mode: jax.Array
-    """Largest measured mode of the closed loop, () [1/s]; dt times this decides whether the step
-    was too large."""
+    """Rate of the fastest measured mode of the closed loop, () [1/s]; dt times this decides whether
+    the step was too large."""
     dt: jax.Array
     """Time step, () [s]."""
     method: str = dataclasses.field(metadata={"static": True})
     """The integrator."""
     steps: int | None = dataclasses.field(default=None, metadata={"static": True})
-    """Steps that were made, recorded or not; None if it is not known whether there were more than
-    up to the last sample."""
+    """Number of steps, recorded or not; None if it is unknown whether there were steps after the
+    last sample."""
     actuator_state: Any = ()
     """State of the actuator, time axis first; `()` if it has none."""
     measured: Any = ()
-    """What the sensor told last, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where
-    the law is not sampled."""
+    """The last measurement, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where the
+    law is not sampled."""
 
     @property
     def ok(self) -> bool:
@@ -152,11 +150,9 @@ class Rollout(Signals):
         if self.is_batch:
             bad = int(np.sum(np.asarray(self.status) != 0))
             return f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"
-        accuracy = (
-            f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube"
-            if RELATIVE in self.metrics
-            else ""
-        )
+        accuracy = ""
+        if RELATIVE in self.metrics:
+            accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube"
         return f"Rollout({shape}; status: {describe(int(self.status))}{accuracy})"
 
     def _repr_html_(self) -> str:

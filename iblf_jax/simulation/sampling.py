@@ -65,11 +65,11 @@ class Sampling:
     def check(self) -> None:
         """Raises ValueError for an unknown step of the observer or a queue that is too short."""
         checks.one_of("Sampling.observer", self.observer, OBSERVER_STEPS)
-        concrete = checks.is_concrete(self)
+        concrete, least = checks.is_concrete(self), 0
         if concrete:
             checks.time_span("Sampling.period", self.period)
             checks.time_span("Sampling.delay", self.delay, zero=True)
-        least = self.needed if concrete else 0
+            least = self.needed
         if self.queue is None:
             if not concrete:
                 raise checks.fail(

@@ -1,6 +1,4 @@
-"""What can be seen of a loop: every signal with its unit and its meaning, listed here and nowhere
-else.
-"""
+"""The signals of a closed loop: the only list of their names, units and meanings."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from jax import Array
 
 
 class Recorded(NamedTuple):
-    """What a signal is that runs record: its SI unit, and its meaning in words."""
+    """SI unit and meaning of a recorded signal."""
 
     unit: str
     meaning: str
@@ -21,7 +19,7 @@ class Recorded(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Signals:
-    """What runs record.  At an instant vectors are (n,); of a run the time axis comes before."""
+    """The recorded signals.  At an instant vectors are (n,); the time axis of a run comes first."""
 
     t: Annotated[Array, Recorded("s", "time")]
     q: Annotated[Array, Recorded("rad", "joint position")]
@@ -65,27 +63,27 @@ class Signals:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sample(Signals):
-    """The loop at one instant: what is recorded, and what else metrics fold over."""
+    """The loop at one instant: the recorded signals, and further ones that metrics use."""
 
     dt: Array
     """Weight of this sample in an integral over time, sum dt g, () [s].
 
-    The weights are those of the trapezoidal rule: the step, half of it for the first and the last
-      sample.  Where signals jump there are two
-    samples of one time, the limits from either side, each with half of the time to its neighbour.
+    The weights are those of the trapezoidal rule: the step, and half of it for the first and the
+    last sample.  Where signals jump there are two samples of one time, the limits from either side,
+    each with half of the time to its neighbour.
     """
     gravity: Array
-    """G0(q), what holding the model still takes [N m]."""
+    """G0(q), the torque that balances the gravity of the model [N m]."""
     guard_active: Array
     saturated: Array
     step: Any = dataclasses.field(default=0.0, kw_only=True)
-    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples
-    beside a jump."""
+    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples at a
+    jump."""
 
 
 def has(sample: Signals, signal: str) -> bool:
-    """Whether there is an optional signal: bounds of the velocities, a slack, margins of
-    regions.
+    """Whether a sample or a run has an optional signal: bounds of the velocities, a slack, margins
+    of regions.
     """
     return not isinstance(getattr(sample, signal), tuple)
 
@@ -96,18 +94,18 @@ def speed_margin(sample: Sample, velocity: Array) -> Array:
 
 
 OF_REGIONS = ("region_margin", "region_slack", "largest_region_slack")
-"""Signals and metrics with one number a region."""
+"""Signals and metrics with one number per region."""
 
 
 def own_dims(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
-    """Dimensions of a signal or metric at one instant or of one run: joint for (n,), region, else
-    its own.
+    """Names of the dimensions of a signal at one instant, or of a metric of one run: "joint" for
+    (n,), "region" for one number per region, else names of its own.
     """
     if name in OF_REGIONS:
         return ("region",)
-    return (
-        ("joint",) if shape == (joints,) else tuple(f"{name}_axis_{i}" for i in range(len(shape)))
-    )
+    if shape == (joints,):
+        return ("joint",)
+    return tuple(f"{name}_axis_{i}" for i in range(len(shape)))
 
 
 SIGNALS: dict[str, Recorded] = {

@@ -1,13 +1,13 @@
 """The closed loop as x' = field(t, x) over one flat vector x, for solvers of other libraries:
 diffrax, SciPy, optimistix.
 
-The loop's own state is a pytree, and holds an empty tuple for a law without memory, which some
-solvers cannot carry (diffrax: "Only arrays can be treated as buffers").  Here its numbers stand one
-  after the other, in the order of `iblf_jax.simulation.closed_loop.LoopState`:
+The loop's own state is a pytree, and contains an empty tuple for a law without memory, which some
+solvers do not accept (diffrax: "Only arrays can be treated as buffers"). Here its numbers are
+concatenated in the order of `iblf_jax.simulation.closed_loop.LoopState`:
 
     x = (q, q', state of the law, state of the observer),   (m,)
 
-`VectorField.names` names the entries, `unpack` and `pack` lead back and forth.
+`VectorField.names` names the entries; `unpack` and `pack` convert between the two forms.
 """
 
 from __future__ import annotations
@@ -84,10 +84,9 @@ class VectorField:
         found = []
         for path, leaf in jax.tree_util.tree_leaves_with_path(_layout(self.scenario)):
             name = jax.tree_util.keystr(path).lstrip(".")
-            found += [
-                f"{name}[{', '.join(map(str, index))}]" if index else name
-                for index in np.ndindex(leaf.shape)
-            ]
+            for index in np.ndindex(leaf.shape):
+                entry = ", ".join(map(str, index))
+                found.append(f"{name}[{entry}]" if index else name)
         return tuple(found)
 
     def pack(self, state: LoopState) -> jax.Array:
@@ -113,9 +112,8 @@ class VectorField:
           x: (..., m); SciPy's `solution.y` has time last, so give `solution.y.T`.
 
         Returns:
-          `iblf_jax.simulation.closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s],
-            controller and observer as these make
-          them, leading axes first.
+          `iblf_jax.simulation.closed_loop.LoopState`: q (..., n) [rad], dq (..., n) [rad/s], and
+          the states of law and observer, leading axes first.
 
         Raises:
           ValueError: another last axis.
@@ -123,8 +121,8 @@ class VectorField:
         return _unpack(self.scenario, checks.as_floats("x", x))
 
     def sample(self, t: Any, x: Any) -> Sample:
-        """Everything that can be looked at in one instant: tau, e1, xi, the bounds, f and f_hat, V
-        ...; a trajectory by `jax.vmap`.
+        """All signals at one instant: tau, e1, xi, the bounds, f and f_hat, V ...; of a trajectory
+        by `jax.vmap`.
 
         Args:
           t: time, () [s].

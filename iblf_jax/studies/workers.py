@@ -116,7 +116,7 @@ def environment(executor: str) -> dict[str, Any]:
 
 
 def _kernel_environment() -> dict[str, str]:
-    from iblf_jax.kernels.toolchain import ToolchainError, built_for
+    from iblf_jax.kernels import ToolchainError, built_for
 
     try:
         return built_for()

@@ -24,6 +24,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots._base import robot_member
 
 
 class Side(Protocol):
@@ -141,6 +142,13 @@ def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
     return array
 
 
+def _distance_or_zero(name: str, value: Any, n: int) -> jax.Array | float:
+    """A positive distance as `_distance`; 0 where none is given."""
+    if value is None:
+        return 0.0
+    return _distance(name, value, n, "positive")
+
+
 def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = None) -> Bounds:
     """Constant bounds at a robot's joint limits.
 
@@ -155,19 +163,18 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
         margin that leaves nothing.
     """
-    if not hasattr(robot, "limits"):
+    limits = robot_member(robot, "limits")
+    if limits is None:
         raise checks.fail(
             "robot",
             type(robot).__name__,
             "a robot with joint limits, such as an Arm",
             "Give bounds of your own.",
         )
-    kept, far = (
-        _distance("margin", margin, robot.n, None),
-        0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive"),
-    )
+    margins = _distance("margin", margin, robot.n, None)
+    far = _distance_or_zero("unlimited", unlimited, robot.n)
     sides = []
-    for side, sign in zip(robot.limits, (1.0, -1.0), strict=True):
+    for side, sign in zip(limits, (1.0, -1.0), strict=True):
         if checks.is_concrete(side) and not np.all(np.isfinite(side)) and unlimited is None:
             raise checks.fail(
                 "robot.limits",
@@ -175,14 +182,14 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
                 "limits on every joint",
                 "Say what to use where there are none: unlimited=6.3.",
             )
-        sides.append(jnp.where(jnp.isfinite(side), side + sign * kept, -sign * far))
+        sides.append(jnp.where(jnp.isfinite(side), side + sign * margins, -sign * far))
     lower, upper = sides
     if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
         raise checks.fail(
             "margin",
             margin,
             "a margin that leaves room between the limits",
-            f"The narrowest range is {float(np.min(np.diff(robot.limits, axis=0))):g} rad.",
+            f"The narrowest range is {float(np.min(np.diff(limits, axis=0))):g} rad.",
         )
     return Bounds(lower=Constant(lower), upper=Constant(upper))
 
@@ -204,7 +211,8 @@ def from_speed_limits(
       ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
         share that is not positive.
     """
-    if not hasattr(robot, "speed"):
+    speed = robot_member(robot, "speed")
+    if speed is None:
         raise checks.fail(
             "robot",
             type(robot).__name__,
@@ -212,15 +220,11 @@ def from_speed_limits(
             "Give velocity bounds of your own.",
         )
     share = checks.positive_number("share", share, "1")
-    far = 0.0 if unlimited is None else _distance("unlimited", unlimited, robot.n, "positive")
-    if (
-        checks.is_concrete(robot.speed)
-        and not np.all(np.isfinite(robot.speed))
-        and unlimited is None
-    ):
+    far = _distance_or_zero("unlimited", unlimited, robot.n)
+    if checks.is_concrete(speed) and not np.all(np.isfinite(speed)) and unlimited is None:
         remedy = "Say what to use where there is none: unlimited=3.0."
-        raise checks.fail("robot.speed", robot.speed, "a limit on every joint", remedy)
-    most = share * jnp.where(jnp.isfinite(robot.speed), robot.speed, far)
+        raise checks.fail("robot.speed", speed, "a limit on every joint", remedy)
+    most = share * jnp.where(jnp.isfinite(speed), speed, far)
     return Bounds(lower=Constant(-most), upper=Constant(most))
 
 

@@ -7,7 +7,6 @@ smooth: the law needs q_d' and q_d", and its derivative alpha' is continuous onl
 
 from __future__ import annotations
 
-import functools
 from typing import Protocol
 
 import jax
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.caches import memoised
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 
@@ -136,7 +136,7 @@ class WaypointSpline:
         return matvec(self.waypoints.T, basis)
 
 
-@functools.lru_cache(maxsize=32)
+@memoised(32)
 def _cardinal_splines(times: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are
     1 at one waypoint.

@@ -15,7 +15,7 @@ from made_up_runs import ALWAYS
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import execute, native, plan, step, transformable
-from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.kernels import UnsupportedError, cpu
 from iblf_jax.simulation.scenario import canonical
 
 PATHS = (
@@ -406,8 +406,8 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     monkeypatch.setattr(execute, "_failed", set())
     for part in (execute._before_steps, execute._steps):
         part.clear_cache()
-    native.kernel.cache_clear()
-    native._turner.cache_clear()
+    cpu.kernel.cache_clear()
+    cpu.rows_function.cache_clear()
     with monkeypatch.context() as patch:
         patch.setenv("CXX", str(broken))
         with pytest.warns(

@@ -19,8 +19,7 @@ from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import LANE, TIME
+from iblf_jax.kernels import PER_RUN, TIME, written_out
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
 
@@ -85,7 +84,7 @@ def both(scenario, varied=()):
 
 
 def moving(program) -> int:
-    return sum(program.counts()[LANE | TIME].values())
+    return sum(program.counts()[PER_RUN | TIME].values())
 
 
 def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_joints():

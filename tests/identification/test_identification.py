@@ -25,9 +25,9 @@ from iblf_jax import cli
 from iblf_jax.core.pytree import astype
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
-from iblf_jax.identification._identify import _lacking_terms
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
+from iblf_jax.identification.problem import missing_terms
 from iblf_jax.identification.replay import slopes
 from iblf_jax.identification.shooting import Replay, Torque, windows
 from iblf_jax.identification.smoothing import smoothed
@@ -366,7 +366,7 @@ def lacking(scenario, log, paths):
     with jax.enable_x64(True):
         replayed, c = coordinates(canonical(astype(canonical(scenario), "float64")), paths, {})
         seen = smoothed(read(log, 2), True)
-        return _lacking_terms(
+        return missing_terms(
             replayed, c, seen, np.append(to_z(c, c.x), 0.0), np.ones(len(c.x) + 1, bool)
         )
 

@@ -126,7 +126,7 @@ def carry_of(inputs, varied, method):
 def evaluate(p: program.Program, shared, lane, carry, index):
     """The outputs of a program by NumPy, node by node."""
     known = []
-    inputs = {"shared": shared, "lane": lane, "carry": carry}
+    inputs = {"shared": shared, "per_run": lane, "carry": carry}
     with np.errstate(all="ignore"):
         for node in p.nodes:
             args = [known[a] for a in node.args]
@@ -433,7 +433,7 @@ def test_classes_of_a_program():
     shapes = Shapes.of(flat, 1)
     classes = p.classes()
     sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
-    assert sines.count(program.LANE | program.TIME) <= 8 < sines.count(program.TIME), (
+    assert sines.count(program.PER_RUN | program.TIME) <= 8 < sines.count(program.TIME), (
         "signals of time belong to no run"
     )
     assert len(p.carry) == shapes.size

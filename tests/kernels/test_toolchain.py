@@ -50,7 +50,7 @@ def filled(tmp_path_factory):
     folder = tmp_path_factory.mktemp("filled")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        patch.setattr(toolchain, "_libraries", {})
+        patch.setattr(toolchain.CACHES, "libraries", {})
         assert [value(), value(OTHER)] == [41, 42]
         return folder, toolchain.built(SOURCE)[0].name
 
@@ -59,7 +59,7 @@ def filled(tmp_path_factory):
 def cache(tmp_path, monkeypatch):
     """An empty cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(toolchain, "_libraries", {})  # as in another process
+    monkeypatch.setattr(toolchain.CACHES, "libraries", {})  # as in another process
     return tmp_path / "cache" / "iblf_jax"
 
 
@@ -146,7 +146,7 @@ def test_what_was_checked_is_loaded(library):
         file.truncate(100)  # a library that was mapped from this file would now kill with SIGBUS
     assert loaded.value() == 41
     assert toolchain.loaded(library) is loaded
-    toolchain._libraries.clear()
+    toolchain.CACHES.libraries.clear()
     with pytest.raises(ToolchainError, match="damaged"):
         toolchain.loaded(library)
 

@@ -382,26 +382,27 @@ ENTRIES = {
             "objective": GOAL,
             "runs": 1,
             "seed": 0,
-            "resample": False,
-            "starts": 1,
-        }
-        | {
-            "sharpenings": 2,
             "iterations": 2,
-            "tolerance": 1e-5,
-            "patience": 3,
-            "report_runs": 4,
-            "report_seed": None,
-            "confidence": 0.9,
+            "solver": None,
+            "report": None,
         }
         | {
             "checkpoint": None,
-            "callback": None,
             "risk": "mean",
             "perturbations": None,
             "progress": False,
         },
     ),
+    "SQP": (
+        ij.tuning.SQP,
+        {"tolerance": 1e-5, "starts": 1, "sharpenings": 2, "patience": 3, "radius": None},
+    ),
+    "LBFGS": (ij.tuning.LBFGS, {"memory": 10, "line_steps": 12, "mode": "auto"}),
+    "Adam": (
+        ij.tuning.Adam,
+        {"learning_rate": 0.1, "schedule": "cosine", "resample": False, "mode": "auto"},
+    ),
+    "tuning.Report": (ij.tuning.Report, {"runs": 4, "seed": None, "confidence": 0.9}),
     "pareto": (
         ij.pareto,
         {
@@ -454,12 +455,11 @@ def no_runs(monkeypatch):
     for place in (
         "engine.simulate.run_one",
         "studies.blocks._execute",
-        "tuning.problem.rollouts",
-        "tuning.problem.slope",
-        "tuning.problem.gradient",
-        "tuning._falsify._push",
+        "tuning.evaluation.rollouts",
+        "tuning.search.Evaluator.__call__",
+        "tuning._falsify._margins",
         "engine.explain.instructions",
-        "certificates._certify._one",
+        "certificates._certify._certificate_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     monkeypatch.setattr(

@@ -20,7 +20,7 @@ from iblf_jax.tuning import quantities
 from iblf_jax.tuning.objectives import for_scenario
 from iblf_jax.tuning.quantities import MetricResult, Quantities
 
-TUNING = {"duration": 0.5, "dt": 1e-3, "report_runs": 1}
+TUNING = {"duration": 0.5, "dt": 1e-3, "report": ij.tuning.Report(runs=1)}
 
 
 @ij.component
@@ -291,7 +291,7 @@ def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
     )
 
 
-# ------------------------------------------------------------------------------------ which joints, weights, limits of each
+# ------------------------------------------------------------ which joints, weights, limits of each
 
 
 def exact(objective, run):

@@ -1,6 +1,7 @@
 """Gain tuning: derivatives, objectives, coordinates, the loop, and the truth of its report."""
 
 import dataclasses
+import inspect
 import itertools
 import os
 import signal
@@ -67,7 +68,7 @@ def central(f, z, h=1e-5):
     return np.stack([(f(z + h * e) - f(z - h * e)) / (2 * h) for e in np.eye(len(z))])
 
 
-# ---------------------------------------------------------------------------------------------------------------- derivatives
+# -------------------------------------------------------------------------------------- derivatives
 
 
 @pytest.mark.slow
@@ -136,7 +137,7 @@ def test_reverse_mode_remembers_few_states(paper):
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
-# ---------------------------------------------------------------------------------------------------------------- quantities
+# --------------------------------------------------------------------------------------- quantities
 
 
 @pytest.mark.slow
@@ -210,7 +211,7 @@ def test_risks():
         ij.cvar(1.0)
 
 
-# ---------------------------------------------------------------------------------------------------------------- coordinates
+# -------------------------------------------------------------------------------------- coordinates
 
 
 def test_bijections_keep_inside_and_invert():
@@ -452,7 +453,7 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     assert evaluate.evaluations == len(search.history["z"]) <= 40
 
 
-# ---------------------------------------------------------------------------------------------------------------- the loop
+# ----------------------------------------------------------------------------------------- the loop
 
 
 @pytest.mark.slow
@@ -780,7 +781,7 @@ def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeyp
         screened(perturbed, 0, nominal.box.z[None])
 
 
-# ---------------------------------------------------------------------------------------------------------------- robust
+# ------------------------------------------------------------------------------------------- robust
 
 
 @pytest.fixture(scope="module")
@@ -878,7 +879,144 @@ def test_common_random_numbers(paper):
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
 
 
-# ---------------------------------------------------------------------------------------------------------------- resume
+# ---------------------------------------------------------------------------------- the options
+
+NAMES_OF_EARLIER_VERSIONS = {
+    "optimiser": "adam",
+    "mode": "forward",
+    "starts": 1,
+    "tolerance": 1e-4,
+    "patience": 5,
+    "sharpenings": 1,
+    "learning_rate": 0.2,
+    "resample": False,
+    "report_runs": 7,
+    "report_seed": 3,
+    "confidence": 0.9,
+}
+
+
+def test_signature_of_tune_is_short_and_solvers_fit_their_protocol():
+    parameters = inspect.signature(ij.tune).parameters.values()
+    assert len([x for x in parameters if x.kind is not x.VAR_KEYWORD]) <= 16
+    members = [name for name in vars(ij.tuning.Solver) if not name.startswith("_")]
+    assert {"init", "step", "converged"} <= set(members)
+    for name, solver in ij.tuning.SOLVERS.items():
+        assert solver.name == name
+        assert [member for member in members if not hasattr(solver(), member)] == []
+
+
+def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
+    calls = []
+    with pytest.warns(DeprecationWarning, match="deprecated") as caught:
+        before = ij.tune(
+            paper,
+            ["controller.k1"],
+            objectives.tracking(),
+            iterations=2,
+            progress=False,
+            callback=calls.append,
+            **NAMES_OF_EARLIER_VERSIONS,
+            **SHORT,
+        )
+    text = " ".join(str(x.message) for x in caught)
+    for name in (*NAMES_OF_EARLIER_VERSIONS, "callback"):
+        assert f"The keyword argument {name} of ij.tune is deprecated" in text
+    assert all(x.filename == __file__ for x in caught)
+    after = ij.tune(
+        paper,
+        ["controller.k1"],
+        objectives.tracking(),
+        iterations=2,
+        solver=Adam(learning_rate=0.2, mode="forward", tolerance=1e-4, patience=5),
+        report=ij.tuning.Report(runs=7, seed=3, confidence=0.9),
+        progress=calls.append,
+        **SHORT,
+    )
+    np.testing.assert_array_equal(after.history["z"], before.history["z"])
+    reported = ("report_runs", "report_seed", "confidence")
+    assert [getattr(after.setup, x) for x in reported] == [7, 3, 0.9]
+    assert [getattr(before.setup, x) for x in reported] == [7, 3, 0.9]
+    assert before.optimiser == after.optimiser == "adam" and len(calls) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"report_run": 3}, TypeError, "unexpected keyword argument 'report_run'.*report_runs"),
+        ({"solver": "newton"}, ValueError, "solver: got 'newton', expected one of 'auto', 'sqp'"),
+        ({"optimiser": "sgd"}, ValueError, "optimiser: got 'sgd', expected one of.*'newton'"),
+        ({"solver": SQP(), "starts": 2}, ValueError, "solver= and starts.*Put starts into solver"),
+        ({"optimiser": "newton", "mode": "reverse"}, ValueError, "LBFGS"),
+        ({"solver": object()}, ValueError, "a solver: one of 'sqp'.*It lacks"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_options_that_do_not_exist_or_fit_are_errors(paper, options, error, words):
+    with pytest.raises(error, match=words):
+        ij.tune(paper, ["controller.k1"], objectives.tracking(scale=1.0), **options, **SHORT)
+
+
+@dataclasses.dataclass(frozen=True)
+class Halving(Adam):
+    """A user's solver: Adam that halves its learning rate at each step, and always converges."""
+
+    name = "halving"
+
+    def step(self, evaluate, state, tolerance):
+        found = super().step(evaluate, state, tolerance)
+        state["rate"] = 0.5 * state["rate"]
+        return found
+
+    def converged(self, state):
+        return state["rate"] < 0.2
+
+
+def test_a_solver_of_the_users_own(paper):
+    best = ij.tune(paper, ["controller.k1"], objectives.tracking(), solver=Halving(), **SHORT)
+    assert (best.optimiser, best.stopped) == ("halving", "converged")
+    assert len(best.history["loss"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ('solver = "lbfgs"', {"solver": LBFGS()}),
+        ('[tune.solver]\nkind = "sqp"\nstarts = 4', {"solver": SQP(starts=4)}),
+        ("[tune.report]\nruns = 20\nseed = 5", {"report": ij.tuning.Report(20, 5)}),
+        ("report_runs = 20\nstarts = 4", {"report_runs": 20, "starts": 4}),
+    ],
+)
+def test_a_tuning_file_has_the_options_as_tables(tmp_path, table, expected):
+    file = tmp_path / "tune.toml"
+    file.write_text(
+        f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
+        '[[objective]]\nkind = "tracking"\n'
+    )
+    arguments = ij.files.tuning.load_tuning_file(file)
+    assert {name: arguments[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ('solver = "sgd"', "tune.solver.kind: got 'sgd', expected one of 'sqp'"),
+        ('[tune.solver]\nkind = "sqp"\nmemory = 4', "tune.solver.memory: got an unknown key"),
+        ('[tune.solver]\nkind = "sqp"\nstarts = 0', "tune.solver.*starts: got 0"),
+        ("[tune.report]\nrun = 20", "tune.report.run: got an unknown key.*runs"),
+    ],
+)
+def test_wrong_options_in_a_tuning_file_are_named(tmp_path, table, words):
+    file = tmp_path / "tune.toml"
+    file.write_text(
+        f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
+        '[[objective]]\nkind = "tracking"\n'
+    )
+    with pytest.raises(ValueError, match=words):
+        ij.files.tuning.load_tuning_file(file)
+
+
+# ------------------------------------------------------------------------------------------- resume
 
 KILLED = """
 import sys, jax
@@ -886,7 +1024,8 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np, iblf_jax as ij
 o = ij.objectives
 slow = (lambda search: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
-best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11),
+goal = o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11)
+best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], goal,
                duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], progress=slow)
 np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best.values.items()})
 """

@@ -404,7 +404,7 @@ def test_figures(alone, kept):
         ((regions.HalfSpace([0.0, 0.0, 1.0]),), r"regions\[0\].*TwoLink of 2 joints"),
         ((regions.Sphere([0.1, 0.2], 0.1, point="wrist"),), "wrist"),
         ((regions.Sphere([0.1, 0.2], 0.1, point=2),), "joint 0, joint 1"),
-        ((regions.HalfSpace([1.0, 0.0], 0.9),), r"initial\.q.*the tip .* m beyond its wall"),
+        ((regions.HalfSpace([1.0, 0.0], 0.9),), r"initial\.q.*the tip .* m beyond its boundary"),
     ],
 )
 def test_bad_ones_are_refused(part, words):

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
+from iblf_jax.core.optional import OptionalMembers
+
 State = Any
 """A pytree of arrays of floats; `()` for an actuator without memory."""
 
@@ -51,3 +53,13 @@ class Actuator(Protocol):
           state: its own.
         """
         ...
+
+
+actuator_member = OptionalMembers(unlimited=None, advice=list)
+"""Reads what an actuator may lack."""
+
+
+def unlimited(actuator: Actuator) -> Actuator:
+    """An actuator without its limits; itself if it declares none."""
+    found = actuator_member(actuator, "unlimited")
+    return actuator if found is None else found

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Actuator, Delivered
+from iblf_jax.control.actuators._base import Actuator, Delivered, unlimited
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import as_at, joined, jump_times_of
@@ -46,9 +46,7 @@ class Chain:
     @property
     def unlimited(self) -> Chain:
         """The same without limits."""
-        return dataclasses.replace(
-            self, parts=tuple(getattr(part, "unlimited", part) for part in self.parts)
-        )
+        return dataclasses.replace(self, parts=tuple(map(unlimited, self.parts)))
 
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""

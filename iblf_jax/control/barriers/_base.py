@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf
 from iblf_jax.world.bounds import Tube
 
@@ -102,16 +103,27 @@ class Barrier(Protocol):
         ...
 
 
+barrier_member = OptionalMembers(
+    uses_o=True,
+    value_unit="1",
+    ratio_jumps=True,
+    decay_rate=lambda k1: None,
+    xi_bound=lambda V, tube: None,
+    error_over_slope=lambda tube, q: None,
+)
+"""Reads what a barrier may lack: without a claim, the answer is None."""
+
+
 def value_unit(barrier: Barrier) -> str:
     """The unit of a barrier's V1 where its error is a position, "1" if the barrier declares
     none.
     """
-    return getattr(barrier, "value_unit", "1")
+    return barrier_member(barrier, "value_unit")  # type: ignore[no-any-return]
 
 
 def ratio_jumps(barrier: Barrier) -> bool:
     """Whether `error_over_slope` of a barrier may jump at e1 = 0."""
-    return bool(getattr(barrier, "ratio_jumps", True))
+    return bool(barrier_member(barrier, "ratio_jumps"))
 
 
 def check_guard(owner: str, guard: float) -> None:

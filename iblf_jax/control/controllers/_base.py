@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -126,14 +127,35 @@ class Controller(Protocol):
         ...
 
 
+law_member = OptionalMembers(
+    gains=("k1", "K2"),
+    unit_factors=(),
+    uses_observer=True,
+    needs_velocity_bounds=False,
+    includes_e2=False,
+    filters=False,
+    wraps=None,
+    advice=list,
+    check_start=lambda context: None,
+    leaf_units=dict,
+    switching=lambda t, q, dq, context, state: None,
+    disturbance_terms=None,
+    barrier=None,
+    weight=None,
+    reading="",
+)
+"""Reads what a law may lack: the members that `Controller` and `LyapunovLaw` describe as optional,
+and some fields that laws with a barrier have."""
+
+
 def switching_functions(
     law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
 ) -> jax.Array | None:
     """The functions at whose zeros a law's command jumps, (m,), or None if it declares none;
     arguments as `Controller.command`.
     """
-    declared = getattr(law, "switching", None)
-    return None if declared is None else declared(t, q, dq, context, state)
+    functions: jax.Array | None = law_member(law, "switching")(t, q, dq, context, state)
+    return functions
 
 
 class LyapunovLaw(Protocol):

@@ -19,7 +19,6 @@ ASSUMPTION: the source's own node count, centres and gains could not be found; a
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import ClassVar
 
@@ -32,6 +31,7 @@ from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_o, fit_weight, weight_unit
 from iblf_jax.core import checks
+from iblf_jax.core.caches import memoised
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
@@ -132,7 +132,7 @@ class AdaptiveRBF:
         return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)
 
 
-@functools.lru_cache(maxsize=16)
+@memoised(16)
 def sobol_centres(nodes: int, dimensions: int) -> np.ndarray:
     """The first `nodes` points of the unscrambled Sobol sequence, centred in their cells, in [-1,
     1]^dimensions.

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.barriers._base import CLAIMS, guard_is_active, value_unit
+from iblf_jax.control.barriers._base import CLAIMS, barrier_member, guard_is_active, value_unit
 from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -133,7 +133,7 @@ def fit_o(law) -> None:
     Raises:
       ValueError: an `o` for a barrier that has no kappa.
     """
-    uses_o = getattr(law.barrier, "uses_o", True)
+    uses_o = barrier_member(law.barrier, "uses_o")
     if uses_o and law.o is None:
         object.__setattr__(law, "o", jnp.full_like(law.k1, 0.1))
     if not uses_o and law.o is not None:

@@ -56,7 +56,13 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.barriers._base import CLAIMS, guard_is_active, ratio_jumps, value_unit
+from iblf_jax.control.barriers._base import (
+    CLAIMS,
+    barrier_member,
+    guard_is_active,
+    ratio_jumps,
+    value_unit,
+)
 from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_weight
 from iblf_jax.core import checks
@@ -144,7 +150,7 @@ class FullState:
                 remedy,
             )
         uses_o = [
-            getattr(barrier, "uses_o", True) for barrier in (self.barrier, self.velocity_barrier)
+            barrier_member(barrier, "uses_o") for barrier in (self.barrier, self.velocity_barrier)
         ]
         if any(uses_o) and self.o is None:
             object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
@@ -219,7 +225,6 @@ class FullState:
 
 def _ratio_of(barrier: Barrier) -> jax.Array | None:
     """e/s of a barrier in the middle of a tube, or None if it has no such ratio."""
-    if not hasattr(barrier, "error_over_slope"):
-        return None
     zero, one = jnp.zeros(1), jnp.ones(1)
-    return barrier.error_over_slope(Tube(zero, zero, -one, one, zero, zero), zero)  # type: ignore[no-any-return]
+    tube = Tube(zero, zero, -one, one, zero, zero)
+    return barrier_member(barrier, "error_over_slope")(tube, zero)  # type: ignore[no-any-return]

@@ -39,6 +39,7 @@ from iblf_jax.control.controllers._base import (
     Controller,
     LawContext,
     State,
+    law_member,
     switching_functions,
 )
 from iblf_jax.core import checks
@@ -105,7 +106,7 @@ class SafetyFilter:
 
     def advice(self) -> list[str]:
         """The wrapped law's."""
-        return getattr(self.law, "advice", list)()
+        return law_member(self.law, "advice")()  # type: ignore[no-any-return]
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""

@@ -17,11 +17,13 @@ from iblf_jax.control.controllers._base import (
     Controller,
     LawContext,
     State,
+    law_member,
     switching_functions,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots._base import robot_member
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
@@ -55,7 +57,7 @@ class Saturated:
 
     def advice(self) -> list[str]:
         """The wrapped law's."""
-        return getattr(self.law, "advice", list)()
+        return law_member(self.law, "advice")()  # type: ignore[no-any-return]
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
         """The wrapped law's state."""
@@ -108,7 +110,9 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
     Raises:
       ValueError: as `Saturated`.
     """
-    effort = getattr(robot, "effort", jnp.inf)
+    effort = robot_member(robot, "effort")
+    if effort is None:
+        effort = jnp.inf
     if not checks.is_concrete(effort):
         return Saturated(
             law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge

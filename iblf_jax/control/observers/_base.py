@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import jax
 
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.world.robots import Robot
 
 State = Any
@@ -43,3 +44,7 @@ class Observer(Protocol):
         saturation).
         """
         ...
+
+
+observer_member = OptionalMembers(advance=None, at_period=None, advice=list)
+"""Reads what an observer may lack."""

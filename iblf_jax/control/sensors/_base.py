@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 
 State = Any
 """A pytree of arrays of floats; `()` for a sensor without memory."""
@@ -89,6 +90,18 @@ class Velocity(Protocol):
           state: of the sample before.
         """
         ...
+
+
+sensor_member = OptionalMembers(
+    unrounded=None, resolution=0.0, velocity=None, advice=lambda period: []
+)
+"""Reads what a sensor, or its velocity, may lack."""
+
+
+def unrounded(sensor: Sensor) -> Sensor:
+    """A sensor without its rounding; itself if it does not round."""
+    found = sensor_member(sensor, "unrounded")
+    return sensor if found is None else found
 
 
 def above_nyquist(name: str, cutoff: jax.Array, period: jax.Array) -> list[str]:

@@ -10,7 +10,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import Measurement, State, Velocity
+from iblf_jax.control.sensors._base import Measurement, State, Velocity, sensor_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 
@@ -49,7 +49,7 @@ class Encoder:
 
     def advice(self, period: jax.Array) -> list[str]:
         """The velocity's warnings."""
-        return getattr(self.velocity, "advice", lambda period: [])(period)
+        return sensor_member(self.velocity, "advice")(period)  # type: ignore[no-any-return]
 
     @property
     def unrounded(self) -> Encoder:

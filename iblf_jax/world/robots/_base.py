@@ -24,6 +24,8 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.time import as_at
 
 T = TypeVar("T")
 
@@ -82,10 +84,25 @@ class Robot(Protocol):
         ...
 
 
+robot_member = OptionalMembers(
+    joints=(),
+    kinds=None,
+    limits=None,
+    speed=None,
+    effort=None,
+    skeleton=None,
+    geometry_fields=(),
+    friction_torque=jnp.zeros_like,
+    energy_gradient=None,
+)
+"""Reads what a robot may lack: the members that `Robot` describes as optional, and what a robot
+from a file has: names, kinds and limits of its joints."""
+
+
 def at_time(robot: T, t: jax.Array) -> T:
     """The robot as it is at time t [s]: itself, unless it has a method `at`."""
     _is_robot(robot)
-    return robot.at(t) if hasattr(robot, "at") else robot
+    return as_at(robot, t)
 
 
 @jax.jit
@@ -110,7 +127,7 @@ def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
     robot has a method of this name.
     """
     (dq,) = checks.vectors(dq=dq)
-    return robot.friction_torque(dq) if hasattr(robot, "friction_torque") else jnp.zeros_like(dq)
+    return robot_member(robot, "friction_torque")(dq)  # type: ignore[no-any-return]
 
 
 def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
@@ -146,7 +163,7 @@ def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     0", "joint 1", ...
     """
     n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
-    names = tuple(map(str, getattr(robot, "joints", ())))
+    names = tuple(map(str, robot_member(robot, "joints")))
     return names if len(names) == n else tuple(f"joint {i}" for i in range(n))
 
 
@@ -167,8 +184,9 @@ def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     """
     _is_robot(robot)
     q, v = checks.vectors(robot.n, q=q, v=v)
-    if hasattr(robot, "energy_gradient"):
-        return robot.energy_gradient(q, v)
+    own_method = robot_member(robot, "energy_gradient")
+    if own_method is not None:
+        return own_method(q, v)  # type: ignore[no-any-return]
     return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
 
 

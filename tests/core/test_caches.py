@@ -1,0 +1,57 @@
+"""The cache of the package: bounds, marks and `clear`."""
+
+import re
+from pathlib import Path
+
+import iblf_jax
+from iblf_jax.core import caches
+from iblf_jax.core.caches import CACHE, Cache
+
+
+def test_the_least_recently_used_results_leave():
+    cache, calls = Cache(), []
+
+    @cache.memoised(2)
+    def square(x):
+        calls.append(x)
+        return x * x
+
+    assert [square(x) for x in (1, 2, 1, 3, 1, 2)] == [1, 4, 1, 9, 1, 4]
+    assert calls == [1, 2, 3, 2]
+    assert len(cache) == cache.bound == 2
+    cache.clear()
+    assert len(cache) == 0 and square(1) == 1 and calls[-1] == 1
+
+
+def test_a_mark_is_new_once(monkeypatch):
+    monkeypatch.setattr(caches, "MOST_MARKS", 2)
+    cache = Cache()
+    assert cache.mark("texts", "a") and not cache.mark("texts", "a")
+    assert cache.mark("kernels", "a"), "topics are separate"
+    assert cache.mark("texts", "b") and cache.mark("texts", "c")
+    assert not cache.is_marked("texts", "a"), "the oldest mark leaves"
+    assert cache.is_marked("texts", "c")
+    cache.clear("texts")
+    assert not cache.is_marked("texts", "c") and cache.is_marked("kernels", "a")
+    cache.clear()
+    assert len(cache) == 0
+
+
+def test_the_cache_of_the_package_can_be_cleared():
+    from iblf_jax.control.controllers.adaptive_rbf import sobol_centres
+
+    first = sobol_centres(4, 2)
+    assert sobol_centres(4, 2) is first and len(CACHE) > 0
+    CACHE.clear()
+    assert len(CACHE) == 0
+    assert (sobol_centres(4, 2) == first).all()
+
+
+def test_core_world_and_control_have_no_other_cache():
+    package = Path(iblf_jax.__file__).parent
+    for folder in ("core", "world", "control"):
+        for path in (package / folder).rglob("*.py"):
+            if path.name == "caches.py":
+                continue
+            found = re.search(r"lru_cache|functools\.cache|import cache\b", path.read_text())
+            assert found is None, f"{path}: {found}"
