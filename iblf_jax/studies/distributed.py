@@ -49,11 +49,6 @@ def initialize(
 
     Source: jax.distributed.
     """
-    notices.warn(
-        "ij.distributed is deprecated: give sweep and monte_carlo an executor, or start the same"
-        " sweep several times with store=ij.studies.StoreOptions(path, shared=True).",
-        DeprecationWarning,
-    )
     given = (coordinator, num_processes, process_id)
     if any(x is None for x in given) and not all(x is None for x in given):
         raise checks.fail(
@@ -61,6 +56,11 @@ def initialize(
             given,
             "all three, or none where JAX finds them by itself",
         )
+    notices.warn(
+        "ij.distributed is deprecated: give sweep and monte_carlo an executor, or start the same"
+        " sweep several times with store=ij.studies.StoreOptions(path, shared=True).",
+        DeprecationWarning,
+    )
     jax.distributed.initialize(
         coordinator,
         num_processes,

@@ -12,6 +12,8 @@ import math
 import os
 import re
 import shutil
+import sys
+import types
 import warnings
 from pathlib import Path
 from unittest import mock
@@ -992,6 +994,7 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
     `parameters` print."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jax.distributed.initialize", entered)
+    monkeypatch.setitem(sys.modules, "distributed", types.SimpleNamespace(Client=entered))
     monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
     for name in ("study", "sweep", "tune"):
         shutil.copy(ROOT / "examples" / f"{name}.toml", tmp_path)
