@@ -1,11 +1,12 @@
 """The command line: `python -m iblf_jax COMMAND`, or `iblf-jax COMMAND`.
 
 One module a command, each with `add_parser(subparsers)` and `run(args) -> int`; a new command is a
-new module and a word in `COMMANDS`. Exit codes: 0 done; 1 a run failed (a bound was violated, the
-  state ran away, the step was too large); 2 bad arguments or files, with
-one line on stderr; 3 a study did not finish (disk full, another process lost) and what it wrote
-stays valid; 130 interrupted. What is slow to import is imported by `run`, so that `--help` is
-quick.  The CLI computes in float64.
+new module and a word in `COMMANDS`.  `run` imports what is slow to import, so that `--help` is
+quick.  The commands compute in float64.
+
+Exit codes: 0 done; 1 a run failed (a bound was violated, the state diverged, the step was too
+large); 2 bad arguments or files, with one line on stderr; 3 a study did not finish (disk full, a
+worker lost) and what it wrote stays valid; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(stop.code or 0)
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        said = set[str]()
-        warnings.showwarning = lambda message, *_, **__: _warn_once(str(message), said)
+        shown = set[str]()
+        warnings.showwarning = lambda message, *_, **__: _warn_once(str(message), shown)
         try:
             prepare_jax()
             code = args.run(args)
@@ -86,11 +87,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         except ValueError as error:
             complain(str(error))
         except OSError as error:
-            complain(
-                f"{error.filename}: {error.strerror}"
-                if error.filename and error.strerror
-                else str(error)
-            )
+            text = str(error)
+            if error.filename and error.strerror:
+                text = f"{error.filename}: {error.strerror}"
+            complain(text)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             complain(
                 f"the machine gave up: {error}. A shorter --duration or a larger --record-every"
@@ -116,9 +116,9 @@ def entry() -> NoReturn:
     sys.exit(code)
 
 
-def _warn_once(message: str, said: set[str]) -> None:
-    if message not in said:
-        said.add(message)
+def _warn_once(message: str, shown: set[str]) -> None:
+    if message not in shown:
+        shown.add(message)
         complain(message, kind="warning")
 
 

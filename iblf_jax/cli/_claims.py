@@ -87,11 +87,11 @@ def bounds_kept(runs: Pair) -> PaperClaim:
     """The constraint boundaries are not broken."""
     margins = _metric(runs, "margin")
     flagged = [name for name, run in runs.items() if int(run.status) & int(Status.BOUND_VIOLATED)]
-    held = not flagged and all(np.all(m > 0) for m in margins.values())
+    confirmed = not flagged and all(np.all(m > 0) for m in margins.values())
     detail = f"smallest distance to a bound, joint by joint: {_versus(margins, 'rad')}."
     return PaperClaim(
         "Neither law violates its time-varying asymmetric bounds.",
-        held,
+        confirmed,
         detail,
         {"margin [rad]": margins},
     )
@@ -100,21 +100,23 @@ def bounds_kept(runs: Pair) -> PaperClaim:
 def both_track(runs: Pair) -> PaperClaim:
     """The robot tracks the reference under both laws."""
     times = _metric(runs, "settling_time")
-    held = all(np.all(np.isfinite(x)) for x in times.values())
+    confirmed = all(np.all(np.isfinite(x)) for x in times.values())
     detail = f"|e1| stays under {SETTLED:g} rad from: {_versus(times, 's')}."
-    return PaperClaim("Both laws track the reference.", held, detail, {"settling_time [s]": times})
+    return PaperClaim(
+        "Both laws track the reference.", confirmed, detail, {"settling_time [s]": times}
+    )
 
 
 def faster(runs: Pair) -> PaperClaim:
     """The trajectory converges more quickly under the proposed law."""
     times = _metric(runs, "settling_time")
     proposed, compared = times.values()
-    held = bool(np.all(np.isfinite(proposed)) and np.all(proposed < compared))
+    confirmed = bool(np.all(np.isfinite(proposed)) and np.all(proposed < compared))
     detail = f"settling times {_versus(times, 's')}"
-    if held and np.all(np.isfinite(compared)):
+    if confirmed and np.all(np.isfinite(compared)):
         detail += f": sooner by {each_joint(100.0 * (1.0 - proposed / compared), '%')}"
     return PaperClaim(
-        "The integral form converges faster.", held, f"{detail}.", {"settling_time [s]": times}
+        "The integral form converges faster.", confirmed, f"{detail}.", {"settling_time [s]": times}
     )
 
 
@@ -122,11 +124,11 @@ def more_accurate(runs: Pair) -> PaperClaim:
     """The control accuracy is slightly higher, the tracking error smaller."""
     rmse = _metric(runs, "rmse")
     late = {name: _late_peak(run, run.e1) for name, run in runs.items()}
-    held = all(bool(np.all(a < b)) for a, b in (tuple(rmse.values()), tuple(late.values())))
+    confirmed = all(bool(np.all(a < b)) for a, b in (tuple(rmse.values()), tuple(late.values())))
     detail = f"rms of e1 {_versus(rmse, 'rad')}; largest late |e1| {_versus(late, 'rad')}."
     return PaperClaim(
         "The integral form is slightly more accurate.",
-        held,
+        confirmed,
         detail,
         {"rmse [rad]": rmse, "late |e1| [rad]": late},
     )
@@ -142,10 +144,10 @@ def overshoot_of_e2(runs: Pair) -> PaperClaim:
     detail = (
         f"how far e2 swings past zero in the first {INITIAL_STAGE:g} s: {_versus(swings, 'rad/s')}."
     )
-    held = bool(np.all(proposed > compared))
+    confirmed = bool(np.all(proposed > compared))
     return PaperClaim(
         "The integral form overshoots more in e2 at the start.",
-        held,
+        confirmed,
         detail,
         {"overshoot of e2 [rad/s]": swings},
     )
@@ -165,7 +167,7 @@ def _estimate_errors(runs: Pair) -> tuple[dict[str, np.ndarray], dict[str, np.nd
 def estimate_follows(runs: Pair) -> PaperClaim:
     """The observer's estimate tends to the uncertain term."""
     late, peak = _estimate_errors(runs)
-    held = all(bool(np.all(late[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
+    confirmed = all(bool(np.all(late[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
     share = {name: 100.0 * late[name] / peak[name] for name in runs}
     detail = (
         f"largest late |f - f_hat|: {_versus(late, 'N m')}; as a share of the peak of |f|:"
@@ -174,7 +176,7 @@ def estimate_follows(runs: Pair) -> PaperClaim:
     )
     return PaperClaim(
         "The observer's estimate tends to the uncertain term.",
-        held,
+        confirmed,
         detail,
         {"late |f - f_hat| [N m]": late, "peak |f| [N m]": peak},
     )
@@ -192,7 +194,9 @@ def small_neighbourhood(runs: Pair) -> PaperClaim:
         for name, run in runs.items()
         for field, late in (("e1", e1), ("e2", e2))
     )
-    held = small and all(bool(np.all(f_tilde[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
+    confirmed = small and all(
+        bool(np.all(f_tilde[name] < ESTIMATE_SHARE * peak[name])) for name in runs
+    )
     detail = (
         f"largest late values: |e1| {_versus(e1, 'rad')}; |e2| {_versus(e2, 'rad/s')}; |f_tilde|"
         f" {_versus(f_tilde, 'N m')} (held if e1 and e2 are under {100 * NEIGHBOURHOOD:g} % of"
@@ -200,7 +204,7 @@ def small_neighbourhood(runs: Pair) -> PaperClaim:
     )
     numbers = {"late |e1| [rad]": e1, "late |e2| [rad/s]": e2, "late |f_tilde| [N m]": f_tilde}
     return PaperClaim(
-        "The error signals tend to a very small neighbourhood of zero.", held, detail, numbers
+        "The error signals tend to a very small neighbourhood of zero.", confirmed, detail, numbers
     )
 
 

@@ -26,10 +26,11 @@ RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "
 
 def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
     """SCENARIO (which may be left out if there is a default), --arg and --set."""
-    words = "a scenario file, or the name of a preset" + (
-        f" (default: {default})" if default else ""
-    )
-    optional: dict[str, Any] = {"nargs": "?", "default": default} if default else {}
+    words = "a scenario file, or the name of a preset"
+    optional: dict[str, Any] = {}
+    if default:
+        words += f" (default: {default})"
+        optional = {"nargs": "?", "default": default}
     parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=words, **optional)
     parser.add_argument(
         "--arg",
@@ -79,9 +80,10 @@ def scenario_of(args: argparse.Namespace) -> ScenarioFile:
 
     words = assignments("--arg", args.arg)
     if args.scenario in PRESETS:
-        file = from_dict(
-            {"preset": args.scenario, "arguments": words}, source="--arg" if words else ""
-        )
+        source = ""
+        if words:
+            source = "--arg"
+        file = from_dict({"preset": args.scenario, "arguments": words}, source=source)
     elif words:
         raise ValueError(
             f"--arg: {args.scenario} is not a preset, and only presets take arguments; use --set"
@@ -103,11 +105,9 @@ def _check_exists(name: str) -> None:
     from iblf_jax.presets import PRESETS
 
     if not Path(name).is_file():
-        remedy = (
-            did_you_mean(name, PRESETS)
-            if not name.endswith(".toml")
-            else "Give the path of a scenario file."
-        )
+        remedy = did_you_mean(name, PRESETS)
+        if name.endswith(".toml"):
+            remedy = "Give the path of a scenario file."
         raise ValueError(f"{name}: no such file, and no such preset. {remedy}")
 
 
@@ -122,13 +122,12 @@ def assignments(option: str, words: list[str]) -> dict[str, Any]:
         found = re.fullmatch(
             r"""((?:\["(?:[^"\\]|\\.)*"\]|\[[^\]]*\]|[^=\[])*)=(.*)""", word, re.DOTALL
         )
-        name, text = found.groups() if found else ("", "")
+        name = text = ""
+        if found:
+            name, text = found.groups()
         if not name.strip() or not text.strip():
-            raise checks.fail(
-                option,
-                word,
-                f"NAME=VALUE, such as {'law=log' if option == '--arg' else 'controller.K2=30'}",
-            )
+            examples = {"--arg": "law=log", "--set": "controller.K2=30"}
+            raise checks.fail(option, word, f"NAME=VALUE, such as {examples[option]}")
         try:
             values[name.strip()] = toml_tables(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
@@ -150,8 +149,12 @@ def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
     return RUN_DEFAULTS | file.run | given
 
 
-def output_folder(name: str) -> Path:
-    """The folder of --out, made if it is not there; ValueError if it cannot be written."""
+def output_folder(name: str | None) -> Path | None:
+    """The folder of --out, made if it does not exist, or None without --out; ValueError if it
+    cannot be written.
+    """
+    if not name:
+        return None
     folder = Path(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -178,7 +181,9 @@ def strict(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [strict(x) for x in value]
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        if not math.isfinite(value):
+            return None
+        return value
     return strict(np.asarray(value).tolist())
 
 
@@ -206,7 +211,9 @@ def verdict(run: Rollout) -> dict[str, Any]:
 def number(value: Any) -> str:
     """A number in four significant digits; a dash for what never happened."""
     value = float(value)
-    return f"{value:.4g}" if math.isfinite(value) else "-"
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.4g}"
 
 
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
@@ -221,22 +228,16 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
     for name, unit in first.metrics.units.items():
         values = [np.ravel(run.metrics[name]) for run in runs.values()]
         # One row a region: there may be more of them than joints.
-        lines = (
-            [(f"{name}[{i}]", [x[i : i + 1] for x in values]) for i in range(values[0].size)]
-            if name in OF_REGIONS
-            else [(name, values)]
-        )
+        lines = [(name, values)]
+        if name in OF_REGIONS:
+            lines = [
+                (f"{name}[{i}]", [x[i : i + 1] for x in values]) for i in range(values[0].size)
+            ]
+        is_index = name.endswith(("violation_joint", "violation_region"))
         for shown, numbers in lines:
             row = [shown, unit]
             for x in numbers:
-                cells = [
-                    (
-                        "-"
-                        if name.endswith(("violation_joint", "violation_region")) and y < 0
-                        else number(y)
-                    )
-                    for y in x
-                ]
+                cells = [number(math.nan if is_index and y < 0 else y) for y in x]
                 row += [*cells, *[""] * (first.n - len(cells))]
             rows.append(row)
     if any(runs):  # a name, over the first of its joints

@@ -28,7 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="run several laws side by side",
         description=(
             "Run several laws on one scenario, at the gains they have and at equal effort (RMS"
-            " torque above gravity), and print two tables that say what was held equal."
+            " torque above gravity), and print two tables that say what is equal in each."
         ),
         epilog=(
             "Exit code 1 if a run at the given gains failed: a bound was violated, the state ran"
@@ -59,13 +59,13 @@ def run(args: argparse.Namespace) -> int:
 
     file = scenario_of(args)
     options = run_options(args, file)
-    folder = output_folder(args.out) if args.out else None
+    folder = output_folder(args.out)
     laws = [name for word in args.laws or LAWS for name in word.split(",") if name]
     result = compare(file.scenario, laws, equal_effort=not args.gains_only, **options)
     print(f"{args.scenario}\n{result!r}")
     if folder is not None:
         _write(folder, args.scenario, result, options)
-    return 1 if result.failed else 0
+    return int(bool(result.failed))
 
 
 def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any]) -> None:

@@ -42,8 +42,11 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.cli._common import output_folder
     from iblf_jax.files.identification import identify_file
 
-    folder = output_folder(args.out) if args.out else None
-    known = identify_file(args.file, **({"log": args.log} if args.log else {}))
+    folder = output_folder(args.out)
+    given = {}
+    if args.log:
+        given["log"] = args.log
+    known = identify_file(args.file, **given)
     print(known)
     if folder is not None:
         from iblf_jax import plotting
@@ -57,4 +60,4 @@ def run(args: argparse.Namespace) -> int:
             f"\nwritten to {folder}: scenario.toml, identification.json, identification.html,"
             " identification.png"
         )
-    return 1 if any(number.value is None for number in known.wanted) else 0
+    return int(any(number.value is None for number in known.wanted))

@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         if distributed.rank() == 0:
             print(report(study))
         write_netcdf(study.to_xarray(), args.out)
-        return 1 if len(study.failed) else 0
+        return int(len(study.failed) > 0)
 
     return carried_out(args, work)
 

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
         f"written to {folder}: figure_1 ... figure_6 (.png, .pdf), arm.gif, rollouts.nc,"
         " metrics.json"
     )
-    return 1 if any(int(one.status) & int(FAILED) for one in runs.values()) else 0
+    return int(any(int(one.status) & int(FAILED) for one in runs.values()))
 
 
 def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[str, float]]:

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
     file = scenario_of(args)
     options = run_options(args, file)
-    folder = output_folder(args.out) if args.out else None
+    folder = output_folder(args.out)
     result = simulate(file.scenario, **options, seed=args.seed)
     failed = bool(int(result.status) & int(FAILED))
     print(
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     print("\n" + metrics_table({"": result}))
     if folder is not None:
         _write(folder, args.scenario, result, options, args.seed)
-    return 1 if failed else 0
+    return int(failed)
 
 
 def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any], seed: int) -> None:

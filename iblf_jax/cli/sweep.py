@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         if distributed.rank() == 0:
             print(report(data))
         write_netcdf(data, args.out)
-        return 1 if bool((data.status & int(FAILED)).any()) else 0
+        return int((data.status & int(FAILED)).any())
 
     return carried_out(args, work)
 
@@ -84,8 +84,9 @@ def report(data: xarray.Dataset) -> str:
     dims, runs = list(config["dims"]), config["runs"]
     failed = ((data.status & int(FAILED)) != 0).values.reshape(-1, runs).sum(1)
     rows = [[*(config["points"] if dims else ["point"]), "failed"]]
-    margin = data["margin"].min("joint").values.reshape(-1, runs) if "margin" in data else None
-    if margin is not None:
+    margin = None
+    if "margin" in data:
+        margin = data["margin"].min("joint").values.reshape(-1, runs)
         rows[0] += ["worst margin [rad]", "median margin [rad]"]
     shape = tuple(config["dims"].values())
     for point, place in enumerate(np.ndindex(shape) if shape else [()]):
@@ -99,7 +100,9 @@ def report(data: xarray.Dataset) -> str:
         if margin is not None:
             cells += [number(np.nanmin(margin[point])), number(np.nanmedian(margin[point]))]
         rows.append(cells)
-    more = [f"... and {len(rows) - 1 - MOST_ROWS} more points"] if len(rows) > MOST_ROWS + 1 else []
+    more = []
+    if len(rows) > MOST_ROWS + 1:
+        more = [f"... and {len(rows) - 1 - MOST_ROWS} more points"]
     head = (
         f"{data.attrs['cases']} runs of {data.attrs['duration']:g} s, dt = {data.attrs['dt']:g} s,"
         f" seed {data.attrs['seed']}"
@@ -108,4 +111,6 @@ def report(data: xarray.Dataset) -> str:
 
 
 def _tick(value: Any) -> str:
-    return " ".join(f"{x:.4g}" for x in value) if isinstance(value, list) else f"{value:.4g}"
+    if isinstance(value, list):
+        return " ".join(f"{x:.4g}" for x in value)
+    return f"{value:.4g}"

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.cli._common import output_folder
     from iblf_jax.files.tuning import tune_file
 
-    folder = output_folder(args.out) if args.out else None
+    folder = output_folder(args.out)
     given = {
         name: x
         for name, x in (("checkpoint", args.checkpoint), ("iterations", args.iterations))

@@ -31,12 +31,19 @@ def describe_component(part: Any) -> Any:
     ):
         return np.asarray(part).tolist()
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        return part if isinstance(part, str | bool | None) else repr(part)
+        return _simple(part, str | bool | None)
     fields = {
         field.name: describe_component(getattr(part, field.name))
         for field in dataclasses.fields(part)
     }
     return {"class": type(part).__qualname__, **fields}
+
+
+def _simple(value: Any, kinds: Any) -> Any:
+    """A value of these types, or its `repr`."""
+    if isinstance(value, kinds):
+        return value
+    return repr(value)
 
 
 def structure(part: Any) -> Any:
@@ -49,9 +56,7 @@ def structure(part: Any) -> Any:
     for field in dataclasses.fields(part):
         inner = getattr(part, field.name)
         if field.metadata.get("static"):
-            found[field.name] = (
-                inner if isinstance(inner, str | bool | int | float) else repr(inner)
-            )
+            found[field.name] = _simple(inner, str | bool | int | float)
         elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):
             found[field.name] = structure(inner)
     return found

@@ -1,4 +1,8 @@
-"""Asked to stop between two units: the first signal asks, the second one insists."""
+"""Ctrl-C and SIGTERM between two units of a store: the first signal stops the sweep after the
+present unit, the second one at once.
+
+No scheduler offers this: without it Ctrl-C would discard the unit that is being computed.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +19,11 @@ STOP_SIGNALS = {
     signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)),
     signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,)),
 }
-"""Signals that ask, what they are called, and who handles them where nobody else does.  A cluster
-sends SIGTERM before it kills.
+"""Signal -> its name, and the default handlers that a `StopRequest` replaces.  A cluster sends
+SIGTERM before it kills.
 
-Ctrl-C is the first, as it is what may raise in the middle of anything where nobody handles it: it
-is taken over first and given back last.
+Ctrl-C is the first, because its default handler may raise anywhere: its handler is replaced first
+and restored last.
 """
 
 
@@ -31,8 +35,8 @@ class StopRequest:
     """While this context is open, the first Ctrl-C or SIGTERM only sets `requested`; the second one
     interrupts at once.
 
-    Signals reach the main thread only; elsewhere, and where somebody else handles or ignores them,
-    this does nothing.
+    Signals reach the main thread only: in other threads, and where the program handles or ignores
+    them itself, this does nothing.
     """
 
     def __init__(self) -> None:

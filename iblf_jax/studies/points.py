@@ -128,11 +128,8 @@ def _design(
 ) -> Points:
     if not grid:
         raise checks.fail("grid", dict(grid), f'at least one distribution for design="{design}"')
-    ways = {
-        path: way if isinstance(way, Perturbation) else value(_distribution(path, way))
-        for path, way in grid.items()
-    }
-    targets, by_path = targets_of(scenario, ways, "grid")
+    perturbations = {path: _perturbation(path, given) for path, given in grid.items()}
+    targets, by_path = targets_of(scenario, perturbations, "grid")
     dtype = scenario.initial.q.dtype
     by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
     designed: dict[str, np.ndarray] = {}
@@ -160,15 +157,17 @@ def _design(
     return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
 
 
-def _distribution(path: str, way: Any) -> Any:
-    if not is_distribution(way):
+def _perturbation(path: str, given: Any) -> Perturbation:
+    if isinstance(given, Perturbation):
+        return given
+    if not is_distribution(given):
         raise checks.fail(
             f"grid[{path!r}]",
-            way,
+            given,
             "a distribution, such as ij.uniform(10, 40)",
             'Lists of values go with design="grid".',
         )
-    return way
+    return value(given)
 
 
 def _draw_points(

@@ -58,7 +58,8 @@ def recommended_dt(
     """
     tableau(method)
     seed, duration = checks.seed(seed), checks.time_span("duration", duration)
-    perturbations = {} if perturbations is None else perturbations
+    if perturbations is None:
+        perturbations = {}
     example = '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}'
     checks.mapping("perturbations", perturbations, example)
     if perturbations:  # checked here, before the search for a step

@@ -76,8 +76,8 @@ class PreparedStudy:
     @property
     def cases(self) -> int:
         """Number of cases: points times runs."""
-        points = [len(values) for values in self.points.values()]
-        return self.runs * (points[0] if points else 1)
+        counts = [len(values) for values in self.points.values()]
+        return self.runs * next(iter(counts), 1)
 
     def inputs_of(self, cases: np.ndarray) -> CaseInputs:
         """What differs between these cases; numbers past the last case repeat it."""

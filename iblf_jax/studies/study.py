@@ -241,9 +241,9 @@ class Study:
         """
         count = checks.positive_integer("count", count)
         values = statistics.one_number(self.metrics, metric)
-        order = np.argsort(
-            values if metric in statistics.SMALLER_IS_WORSE else -values, kind="stable"
-        )
+        if metric not in statistics.SMALLER_IS_WORSE:
+            values = -values
+        order = np.argsort(values, kind="stable")
         return order[self.made[order]][:count]
 
     def parameter_unit(self, path: str) -> str:
@@ -251,30 +251,33 @@ class Study:
         return paths.unit_at(self.scenario, path)
 
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
-        """Which runs a statistic is over, (N,) bool, and what to say about it."""
+        """Which runs a statistic is over, (N,) bool, and the counts that go with it."""
         exclude_failed = checks.flag("exclude_failed", exclude_failed)
-        used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
-        said = {
+        has_failed = self.status & int(FAILED) != 0
+        used = self.made
+        if exclude_failed:
+            used = used & ~has_failed
+        counts = {
             "runs": int(used.sum()),
             "excluded": int(self.runs - used.sum()),
             "failed_excluded": str(bool(exclude_failed)),
+            "failed_included": int(np.sum(used & has_failed)),
         }
-        return used, said | {
-            "failed_included": int(np.sum(used & (self.status & int(FAILED) != 0)))
-        }
+        return used, counts
 
     @property
     def included(self) -> str:
         """In words: which runs statistics are over, unless failed ones are left out."""
-        said = self.chosen()[1]
-        failed = (
-            f"{said['failed_included']} failed ones included (exclude_failed=True leaves them out)"
-        )
-        unmade = f"; {said['excluded']} were not made" if said["excluded"] else ""
-        return (
-            f"statistics are over {said['runs']} runs,"
-            f" {failed if said['failed_included'] else 'none of them failed'}{unmade}"
-        )
+        _, counts = self.chosen()
+        text = f"statistics are over {counts['runs']} runs, "
+        if counts["failed_included"]:
+            text += f"{counts['failed_included']} failed ones included (exclude_failed=True leaves"
+            text += " them out)"
+        else:
+            text += "none of them failed"
+        if counts["excluded"]:
+            text += f"; {counts['excluded']} were not made"
+        return text
 
     def quantiles(
         self, quantiles: Sequence[float] = (0.05, 0.5, 0.95), *, exclude_failed: bool = False
@@ -435,7 +438,8 @@ class Study:
         flags = [
             f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])
         ]
-        lines += [f"  flags, of which a run may have several: {'; '.join(flags)}"] if flags else []
+        if flags:
+            lines.append(f"  flags, of which a run may have several: {'; '.join(flags)}")
         lines += [f"  {self.included}"]
         return "\n".join(lines)
 

@@ -80,21 +80,19 @@ def metric_quantiles(
     import xarray
 
     levels = check_quantiles(quantiles)
-    used, said = study.chosen(exclude_failed)
+    used, counts = study.chosen(exclude_failed)
     variables = {}
     for name, values in study.metrics.items():
         values = np.asarray(values)
-        made = (
-            _quantile(values[used], levels)
-            if used.any()
-            else np.full((len(levels), *values.shape[1:]), np.nan)
-        )
+        made = np.full((len(levels), *values.shape[1:]), np.nan)
+        if used.any():
+            made = _quantile(values[used], levels)
         variables[name] = (
             ("quantile", *own_dims(name, values.shape[1:], study.scenario.n)),
             made,
             {"units": study.metrics.units.get(name, "")},
         )
-    return xarray.Dataset(variables, {"quantile": levels}, said)
+    return xarray.Dataset(variables, {"quantile": levels}, counts)
 
 
 def _quantile(values: np.ndarray, levels: np.ndarray) -> np.ndarray:
@@ -110,7 +108,7 @@ def correlations(
     """
     import xarray
 
-    used, said = study.chosen(exclude_failed)
+    used, counts = study.chosen(exclude_failed)
     names = (
         list(study.metrics)
         if metrics is None
@@ -130,7 +128,7 @@ def correlations(
     return xarray.Dataset(
         variables,
         {"parameter": list(drawn), "metric": names},
-        said | {"of": "the worst joint of each metric"},
+        counts | {"of": "the worst joint of each metric"},
     )
 
 
@@ -151,8 +149,8 @@ def bands(
     ):
         parts.append(arrays)
         times = t[0]
-    whole = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
-    used = study.made[:count] if not exclude_failed else study.chosen(True)[0][:count]
+    recorded = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
+    used = study.chosen(exclude_failed)[0][:count]
     if not used.any():
         raise checks.fail(
             "runs",
@@ -162,7 +160,7 @@ def bands(
         )
     dims = ("quantile", "time", "joint")
     variables: dict[str, Any] = {
-        name: (dims, _quantile(whole[name][used], levels), {"units": SIGNALS[name].unit})
+        name: (dims, _quantile(recorded[name][used], levels), {"units": SIGNALS[name].unit})
         for name in BANDS
     }
     edges: dict[str, Any] = {"lower": np.max, "upper": np.min, "q_d": np.median}
@@ -174,18 +172,18 @@ def bands(
         }[name]
         variables[name] = (
             dims[1:],
-            edge(whole[name][used], axis=0),
+            edge(recorded[name][used], axis=0),
             {"units": "rad", "description": f"{words} of the runs"},
         )
     failed = int(np.sum(used & (study.status[:count] & int(FAILED) != 0)))
-    said = {
+    attributes = {
         "runs": int(used.sum()),
         "excluded": int(count - used.sum()),
         "failed_included": failed,
         "of_runs": study.runs,
     }
     return xarray.Dataset(
-        variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, said
+        variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, attributes
     )
 
 

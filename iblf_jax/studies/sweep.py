@@ -128,7 +128,8 @@ def sweep(
     points = design_of(design, deprecated)
     progress = checks.flag("progress", progress, optional=True)
     runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
-    perturbations = {} if perturbations is None else perturbations
+    if perturbations is None:
+        perturbations = {}
     replicates = check_sampler(sampler, runs, replicates)
     _check_something_varies(grid, perturbations, runs)
     where = make_points(canonical(scenario), grid, points.kind, points.points, checks.seed(seed))
