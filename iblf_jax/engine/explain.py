@@ -1,4 +1,4 @@
-"""What one step of a scenario costs, counted on its scalar program: the roofline in plain sight."""
+"""`explain`: what one step of a scenario costs, counted on its scalar program."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.execute import automatic, inputs_of
+from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import TimeStep
 from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
@@ -98,23 +99,26 @@ def explain(
         path: jnp.asarray(get(scenario, path))[None]
         for path in {"initial.q", "initial.dq", *varied}
     }
-    noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
+    if has_noise(scenario):
+        leaves[NOISE_NAME] = jnp.zeros((1, 4), jnp.float32)
     one = Batch.of(
         inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
-        leaves | noise,
-        mechanism=known_of(scenario),
+        leaves,
+        constants=known_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = automatic()
-    backend = f"{name}: {reason}" if reason else name
     columns = (
         f"by numbers of the scenario on {name}, one run a number, first and second ones; others by"
         " plain JAX"
     )
-    derivatives = f"by plain JAX: {reason}" if reason else columns
+    backend, derivatives = name, columns
+    if reason:
+        backend = f"{name}: {reason}"
+        derivatives = f"by plain JAX: {reason}"
     return Explanation(
         counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives
     )
@@ -139,7 +143,9 @@ def instructions(program: Program, width: int) -> float:
     total = -len(fused - {None})
     for op, n in counted.items():
         cost = OPERATIONS[op].cost
-        total += n * (LIBRARY_CALL * width if cost is None else cost)
+        if cost is None:
+            cost = LIBRARY_CALL * width
+        total += n * cost
     return total
 
 

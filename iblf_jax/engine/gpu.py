@@ -80,3 +80,8 @@ def run(
     processors = getattr(devices.default()[0], "core_count", plan.GPU_PROCESSORS)
     threads = plan.gpu_threads(carry.floats.shape[1], processors)
     return call(name, program, shared, lane, carry, steps, every, threads)
+
+
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Compiles the kernel of `run`, which serves any number of runs and steps."""
+    cuda.kernel(program, shared, per_run, architecture())

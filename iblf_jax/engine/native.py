@@ -64,3 +64,8 @@ def run(
     return cpu.run(
         program, shared, lane, carry, steps, every, first=first, build=build, threads=threads()
     )
+
+
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Compiles the kernel with which `run` makes so many steps of so many runs."""
+    cpu.kernel(program, shared, per_run, _build(program, runs, steps))

@@ -227,3 +227,8 @@ def _joined(program: Program, values: list[jax.Array], runs: int) -> Packed:
         return jnp.stack(some) if some else jnp.zeros((0, runs), dtype)
 
     return Packed(rows("f", program.dtype), rows("ib", jnp.int32))
+
+
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Raises UnsupportedError where a program is too long; XLA compiles it with its caller."""
+    compilable(program)

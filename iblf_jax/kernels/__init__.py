@@ -53,18 +53,20 @@ Three runs from 1, 2 and 3 make ten steps, of which every fifth is recorded:
 
     >>> start = kernels.pack([jnp.array([1.0, 2.0, 3.0])], number, "float64", runs=3)
     >>> k = jnp.array([2.0])
-    >>> end, (x,) = kernels.run_on_cpu(compiled.program, k, jnp.zeros((0, 3)), start, 10, every=5)
+    >>> end, (x,) = kernels.cpu.run(compiled.program, k, jnp.zeros((0, 3)), start, 10, every=5)
     >>> np.testing.assert_allclose(end.floats[0], 0.8**10 * np.array([1.0, 2.0, 3.0]))
     >>> x.shape
     (2, 1, 3)
 """
 
+from iblf_jax.kernels import cpu as cpu
+from iblf_jax.kernels import cuda as cuda
+from iblf_jax.kernels import nvrtc as nvrtc
 from iblf_jax.kernels.caches import CACHES as CACHES
 from iblf_jax.kernels.compilation import CompiledStep as CompiledStep
 from iblf_jax.kernels.compilation import compile_step as compile_step
 from iblf_jax.kernels.cpu import Build as Build
 from iblf_jax.kernels.cpu import c_source as c_source
-from iblf_jax.kernels.cpu import run as run_on_cpu
 from iblf_jax.kernels.drafts import draft as draft
 from iblf_jax.kernels.emit_c import header as header
 from iblf_jax.kernels.emit_c import plain_function as plain_function

@@ -27,7 +27,7 @@ class Build(NamedTuple):
     segment: int | None = None
     """Operations of a function of the C, at most; None for one function."""
     flags: tuple[str, ...] = ("-DSTRETCH=128", "-DGROUP=32")
-    """Flags of the compiler: STRETCH steps and GROUP blocks of runs that a thread makes together."""
+    """Flags of the compiler: STRETCH steps of GROUP blocks of runs are made together."""
 
 
 @CACHES.function(maxsize=8)
@@ -43,13 +43,16 @@ def c_source(program: Program, shared: int, per_run: int, segment: int | None = 
     return source(program, shared, per_run, segment=segment)
 
 
-def start_build(program: Program, shared: int, per_run: int, build: Build = Build()) -> None:
+DEFAULT_BUILD = Build()
+
+
+def start_build(program: Program, shared: int, per_run: int, build: Build = DEFAULT_BUILD) -> None:
     """Starts to compile a kernel in the background; arguments as `kernel`."""
     build_ahead(c_source(program, shared, per_run, build.segment), build.flags)
 
 
 @CACHES.function(maxsize=64)
-def kernel(program: Program, shared: int, per_run: int, build: Build = Build()) -> str:
+def kernel(program: Program, shared: int, per_run: int, build: Build = DEFAULT_BUILD) -> str:
     """The name by which XLA knows the kernel of a program; compiles the kernel if necessary.
 
     Args:
@@ -113,7 +116,7 @@ def run(
     every: int | None = None,
     *,
     first: jax.Array | int = 0,
-    build: Build = Build(),
+    build: Build = DEFAULT_BUILD,
     threads: int = 1,
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs.
@@ -140,10 +143,10 @@ def run(
     name = kernel(program, shared.size, per_run.shape[0], build)
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     outputs += record_shapes(program, runs, steps, every)
-    settings = jnp.asarray(np.asarray([[0, steps, every or 0, threads]], np.int32))
+    attributes = jnp.asarray(np.asarray([[0, steps, every or 0, threads]], np.int32))
     if not isinstance(first, int) or first:
-        settings = settings.at[0, 0].set(first)
+        attributes = attributes.at[0, 0].set(first)
     floats, ints, *records = jax.ffi.ffi_call(name, outputs)(
-        shared.reshape(1, -1), per_run, *carry, settings
+        shared.reshape(1, -1), per_run, *carry, attributes
     )
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]

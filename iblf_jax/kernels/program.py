@@ -72,6 +72,13 @@ class Node(NamedTuple):
     """A constant's value, an input's index, a lookup's table, or a call's function."""
 
 
+def arguments_of(call: Node) -> tuple[int, ...]:
+    """The nodes that a call passes to its function."""
+    if call.kind == "call":
+        return call.args
+    return call.args[1:]  # the first one is the condition
+
+
 class Known(NamedTuple):
     """What is known beforehand of a shared number that is finite."""
 
@@ -151,7 +158,7 @@ class Builder:
         self._known: dict[tuple, int] = {}
         self._classes: list[int] = []
         self.known_finite: set[int] = set()
-        """Inputs that are known to be finite (`Known`), and nodes that depend on such inputs only."""
+        """Inputs that are known to be finite (`Known`), and nodes that depend only on these."""
         self.absent = self._add(Node("const", (), "f", 0.0), "absent")
         """The zero of an absent quantity: a product with it is absent, too, whatever the other
         factor is."""
@@ -161,7 +168,7 @@ class Builder:
         if kind == "f":
             number = float(self.dtype.type(value))
             return self._add(Node("const", (), kind, number), number.hex())
-        exact = int(value) if kind == "i" else bool(value)
+        exact = {"i": int, "b": bool}[kind](value)
         return self._add(Node("const", (), kind, exact), exact)
 
     def input(self, op: str, index: int, kind: str) -> int:

@@ -28,7 +28,7 @@ from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
-from iblf_jax.engine import RunRequest, run_batch
+from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
@@ -286,7 +286,7 @@ def _batch(
     dt: jax.Array,
     *,
     request: RunRequest,
-):
+) -> Outcome:
     return run_batch(scenario, varied, folds, dt, request)
 
 

@@ -14,11 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fallback import with_fallback
 from made_up_runs import ALWAYS
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
-from iblf_jax.engine import execute, executors, native, plan
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import compile, execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
 from iblf_jax.kernels import cpu, directory, packed, toolchain
@@ -369,16 +371,16 @@ def test_forward_sensitivities(monkeypatch, written_out):
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(execute, "_told", set())
+    CACHE.clear(compile.WARNINGS)
     cpu.kernel.cache_clear()
     called = []
-    with pytest.warns(execute.BackendWarning, match="no-such-compiler.*xla"):
-        execute.with_fallback(
+    with pytest.warns(compile.BackendWarning, match="no-such-compiler.*xla"):
+        with_fallback(
             "auto", lambda name: called.append(name) or fail_if_native(name), lambda: None
         )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        execute.with_fallback("auto", fail_if_native, lambda: None)
+        with_fallback("auto", fail_if_native, lambda: None)
     assert called == ["native", "xla"]
 
 

@@ -20,12 +20,14 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
+from fallback import with_fallback
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax import cli
 from iblf_jax.core import devices
 from iblf_jax.core.cache import _reloads_badly, keep_programs
-from iblf_jax.engine import execute, native
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import compile, native
 from iblf_jax.kernels import directory, drafts, nvrtc, processor, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 
@@ -565,10 +567,10 @@ def falls_back(work):
             work()
         return name
 
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        patch.setattr(execute, "_told", set())
-        assert execute.with_fallback("native", run_on, lambda: None) == "xla"
+        CACHE.clear(compile.WARNINGS)
+        assert with_fallback("native", run_on, lambda: None) == "xla"
     (line,) = [str(x.message) for x in said]
     assert line.endswith("running on xla.")
     assert "\n" not in line

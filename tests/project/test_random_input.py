@@ -271,7 +271,7 @@ def test_no_silent_nan_in_a_run(paper, values):
     """Any numbers in any leaves: refused, or run; a run that is not finite says so, and its records
     are finite up to there."""
     # The step that a warning names takes longer to find than the run; other tests look at it.
-    with mock.patch("iblf_jax.engine.simulate.find_dt", return_value=1e-4):
+    with mock.patch("iblf_jax.engine.diagnosis.find_dt", return_value=1e-4):
         run = accepts_or_value_error(
             lambda: ij.simulate(ij.with_parameters(paper, values), **SHORT)
         )

@@ -351,8 +351,8 @@ def test_joints_selects_joints_everywhere(joints, expected, three_joints):
     # The integrals are those of a run in which the other joints stand still.
     chosen = np.isin(np.arange(3), expected).astype(float)
     others = dataclasses.replace(run, e1=run.e1 * chosen, tau=run.tau * chosen)
-    wanted = exact(o.tracking() + o.effort() + o.metric(ij.metrics.Tracking(), "iae"), others)
-    np.testing.assert_allclose(found[:3], wanted, rtol=1e-10)
+    separate = exact(o.tracking() + o.effort() + o.metric(ij.metrics.Tracking(), "iae"), others)
+    np.testing.assert_allclose(found[:3], separate, rtol=1e-10)
 
 
 def test_limits_of_single_joints_and_weights(three_joints):

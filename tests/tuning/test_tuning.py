@@ -22,6 +22,7 @@ from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
+from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -240,16 +241,16 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
     run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
     assert run.ok
     assert 1e-3 * float(run.fastest_mode) > 1.2
-    # Together they keep to the same share of the step, which each alone would leave free to a
+    # Together they keep to the same share of the step, which each one would leave free to a
     # larger range.
     together = ij.with_parameters(
         paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]}
     )
     mode = 1e-3 * fastest_along(canonical(together), TIMES)
     assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
-    _, alone = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
-    assert np.all(np.exp(alone.high) > 1.001 * high[2:4])
-    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and alone.reasons[0] == (THEOREM, STEP)
+    _, single = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
+    assert np.all(np.exp(single.high) > 1.001 * high[2:4])
+    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and single.reasons[0] == (THEOREM, STEP)
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):
@@ -351,8 +352,8 @@ def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])
 def test_a_region_that_has_collapsed_is_no_optimum(sign):
-    """|z|^2 with its gradient, and with the opposite one: nothing is foretold there, however short
-    the step."""
+    """|z|^2 with its gradient, and with the opposite one: no decrease is predicted there, however
+    short the step."""
 
     def evaluate(z):
         value = Value(np.sum(z**2, axis=1))
@@ -487,12 +488,12 @@ def test_an_infeasible_start_finds_its_way_in(paper):
         paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]}
     )
     assert int(plain_status(weak)) & ij.Status.BOUND_VIOLATED
-    wanted = (
+    goal = (
         objectives.effort()
         + objectives.margin_above(0.06)
         + objectives.violation_probability_below(0.01)
     )
-    best = ij.tune(weak, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    best = ij.tune(weak, ["controller.k1", "controller.K2"], goal, iterations=60, **SHORT)
     assert int(plain_status(best.scenario)) & ij.Status.BOUND_VIOLATED == 0
     assert best.report.passed, best.report
     assert best.report.margin[0] < 0 < 0.06 < best.report.margin[1]
@@ -500,10 +501,10 @@ def test_an_infeasible_start_finds_its_way_in(paper):
 
 @pytest.mark.slow
 def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
-    """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just
-    so."""
-    wanted = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    """Nothing leaves the bounds, but the torque is too large: the multipliers make it feasible, and
+    just so."""
+    goal = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, iterations=60, **SHORT)
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
     assert 11.0 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 12.0
 
@@ -515,10 +516,10 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
     gains = ["controller.k1", "controller.K2"]
 
     def tuned(limit):
-        wanted = (
+        goal = (
             objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(limit)
         )
-        return ij.tune(paper, gains, wanted, solver=SQP(1e-7), **SHORT)
+        return ij.tune(paper, gains, goal, solver=SQP(1e-7), **SHORT)
 
     tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
     price = (tight.objective - loose.objective) / 0.18
@@ -535,9 +536,9 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
 
 @pytest.mark.slow
 def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
-    """Gravity alone takes more than 2 N m.  Beside it, what else a reader is warned of."""
-    wanted = objectives.tracking() + 0.3 * objectives.effort() + objectives.peak_torque_below(2.0)
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, **SHORT)
+    """Gravity takes more than 2 N m.  Beside it, what else a reader is warned of."""
+    goal = objectives.tracking() + 0.3 * objectives.effort() + objectives.peak_torque_below(2.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, **SHORT)
     peak = float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque))
     assert best.stopped == "the requirements cannot be kept together near these gains"
     assert f"fail; {peak:.5g} N m, {peak - 2:.3g} N m above the limit" in str(best.report)
@@ -993,7 +994,7 @@ def test_a_tuning_file_has_the_options_as_tables(tmp_path, table, expected):
         f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
         '[[objective]]\nkind = "tracking"\n'
     )
-    arguments = ij.files.tuning.load_tuning_file(file)
+    arguments = load_tuning_file(file)
     assert {name: arguments[name] for name in expected} == expected
 
 
@@ -1013,7 +1014,7 @@ def test_wrong_options_in_a_tuning_file_are_named(tmp_path, table, words):
         '[[objective]]\nkind = "tracking"\n'
     )
     with pytest.raises(ValueError, match=words):
-        ij.files.tuning.load_tuning_file(file)
+        load_tuning_file(file)
 
 
 # ------------------------------------------------------------------------------------------- resume
@@ -1055,13 +1056,16 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
         assert 1 <= len(half["history_loss"]) < 12
     assert start("a.npz", "fast", "resumed.npz").wait() == 0
     monkeypatch.setattr(
-        sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "whole.npz")]
+        sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "complete.npz")]
     )
     exec(KILLED, {})
-    with np.load(tmp_path / "resumed.npz") as resumed, np.load(tmp_path / "whole.npz") as whole:
-        assert set(resumed.files) == set(whole.files)
-        for name in whole.files:
-            assert resumed[name].tobytes() == whole[name].tobytes(), name
+    with (
+        np.load(tmp_path / "resumed.npz") as resumed,
+        np.load(tmp_path / "complete.npz") as complete,
+    ):
+        assert set(resumed.files) == set(complete.files)
+        for name in complete.files:
+            assert resumed[name].tobytes() == complete[name].tobytes(), name
 
 
 def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
