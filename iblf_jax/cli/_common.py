@@ -149,12 +149,15 @@ def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
     return RUN_DEFAULTS | file.run | given
 
 
-def output_folder(name: str | None) -> Path | None:
-    """The folder of --out, made if it does not exist, or None without --out; ValueError if it
-    cannot be written.
-    """
+def optional_folder(name: str | None) -> Path | None:
+    """As `output_folder`; None without --out."""
     if not name:
         return None
+    return output_folder(name)
+
+
+def output_folder(name: str) -> Path:
+    """The folder of --out, made if it does not exist; ValueError if it cannot be written."""
     folder = Path(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from iblf_jax.cli._common import (
     add_run_arguments,
     add_scenario_arguments,
-    output_folder,
+    optional_folder,
     run_options,
     scenario_of,
     verdict,
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
     file = scenario_of(args)
     options = run_options(args, file)
-    folder = output_folder(args.out)
+    folder = optional_folder(args.out)
     laws = [name for word in args.laws or LAWS for name in word.split(",") if name]
     result = compare(file.scenario, laws, equal_effort=not args.gains_only, **options)
     print(f"{args.scenario}\n{result!r}")

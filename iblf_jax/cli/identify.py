@@ -39,10 +39,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import output_folder
+    from iblf_jax.cli._common import optional_folder
     from iblf_jax.files.identification import identify_file
 
-    folder = output_folder(args.out)
+    folder = optional_folder(args.out)
     given = {}
     if args.log:
         given["log"] = args.log

@@ -11,7 +11,7 @@ from iblf_jax.cli._common import (
     add_run_arguments,
     add_scenario_arguments,
     metrics_table,
-    output_folder,
+    optional_folder,
     run_options,
     scenario_of,
     verdict,
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
     file = scenario_of(args)
     options = run_options(args, file)
-    folder = output_folder(args.out)
+    folder = optional_folder(args.out)
     result = simulate(file.scenario, **options, seed=args.seed)
     failed = bool(int(result.status) & int(FAILED))
     print(

@@ -67,7 +67,7 @@ def case_bytes(study: PreparedStudy) -> float:
 
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     """`x` where the draws were admissible; elsewhere NaN, or -1 for integers."""
-    mark = -1
+    mark: float = -1
     if jnp.issubdtype(x.dtype, jnp.floating):
         mark = jnp.nan
     mask = admissible.reshape(admissible.shape + (1,) * (x.ndim - 1))
@@ -175,7 +175,8 @@ def _first_of(waiting: deque[tuple[int, Future]]) -> tuple[int, Any]:
 
 def _compile(call: partial, copies: list[SharedInputs], inputs: list[CaseInputs]) -> None:
     """Compiles the block for several devices at the same time; it is traced once for all."""
-    program, options = call.func, call.keywords
+    program: Any = call.func
+    options = call.keywords
     program.trace(copies[0], inputs[0], **options)
 
     def one(shared, inputs_there):

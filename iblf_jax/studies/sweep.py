@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
@@ -280,7 +280,7 @@ def _results(
     store: Store,
     options: StoreOptions,
     advance: Callable[[int], None],
-) -> Iterator[tuple[slice, Any]]:
+) -> Generator[tuple[slice, Any], None, None]:
     """Units with their results; None for those that a worker has written."""
     if isinstance(executor, ThisProcess) or options.writer == "client":
         yield from run_spans(study, spans, executor, advance)
