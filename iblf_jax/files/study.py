@@ -43,7 +43,7 @@ from iblf_jax.files.values import (
     numbers,
 )
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies import distributions
+from iblf_jax.studies import Design, distributions
 from iblf_jax.studies.distributions import KINDS, Perturbation
 
 OPTIONS: dict[str, dict[str, type]] = {
@@ -132,7 +132,10 @@ def _options(table: Any, kind: str) -> dict[str, Any]:
         decode_static(value, OPTIONS[kind][key], f"{kind}.{key}")
     if kind == "study" and "runs" not in table:
         raise checks.fail("study.runs", Words("nothing"), "a number of runs")
-    return dict(table)
+    options = dict(table)
+    if "points" in options:
+        options["design"] = Design(options.get("design", "grid"), options.pop("points"))
+    return options
 
 
 def perturbations_of(data: dict[str, Any]) -> dict[str, Perturbation]:
